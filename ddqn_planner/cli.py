@@ -185,8 +185,6 @@ def certify(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
 
 def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     """Learn from a robot's recorded drives how long places take, and what of it the map tells."""
-    import numpy as np
-
     from ddqn_planner.experience.drives import EXPERIENCE, LOCK, RECORD, Drive
     from ddqn_planner.experience.recordings import read_recording
 
@@ -225,23 +223,16 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
         for drive in drives:
             drive.teach(experience, grid)
         try:
-            from ddqn_planner.training.prior import teach_prior
+            from ddqn_planner.training.prior import prior_of
 
-            teach_prior(experience, grid)
+            experience.prior = prior_of(grid, experience.evidence.table, experience.prior)
         except ImportError as error:
             print(f"the map's prior is not trained: {with_remedy(error)}")
         first = options.drives[0]
         out = options.out or (first if first.is_dir() else first.parent) / EXPERIENCE
         write_atomically(out, experience.to_bytes())  # not `save`, which adds to an older file
-    slowness, unsure = experience.slowness(grid), experience.uncertainty(grid)
-    known = unsure < 0.9 * unsure.max()
-    seconds = sum(float(np.ptp(drive.seconds)) for drive in drives)
-    print(f"{len(drives)} drives, {sum(d.metres for d in drives):.0f} m, {seconds / 60:.1f} min")
-    free = known & ~grid.occupancy
-    print(f"known now: {free.sum() / max((~grid.occupancy).sum(), 1):.0%} of the free cells")
-    if free.any():
-        middle, slow = np.quantile(slowness[free], (0.5, 0.95))
-        print(f"seconds over nominal ones there: median {middle:.2f}, slowest 5 % from {slow:.2f}")
+    minutes = sum(drive.seconds[-1] - drive.seconds[0] for drive in drives) / 60
+    print(f"{len(drives)} drives, {sum(d.metres for d in drives):.0f} m, {minutes:.1f} min")
     print(f"speed in the open: {experience.learned_speed:.2f} m/s")
     print(f"saved {out}")
     return 0

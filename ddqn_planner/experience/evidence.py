@@ -26,7 +26,6 @@ NOMINAL = 2.0  # inverse variance of the log slowness of all places, before the 
 TRUST, TRUSTED = 0.2, 0.25  # in the prior: at first, and the inverse variance of that
 SURE_PLACES = 20  # fewer say nothing about the robot's speed in the open
 KNOWN = 0.7  # weight of visits from which a place is known
-MOST = 6.0  # weight of visits that a place keeps
 
 PART, SURPRISE = 8, 3.5  # so many places have changed if they are off by more deviations
 USUAL = 4.0  # from bound to bound of drives' errors; where it is more, so is a surprise
@@ -98,11 +97,6 @@ class Evidence:
             self.table[:, :2] *= CHANGED
         weight = visits.metres / self.side
         np.add.at(self.table[:, :2], rows, np.column_stack([weight, weight * log]))
-        self._bound()
-
-    def _bound(self) -> None:
-        """Bound the weights of places, so that what is new counts."""
-        self.table[:, :2] /= np.maximum(self.table[:, :1] / MOST, 1)
 
     def _has_changed(self, rows: NDArray[np.int64], log: Float64) -> bool:
         """Return whether a part of a drive was other than all before."""
@@ -223,7 +217,6 @@ class Evidence:
         """Add what other evidence has."""
         rows = self._rows(other.table[:, 3:5])
         self.table[rows, :2] += other.table[:, :2]
-        self._bound()
         for seconds, passages, x, y in other.waits.tolist():
             row = self._wait_at(x, y)  # first: it may make the table anew
             self.waits[row, :2] += seconds, passages

@@ -76,15 +76,14 @@ def read_recording(
 
 def _files_of(path: Path) -> Sequence[Path]:
     """Return the MCAP files of a bag in the order of their numbers; a ValueError if it has none."""
-    if path.is_file() and path.suffix.lower() == ".mcap":
-        return [path]
-    files = sorted(path.glob("*.mcap"), key=lambda file: (len(file.name), file.name))
-    if path.exists() and not files:
+    inside = sorted(path.glob("*.mcap"), key=lambda file: (len(file.name), file.name))
+    files = inside if path.is_dir() else [path]
+    if path.exists() and not any(file.suffix.lower() == ".mcap" for file in files):
         raise ValueError(
             f"{path} is no .csv and no .mcap file, and no folder with {RECORD} or .mcap files; "
             "`ros2 bag convert` makes MCAP files of other bags (storage_id: mcap)"
         )
-    return files or [path]
+    return files
 
 
 def drives_of(samples: Sequence[Sample]) -> list[Drive]:

@@ -111,13 +111,12 @@ def numbers(
         raise ValueError(f"{name} has shape {array.shape}; give {shape}")
     if array.dtype.kind not in kinds:
         raise ValueError(f"{name}: the elements are of type {array.dtype}; give numbers")
-    if between is None or array.dtype.kind == "b":
+    if between is None or array.dtype.kind == "b" or array.size == 0:
         return array
     lowest, highest = between
-    right = (array >= lowest) & (array <= highest)  # not NaN
-    if whole and array.dtype.kind == "f":
-        right &= array == np.floor(array)
-    if not right.all():
+    fractions = whole and array.dtype.kind == "f" and not (array == np.floor(array)).all()
+    if fractions or not lowest <= array.min() <= array.max() <= highest:  # or NaN
+        right = (array >= lowest) & (array <= highest) & (not whole or array == np.floor(array))
         remedy = remedy or f"{'whole numbers ' if whole else ''}{lowest:g} to {highest:g}"
         raise ValueError(f"{name} holds {array[~right].flat[0]}; give {remedy}")
     return array

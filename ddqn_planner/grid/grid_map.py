@@ -186,6 +186,8 @@ class GridMap:
             cost=costs,
             obstacles=replaced(self.obstacles, box, closed),
         )
+        change = np.count_nonzero(patch) - np.count_nonzero(self.occupancy[box])
+        patched._set(_occupied=self._occupied + change)
         if (costs is None) == (self.cost is None):
             patched._set(_history=(*self._history[-MAX_PATCHES:], (object(), box)))
         return patched
@@ -237,10 +239,12 @@ class GridMap:
 
     def multipliers_in(self, where: Any) -> NDArray[np.float32]:
         """Return the cost multipliers that an index of NumPy names."""
-        multiplier = np.ones(self.occupancy[where].shape, dtype=np.float32)
-        if self.cost is not None:
-            multiplier = MULTIPLIERS.take(self.cost[where], mode="wrap")  # -1 finds the last one
-        return multiplier if self.slowness is None else multiplier * self.slowness[where]
+        slowness = None if self.slowness is None else self.slowness[where]
+        if self.cost is None:
+            return np.ones(self.occupancy[where].shape, "f4") if slowness is None else slowness
+        multiplier: NDArray[np.float32]
+        multiplier = MULTIPLIERS.take(self.cost[where], mode="wrap")  # -1 finds the last one
+        return multiplier if slowness is None else multiplier * slowness
 
     def labels(self, move_rule: MoveRule | str) -> NDArray[np.int32]:
         """Return (H, W) int32: each free cell's component, from 1 on, whatever is forbidden."""
@@ -298,12 +302,13 @@ class GridMap:
     def same_cells(self, other: GridMap) -> bool:
         """Return whether all cells of two maps are equal, wherever the maps lie."""
         check_grid(other, "other")
+        if self._occupied != other._occupied:
+            return False
         boxes = self.patches_since(other)
         if boxes is not None:
             return not any(self.differs(other, box, box).any() for box in reversed(boxes))
         layers = ((getattr(self, name), getattr(other, name)) for name in LAYERS)
-        same = (mine is its or np.array_equal(mine, its) for mine, its in layers)
-        return self._occupied == other._occupied and all(same)
+        return all(mine is its or np.array_equal(mine, its) for mine, its in layers)
 
     def differs(self, other: GridMap, box: Box, others_box: Box) -> NDArray[np.bool_]:
         """Return which cells of boxes of two maps with the same layers differ."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeAlias
 
@@ -24,6 +24,7 @@ Float64: TypeAlias = NDArray[np.float64]
 # One of each class: under `MoveRule.UNIT`, the same moves are legal as under the second.
 MOVE_RULES: Final = (MoveRule.ROBOT_SAFE, MoveRule.CORNER_CUTTING)
 CENTRE = 4  # the robot's cell in a patch
+COSTS = slice(9, 27)  # the inputs for costs and unknown cells
 NO_CERTIFICATE = "nothing can be proved: the moves depend on the whole map, not on 3x3 patches"
 MAX_FILTERS = 256  # for more, the proof would take seconds, and it is not tried
 ROUNDING = 2.0**-23  # a float32 operation's relative error, and as much for errors in float64
@@ -79,35 +80,31 @@ def certify(
 ) -> Certificate:
     """Prove what a network takes for possible under some rules, and bound its costs' errors."""
     every_P9 = every_patch()
-    patch_P9 = every_P9[every_P9[:, CENTRE] != OCCUPIED]
-    decisions = len(move_rules) * len(patch_P9) * len(MOVES)
+    features = [network.features(every_P9, rule) for rule in move_rules]
+    legal_PA = np.concatenate([legal_in_patches(every_P9, rule) for rule in move_rules])
+    is_free_P = np.tile(every_P9[:, CENTRE] != OCCUPIED, len(move_rules))
+    decisions = int(is_free_P.sum()) * len(MOVES)
     if network.sizes["filters"] > MAX_FILTERS:
         return Certificate(decisions, decisions, 0, 0.0, math.inf)
-    undecided, wrong, least, error, tries = 0, 0, math.inf, 0.0, 1.0
     with np.errstate(over="ignore", invalid="ignore"):  # a broken model may overflow
-        for rule in move_rules:
-            legal_PA = legal_in_patches(patch_P9, rule)
-            feature_PI = network.features(patch_P9, rule)
-            margin_PA, weight_CPA = _margins(network, feature_PI, legal_PA)
-            right_PA = margin_PA > 0  # False for NaN
-            least = min(least, float(margin_PA[right_PA].min(initial=math.inf)))
-            pattern, action = np.nonzero(~right_PA)
-            # The costs that make their bounded function least: for each free cell 0, 99 or unknown.
-            gain_K9B = weight_CPA.reshape(-1, 9, *legal_PA.shape)[:, :, pattern, action]
-            gain_K9B = np.pad(gain_K9B, ((1, 0), (0, 0), (0, 0)))
-            worst_B9 = np.array([0, OCCUPIED - 1, UNKNOWN], np.int8)[gain_K9B.argmin(axis=0)].T
-            example_B9 = np.where(patch_P9[pattern] == OCCUPIED, OCCUPIED, worst_B9)
-            p_BA = network.success(network.features(example_B9, rule))
-            possible = p_BA[np.arange(len(action)), action] > 0.5
-            found = int(np.count_nonzero(possible != legal_PA[pattern, action]))
-            wrong += found
-            undecided += len(action) - found
-            error = max(error, _multiplier_error(network, feature_PI, legal_PA))
-            # Of all patches at once, as the planner does it: the same floats.
-            tries_PA = network.tries(network.features(every_P9, rule))
-            tries = max(tries, float(tries_PA[legal_in_patches(every_P9, rule)].max()))
-    margin = least if least < math.inf else 0.0
-    return Certificate(decisions, undecided, wrong, margin, error, tries)
+        # Of all patches at once, as the planner does it: the same floats.
+        tries = float(np.concatenate([*map(network.tries, features)])[legal_PA].max())
+        feature_PI, legal_PA = np.concatenate(features)[is_free_P], legal_PA[is_free_P]
+        margin_PA, weight_CPA = _margins(network, feature_PI, legal_PA)
+        right_PA = margin_PA > 0  # False for NaN
+        pattern, action = np.nonzero(~right_PA)
+        # The costs that make their bounded function least: for each free cell 0, 99 or unknown.
+        gain_K9B = weight_CPA.reshape(-1, 9, *legal_PA.shape)[:, :, pattern, action]
+        gain_K9B = np.pad(gain_K9B, ((1, 0), (0, 0), (0, 0)))
+        worst_B9 = np.array([0, OCCUPIED - 1, UNKNOWN], np.int8)[gain_K9B.argmin(axis=0)].T
+        example_B9 = np.where(feature_PI[pattern, :9] > 0, OCCUPIED, worst_B9)
+        example_BI = network.features(example_B9, move_rules[0])
+        example_BI[:, 27:] = feature_PI[pattern, 27:]  # the rule
+        possible_B = network.success(example_BI)[np.arange(len(action)), action] > 0.5
+        wrong = int(np.count_nonzero(possible_B != legal_PA[pattern, action]))
+        error = _multiplier_error(network, feature_PI, legal_PA)
+    margin = float(margin_PA[right_PA].min()) if right_PA.any() else 0.0
+    return Certificate(decisions, len(action) - wrong, wrong, margin, error, tries)
 
 
 def _margins(
@@ -120,36 +117,31 @@ def _margins(
     # Copies, as arrays in another order than the rest are slow.
     weight_IF, hidden_FF = tensors["convolution.weight"].T.copy(), tensors["hidden.weight"].T.copy()
     base_PF = feature_PI @ weight_IF + tensors["convolution.bias"]
-    low_PF, high_PF = _extremes(lambda inputs: weight_IF[inputs, None], feature_PI)
+    low_PF, high_PF = _extremes(weight_IF[COSTS, None], feature_PI)
     first = _Lines(base_PF + low_PF, base_PF + high_PF)
 
     # With the upper line's slope for both lines, only their distance differs.
     base_PF = (first.slope * base_PF) @ hidden_FF + tensors["hidden.bias"]
-    low_PF, high_PF = _extremes(
-        lambda inputs: (first.slope * weight_IF[inputs, None]) @ hidden_FF, feature_PI
-    )
+    low_PF, high_PF = _extremes((first.slope * weight_IF[COSTS, None]) @ hidden_FF, feature_PI)
     low_PF += first.distance @ np.minimum(hidden_FF, 0)
     high_PF += first.distance @ np.maximum(hidden_FF, 0)
     second = _Lines(base_PF + low_PF, base_PF + high_PF)
 
     # Back from the logits: what a positive weight multiplies is at least its lower line.
-    sign_PA = np.where(legal_PA, 1.0, -1.0)
-    bound_PA = sign_PA * tensors["moves.bias"]
-    weight_PIA = np.empty((*feature_PI.shape, len(MOVES)))
-    for action in range(len(MOVES)):
-        weight = sign_PA[:, action, None] * tensors["moves.weight"][action]
-        for layer, lines in (("hidden", second), ("convolution", first)):
-            bound_PA[:, action] += (np.minimum(weight, 0) * lines.distance).sum(axis=1)
-            weight *= np.where(weight > 0, lines.lower_slope, lines.slope)
-            bound_PA[:, action] += weight @ tensors[f"{layer}.bias"]
-            weight = weight @ tensors[f"{layer}.weight"]
-        bound_PA[:, action] += (weight * feature_PI).sum(axis=1)
-        weight_PIA[:, :, action] = weight
-    weight_IPA = weight_PIA.transpose(1, 0, 2)
-    low_PA, _ = _extremes(lambda inputs: weight_IPA[inputs], feature_PI)
+    sign_AP = np.where(legal_PA, 1.0, -1.0).T
+    bound_AP = sign_AP * tensors["moves.bias"][:, None]
+    weight_APF = sign_AP[..., None] * tensors["moves.weight"][:, None]
+    for layer, lines in (("hidden", second), ("convolution", first)):
+        bound_AP += (np.minimum(weight_APF, 0) * lines.distance).sum(axis=2)
+        weight_APF *= np.where(weight_APF > 0, lines.lower_slope, lines.slope)
+        bound_AP += weight_APF @ tensors[f"{layer}.bias"]
+        weight_APF = weight_APF @ tensors[f"{layer}.weight"]
+    bound_AP += (weight_APF * feature_PI).sum(axis=2)
+    weight_CPA = weight_APF[..., COSTS].transpose(2, 1, 0)
+    low_PA, _ = _extremes(weight_CPA, feature_PI)
     ones_I = np.ones_like(feature_PI[0])
     layers = [("convolution", ones_I), ("hidden", first.greatest), ("moves", second.greatest)]
-    return bound_PA + low_PA - _rounding_error(network, layers), weight_IPA[9:27]
+    return bound_AP.T + low_PA - _rounding_error(network, layers), weight_CPA
 
 
 class _Lines:
@@ -164,17 +156,14 @@ class _Lines:
         self.greatest = above.max(axis=0).astype(np.float32)
 
 
-def _extremes(
-    weights: Callable[[slice], Float64], feature_PI: NDArray[np.float32]
-) -> tuple[Float64, Float64]:
-    """Return the least and greatest weighted sums, (P, U), given a cell's (2, P, U) weights."""
-    # A free cell has a cost of 0 to 1, or it is unknown. Arrays of one cell each are the fastest.
-    low_PU, high_PU = np.float64(0), np.float64(0)
-    for cell in range(9):
-        choice_2PU = weights(slice(9 + cell, 27, 9)) * (1 - feature_PI[:, cell, None])
-        low_PU = low_PU + choice_2PU.min(axis=0, initial=0)
-        high_PU = high_PU + choice_2PU.max(axis=0, initial=0)
-    return low_PU, high_PU
+def _extremes(weight_CPU: Float64, feature_PI: NDArray[np.float32]) -> tuple[Float64, Float64]:
+    """Return the least and greatest sums, (P, U), of costs and unknown cells with weights."""
+    # A free cell has a cost of 0 to 1, or it is unknown.
+    cells = len(weight_CPU) // 2
+    choice_29PU = weight_CPU.reshape(2, cells, *weight_CPU.shape[1:])
+    choice_29PU = choice_29PU * (1 - feature_PI.T[:cells, :, None])
+    low_9PU, high_9PU = choice_29PU.min(axis=0, initial=0), choice_29PU.max(axis=0, initial=0)
+    return low_9PU.sum(axis=0), high_9PU.sum(axis=0)
 
 
 def _multiplier_error(
@@ -188,7 +177,7 @@ def _multiplier_error(
         for cell in (CENTRE, CENTRE + 3 * dy + dx):
             error_IA[[9 + cell, 18 + cell], action] -= (MAX_COST_MULTIPLIER - 1) / 2
     base_PA = feature_PI @ error_IA + network.tensors["prices.bias"]
-    low_PA, high_PA = _extremes(lambda inputs: error_IA[inputs, None], feature_PI)
+    low_PA, high_PA = _extremes(error_IA[COSTS, None], feature_PI)
     error_PA = np.maximum(base_PA + high_PA, -base_PA - low_PA)
     error_PA += _rounding_error(network, [("prices", np.ones_like(feature_PI[0]))])
     error = float(error_PA[legal_PA].max())

@@ -157,21 +157,18 @@ def path_bytes(
     """Return a path as it is sent: positions (N, 2), and directions (N), or (N - 1) and a last."""
     # OMG DDS-XTypes, plain CDR, little-endian: numbers are aligned to their size, so that each pose
     # has the same bytes before its seven numbers, except for the first one.
-    count = len(positions)
-    start = serialize_message(Path(header=header))[4:-4] + count.to_bytes(4, "little")
-    start += bytes(-len(start) % 4)
-    stamp = serialize_message(header)[4:]
-    first, others = (stamp + bytes(-(at + len(stamp)) % 8) for at in (len(start), 0))
-    pose = np.dtype([("header", f"V{len(others)}"), ("numbers", "<f8", 7)])
-    poses = np.zeros(count, dtype=pose)
-    if count:
-        poses["header"] = np.void(others)
-        numbers = poses["numbers"]
-        numbers[:, :2] = positions
-        numbers[: len(yaw), 5], numbers[: len(yaw), 6] = np.sin(yaw / 2), np.cos(yaw / 2)
-        if last is not None:
-            numbers[-1, 3:] = last.x, last.y, last.z, last.w
-    return b"\0\1\0\0" + start + (first + poses.tobytes()[len(others) :] if count else b"")
+    count, stamp = len(positions), serialize_message(header)[4:]
+    start = serialize_message(Path(header=header))[:-4] + count.to_bytes(4, "little")
+    if not count:
+        return start
+    first, others = (stamp + bytes(-(at + len(stamp)) % 8) for at in (len(start) - 4, 0))
+    poses = np.zeros(count, dtype=[("header", f"V{len(others)}"), ("numbers", "<f8", 7)])
+    poses["header"], numbers = np.void(others), poses["numbers"]
+    numbers[:, :2] = positions
+    numbers[: len(yaw), 5], numbers[: len(yaw), 6] = np.sin(yaw / 2), np.cos(yaw / 2)
+    if last is not None:
+        numbers[-1, 3:] = last.x, last.y, last.z, last.w
+    return start + first + poses.tobytes()[len(others) :]
 
 
 def bytes_message(kind: str, data: bytes) -> UInt8MultiArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,6 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -38,22 +37,6 @@ ARROW = np.array([-0.35, 0.35, 0.1 + 0.175j, 0.1 - 0.175j])
 DIRECTIONS = np.exp(1j * np.arctan2(MOVES[:, 1], MOVES[:, 0]))
 
 
-@dataclass
-class Layer:
-    """A topic, the function that makes its messages, and whether the last one shows anything."""
-
-    name: str
-    publisher: Publisher
-    message: Callable[[Outcome], Any]
-    is_due: bool = False
-    shows: bool = False
-
-    def has(self, outcome: Outcome) -> bool:
-        """Return whether there is anything to show."""
-        has_body = isinstance(outcome.plan, PosePlan)
-        return outcome.planner is not None and has_body == (self.name == "footprints")
-
-
 class FieldDisplay:
     """Publishes what subscribers ask for: ``~/value``, ``~/policy``, ``~/footprints``."""
 
@@ -61,18 +44,14 @@ class FieldDisplay:
     def __init__(self, node: Node, worker: Worker) -> None:
         self._logger, self._worker = node.get_logger(), worker
         self._shown: Outcome | None = None
+        # What is to be published anew, and what showed something when it was published last.
+        self._due, self._visible = set[str](), set[str]()
         self._look = node.create_guard_condition(self._on_look, MutuallyExclusiveCallbackGroup())
         matched = PublisherEventCallbacks(matched=lambda _: self._look.trigger())
-
-        def layer(name: str, kind: Any, message: Callable[[Outcome], Any]) -> Layer:
-            publisher = node.create_publisher(kind, f"~/{name}", LATCHED, event_callbacks=matched)
-            return Layer(name, publisher, message)
-
-        self._layers = (
-            layer("value", OccupancyGrid, lambda it: value_message(*_field_of(it))),
-            layer("policy", MarkerArray, lambda it: policy_message(*_field_of(it))),
-            layer("footprints", MarkerArray, footprint_message),
-        )
+        self._publishers = {
+            name: node.create_publisher(kind, f"~/{name}", LATCHED, event_callbacks=matched)
+            for name, (kind, _) in LAYERS.items()
+        }
 
     def show(self, outcome: Outcome) -> None:
         """Show the field of an outcome from now on; none if it has none, as of another goal."""
@@ -80,30 +59,31 @@ class FieldDisplay:
         if outcome.plan.goal is None and last is not None:
             header = Header(stamp=outcome.header.stamp, frame_id=last.header.frame_id)
             outcome = replace(last, planner=None, header=header)
-        if outcome.plan.goal and (last is None or _visible(outcome) != _visible(last)):
-            self._shown = outcome
-            for layer in self._layers:
-                layer.is_due = True
+        if outcome.plan.goal and (last is None or _key(outcome) != _key(last)):
+            self._shown, self._due = outcome, {*LAYERS}
             self._look.trigger()
 
     async def _on_look(self) -> None:
-        for layer in self._layers:
-            if self._shown is None or not layer.is_due:
+        for name, publisher in self._publishers.items():
+            shown = self._shown
+            if shown is None or name not in self._due:
                 continue
-            has_any = layer.has(self._shown)
+            has_body = isinstance(shown.plan, PosePlan)
+            has_any = shown.planner is not None and has_body == (name == "footprints")
             # What is latched is cleared even if nobody subscribes now.
-            if not (layer.publisher.get_subscription_count() if has_any else layer.shows):
+            if not (publisher.get_subscription_count() if has_any else name in self._visible):
                 continue
-            layer.is_due, layer.shows = False, has_any
+            self._due.remove(name)
+            self._visible = self._visible | {name} if has_any else self._visible - {name}
             try:
-                layer.publisher.publish(await self._worker.call(layer.message, self._shown))
+                publisher.publish(await self._worker.call(LAYERS[name][1], shown))
             except InvalidHandle:  # cleaned up meanwhile
                 return
             except Exception as error:  # as when no memory is left: the node must survive
-                self._logger.error(f"no {layer.name} is shown ({error!r}); give a smaller map")
+                self._logger.error(f"no {name} is shown ({error!r}); give a smaller map")
 
 
-def _visible(outcome: Outcome) -> tuple[object, ...]:
+def _key(outcome: Outcome) -> tuple[object, ...]:
     """Return what is shown of an outcome: another goal is, though its field may be the same."""
     request, plan = outcome.request, outcome.plan
     way = plan if isinstance(plan, PosePlan) else getattr(request, "move_rule", None)
@@ -170,3 +150,11 @@ def _point(x: float, y: float) -> Point:
     point = Point()  # faster than Point(x=x, y=y)
     point.x, point.y = x, y
     return point
+
+
+LAYERS: dict[str, tuple[Any, Callable[[Outcome], Any]]] = {
+    "value": (OccupancyGrid, lambda outcome: value_message(*_field_of(outcome))),
+    "policy": (MarkerArray, lambda outcome: policy_message(*_field_of(outcome))),
+    "footprints": (MarkerArray, footprint_message),
+}
+"""Each topic's type, and the function that makes its messages."""

@@ -19,7 +19,7 @@ from std_msgs.msg import Header, UInt8MultiArray
 from ddqn_planner.experience import Experience
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.body import Inflation
-from ddqn_planner.grid.copies import WHOLE, boxes_of
+from ddqn_planner.grid.copies import boxes_of
 from ddqn_planner.nodes.conversions import bytes_of, grid_from_message, grid_from_values
 from ddqn_planner.nodes.report import NO_REQUEST, Outcome, Report, RequestError, seconds
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
@@ -293,10 +293,7 @@ class Directions:
             return grid
         of_map, directions = found = (own or known)[0]
         if directions is not None and directions.forbidden is not None:
-            try:
-                offset = offset_between(directions, grid)
-            except (OverflowError, ValueError):  # too far away to have a number of cells
-                offset = None
+            offset = offset_between(directions, grid)
             if of_map.frame_id != header.frame_id or offset is None:
                 raise ValueError(
                     f"the directions on {self._topic} are not for this map: they have the frame "
@@ -391,7 +388,5 @@ def is_like(grid: GridMap, other: GridMap) -> bool:
     mine, its = ((each.occupancy.shape, each.resolution, each.origin) for each in (grid, other))
     if mine != its:
         return False
-    boxes = grid.patches_since(other)
-    boxes = [WHOLE] if boxes is None else boxes
-    changed = sum(np.count_nonzero(grid.occupancy[box] != other.occupancy[box]) for box in boxes)
+    changed = np.count_nonzero(grid.occupancy != other.occupancy)
     return bool(changed <= CHANGED_SHARE * grid.occupancy.size)

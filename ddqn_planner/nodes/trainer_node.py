@@ -307,21 +307,18 @@ class TrainerNode(BaseNode):
             return False, f"{NO_MAP} first"
         frames = (places[: n + 1] for places in episodes for n in range(len(places)))
 
-        def draw_next() -> str:  # it returns why it cannot
+        def step() -> None:
             try:
                 draw(place, next(frames))
-            except StopIteration:
-                return f"{file} holds no episode to replay yet; {remedy}"
-            except OSError as error:
-                return f"no recorded episodes ({error}); call ~/start first"
-            return ""
-
-        def step() -> None:
-            if draw_next():
+            except (StopIteration, OSError):
                 self.stop_replay()
 
-        if reason := draw_next():
-            return False, reason
+        try:
+            draw(place, next(frames))
+        except StopIteration:
+            return False, f"{file} holds no episode to replay yet; {remedy}"
+        except OSError as error:
+            return False, f"no recorded episodes ({error}); call ~/start first"
         self.stop_replay()
         self.replaying = self.create_timer(self.value("replay_period"), step, clock=STEADY)
         return True, "replaying the recorded episodes on ~/episode"

@@ -262,7 +262,10 @@ def offset_between(old: GridMap, new: GridMap) -> Cell | None:
     if not same or old.origin[2] != new.origin[2]:
         return None
     corner = old.cell_to_world((0, 0))
-    shift = new.world_to_cell(*corner)
+    try:
+        shift = new.world_to_cell(*corner)
+    except (OverflowError, ValueError):  # too far away to have a number of cells
+        return None
     apart = math.dist(corner, new.cell_to_world(shift))
     return shift if apart < SAME_PLACE * new.resolution else None
 
@@ -332,8 +335,9 @@ class FieldCache:
     def __init__(self, network: QNetwork) -> None:
         self.network = network
         self.nbytes = CACHE_BYTES  # the bound; the fields used last are kept
-        self._kept: list[_Kept] = []  # used last at the end
-        self._lock = threading.Lock()
+        # Used last at the end. Threads need no lock, as the list is replaced and never changed: one
+        # may at worst forget what another has just kept.
+        self._kept: list[_Kept] = []
 
     def has_costs(self, grid: GridMap, rule: MoveRule) -> bool:
         """Return whether the network gives the costs of a map's moves, see `DistanceField`."""
@@ -384,28 +388,27 @@ class FieldCache:
         """Give a new field what a field of an older map knows, if there is one."""
         shift_from = cache(lambda older: shift_between(older, new.grid))  # many are of one map
         for kept in self._of_rule(new.move_rule):
-            old, shift = kept.field, shift_from(kept.grid)
-            if shift is None or not isinstance(old, DistanceField):
+            old = kept.field
+            if not isinstance(old, DistanceField) or (shift := shift_from(kept.grid)) is None:
                 continue
             moved_goals = tuple((x + shift[0], y + shift[1]) for x, y in old.goals)
             if moved_goals == new.goals and new.take_over(old, shift, start):
-                with self._lock:  # the place will hardly be again what it was
-                    self._kept = [other for other in self._kept if other.field is not old]
+                # The place will hardly be again what it was.
+                self._kept = [other for other in self._kept if other.field is not old]
                 return
 
     def _use(self, used: _Kept) -> None:
         """Put what is used at the end; of maps without a field, only the last stays."""
-        with self._lock:
-            others = [kept for kept in self._kept if kept.field and kept.field is not used.field]
-            self._kept = [*others, used]
+        others = [kept for kept in self._kept if kept.field and kept.field is not used.field]
+        self._kept = [*others, used]
 
     def _forget(self) -> None:
         """Forget the oldest fields beyond the bound; those of one map share its costs."""
         size, of_costs = 0, dict[int, int]()
-        with self._lock:
-            for number, kept in enumerate(reversed(self._kept)):
-                size += kept.field.nbytes if kept.field else 0
-                of_costs[id(kept.costs)] = kept.costs.patch.nbytes if kept.costs else 0
-                if number >= ALWAYS_KEPT and size + sum(of_costs.values()) > self.nbytes:
-                    self._kept = self._kept[-number:]
-                    break
+        known = self._kept
+        for number, kept in enumerate(reversed(known)):
+            size += kept.field.nbytes if kept.field else 0
+            of_costs[id(kept.costs)] = kept.costs.patch.nbytes if kept.costs else 0
+            if number >= ALWAYS_KEPT and size + sum(of_costs.values()) > self.nbytes:
+                self._kept = known[-number:]
+                break

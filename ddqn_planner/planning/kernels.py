@@ -18,7 +18,6 @@ from ddqn_planner.model.move_costs import MAX_MULTIPLIER, VALUES, MoveCosts
 
 Distances = NDArray[np.float64]
 Cells = NDArray[np.int32]
-Bounds = tuple[float, float]
 
 # States. The distance of an open cell may fall; that of a closed one is the least. Until a cell is
 # reached its distance is 0: then pages of memory that no request needs are never touched.
@@ -82,13 +81,10 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
     """Close cells until a start's distance is known; return what is known then, and if it is."""
     # In the order of A*, so that few cells are visited (resumable reverse A*, Silver 2005). Buckets
     # hold the cells of about the same order (Dial 1969).
-    if start == 0:
-        # All of the map (Dijkstra), as no path reaches this cell of the border. One bucket per unit
-        # is enough: no move costs less than 1.
-        bounds, buckets = (0.0, 0.0), 1
-    else:  # lower bounds, whatever the rounding
-        least = costs.least * (1 - 1e-7)
-        bounds, buckets = (costs.straight * least, costs.diagonal * least), BUCKETS
+    # No path reaches cell 0, of the border, so all of the map is visited: without lower bounds
+    # (Dijkstra), and with one bucket per unit, as no move costs less than 1.
+    least = costs.least * (1 - 1e-7) if start else 0.0  # whatever the rounding
+    bounds, buckets = (costs.straight * least, costs.diagonal * least), BUCKETS if start else 1
     distance, state, opened, _ = known
     # A power of 2, so that a slot takes no division.
     ring = 1 << int((costs.highest + bounds[1]) * buckets + 2).bit_length()
@@ -98,8 +94,10 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
     while is_full:
         order = np.empty(opened.size, np.int64)
         count = _order(distance, state, opened, order, (start, bounds, buckets, costs.width))
-        first = np.argsort(order[:count])
-        opened, order = opened[first], order[first]
+        opened, order = opened[:count], order[:count]
+        if count > 1:
+            first = np.argsort(order)
+            opened, order = opened[first], order[first]
         bucket, used = np.empty((ring, capacity), np.int32), np.zeros(ring, np.int64)
         how = start, bounds, buckets, limit, offsets, costs.low
         queue = opened, order, bucket, used
@@ -119,9 +117,8 @@ def _order(distance: Any, state: Any, opened: Any, order: Any, how: Any) -> int:
         cell = np.int64(opened[number])
         if state[cell] == OPEN:
             state[cell] = MARKED
-            remaining = _remaining(
-                cell % width - start % width, cell // width - start // width, bounds
-            )
+            x, y = cell % width - start % width, cell // width - start // width
+            remaining = _remaining(x, y, bounds)
             order[count] = np.int64((distance[cell] + remaining) * buckets)
             opened[count] = cell
             count += 1
