@@ -101,7 +101,7 @@ def train_robot(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> in
         parser.add_argument(f"--{name}", type=kind, default=default, metavar="X", help=words)
     options = parser.parse_args(arguments)
     how = options.turning_radius, options.resolution, options.lattice, options.seed, options.padding
-    trainer = RobotTrainer.of(options.footprint, options.motion, *how)
+    trainer = RobotTrainer(options.footprint, options.motion, *how)
     with tqdm(total=options.steps, disable=None) as bar:
         for certificate in trainer.run(options.steps):
             bar.update(trainer.steps - bar.n)
