@@ -248,6 +248,15 @@ def test_a_wait_is_not_spread_along_the_way_or_to_other_ways() -> None:
         assert at(HALL, slowness, x, y) < 1.3
 
 
+def test_a_wait_beside_a_wall_costs_nothing_behind_it() -> None:
+    experience = driven(straight((2, 5), (12, 5)))
+    experience.record_failure((5, 5.1))
+    slowness = experience.slowness(MAPS[1])
+    assert at(HALL, slowness, 5, 5.1) > 10
+    assert at(HALL, slowness, 5, 5.6) < 1.3
+    assert at(HALL, experience.slowness(HALL), 5, 5.4) > 10
+
+
 def test_where_robots_wait_at_several_places_they_are_expected_to_wait_elsewhere_too() -> None:
     open_way, one, other = (
         driven(*[drive] * 4).slowness(HALL)[:10].mean()
