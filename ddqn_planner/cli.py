@@ -101,7 +101,7 @@ def train_robot(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> in
         parser.add_argument(f"--{name}", type=kind, default=default, metavar="X", help=words)
     options = parser.parse_args(arguments)
     how = options.turning_radius, options.resolution, options.lattice, options.seed, options.padding
-    trainer = RobotTrainer.of(options.footprint, options.motion, *how)
+    trainer = RobotTrainer(options.footprint, options.motion, *how)
     with tqdm(total=options.steps, disable=None) as bar:
         for certificate in trainer.run(options.steps):
             bar.update(trainer.steps - bar.n)
@@ -223,9 +223,9 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
         for drive in drives:
             drive.teach(experience, grid)
         try:
-            from ddqn_planner.training.prior import teach_prior
+            from ddqn_planner.training.prior import prior_of
 
-            teach_prior(experience, grid)
+            experience.prior = prior_of(grid, experience.evidence.table, experience.prior)
         except ImportError as error:
             print(f"the map's prior is not trained: {with_remedy(error)}")
         first = options.drives[0]

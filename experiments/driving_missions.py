@@ -14,7 +14,7 @@ from random_maps import Random
 
 from ddqn_planner import Experience, Planner, inflate, load_map
 from ddqn_planner.grid import Cell
-from ddqn_planner.training.prior import teach_prior
+from ddqn_planner.training.prior import prior_of
 
 MOVED_AT: Final = 100  # the mission before which all that is slow moves, where it does
 FAULT_EVERY: Final = 900.0  # seconds of driving: four faults per hour, one of each kind on average
@@ -82,8 +82,7 @@ def run(job: Job) -> Result:
         source, teacher = replace(job, kind=job.prior_from, prior_from=""), Experience(worlds.SPEED)
         taught = world_of(source)
         run_in(replace(source, missions=TEACHING), taught, teacher)
-        teach_prior(teacher, taught.grid)
-        learner.prior = teacher.prior
+        learner.prior = prior_of(taught.grid, teacher.evidence.table, teacher.prior)
     return run_in(job, world, learner)
 
 

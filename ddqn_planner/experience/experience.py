@@ -143,9 +143,10 @@ class Experience:
             way = np.array(_ways(at, STAND_DISTANCE)[1:], dtype=np.int64)
             if not len(way):
                 continue
-            stood = seconds[way[1:] - 1] - seconds[way[:-1]]
+            leaves = way[1:] - 1
+            stood = seconds[leaves] - seconds[way[:-1]]
             stood[stood < STAND / speed] = 0
-            waited = np.column_stack([at[way[:-1]], stood])
+            waited = np.column_stack([at[leaves], stood])
             waits.append(waited[(stood > 0) & (stood <= self.max_pause)])
             steps.append(_steps(np.diff(seconds[way]) - stood, at[way], step))
         rows = np.concatenate(steps)
@@ -193,7 +194,7 @@ class Experience:
 
     @prior.setter
     def prior(self, prior: Prior | None) -> None:
-        self.evidence.use_prior(prior)
+        self._learn(partial(Evidence.use_prior, prior=prior))
 
     def take_over(self, older: Experience) -> None:
         """Use what older experience solved for its map, which forgets it."""
@@ -280,7 +281,6 @@ class Experience:
                 if self._synchronised[0] == path:
                     for step in self._news:
                         step(saved.evidence)
-                    saved.prior = self.prior
                 else:
                     saved.merge(self)
                 saved.take_over(self)

@@ -27,7 +27,7 @@ WAIT_PASSAGES = 0.1  # passages without a wait that are assumed
 FEW_PLACES = 16.0  # it is assumed that so many were driven where nothing was slow
 NOISE = 0.1  # variance of the log slowness of one visit
 # Standard deviations of the log time of a drive: on ways that are known, and that are not.
-DRIVE_NOISE, UNSURE = 0.05, 0.5
+DRIVE_NOISE, UNSURE = 0.05, 0.42
 
 
 class Posterior:

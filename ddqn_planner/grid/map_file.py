@@ -217,7 +217,7 @@ def _read_ros(path: Path) -> MapFile:
         raise ValueError(f"not a YAML file ({' '.join(str(error).split())})") from error
     if not isinstance(document, dict):
         raise ValueError("not a YAML mapping; give 'key: value' lines: image, resolution, ...")
-    grey, clear, _ = _read_image(path, document, "image", ("PPM", "PNG", "BMP", "JPEG"))
+    grey, clear = _read_image(path, document, "image", ("PPM", "PNG", "BMP", "JPEG"), LAYOUTS)
     mode = _choice({"mode": "trinary", **document}, "mode", ("trinary", "scale", "raw"))
     values = _percent_of_grey(document, mode)[grey]
     if mode != "raw":
@@ -229,10 +229,8 @@ def _read_ros(path: Path) -> MapFile:
         raise ValueError(f"ddqn_planner is {_short(ours)}; give some of {keys}")
     forbidden = None
     if "directions" in ours:
-        forbidden, _, layout = _read_image(path, ours, "directions", ("PPM", "PNG"))
+        forbidden, _ = _read_image(path, ours, "directions", ("PPM", "PNG"), {"L"})
         name = ours.pop("directions")
-        if layout != "L":
-            raise MapDataError(f"{name!r}: its pixels are stored as {layout}; save 8 bits of grey")
         if forbidden.shape != values.shape:
             has, right = (f"{w} x {h}" for h, w in (forbidden.shape, values.shape))
             raise MapDataError(f"{name!r}: has {has} pixels; give {right}, as the map's image")
@@ -242,9 +240,9 @@ def _read_ros(path: Path) -> MapFile:
 
 
 def _read_image(
-    path: Path, document: dict[str, Any], key: str, formats: tuple[str, ...]
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_], str]:
-    """Return an image's grey values, which pixels are not opaque, and the layout of the pixels."""
+    path: Path, document: dict[str, Any], key: str, formats: tuple[str, ...], layouts: set[str]
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Return an image's grey values, and which pixels are not opaque."""
     from PIL import Image  # 17 ms, and a planner that is sent its maps reads no image
 
     name = document.get(key)
@@ -259,15 +257,15 @@ def _read_image(
         raise ValueError(f"{key} is {name!r}, outside of the folder of the YAML; put it beside")
     try:
         with Image.open(file, formats=formats) as image:
-            layout = _layout(image)
-            return *_grey(image), layout
+            _check_layout(image, layouts)
+            return _grey(image)
     except Exception as error:  # Pillow's decoders raise many exceptions on broken bytes
         remedy = f"give a {', '.join(formats)} image of at most {MAX_CELLS} pixels"
         raise MapDataError(f"{str(file)!r}: not readable ({error}); {remedy}") from error
 
 
-def _layout(image: Any) -> str:
-    """Return Pillow's name of the layout; ValueError if map_server reads it differently."""
+def _check_layout(image: Any, layouts: set[str]) -> None:
+    """Raise a ValueError for an image that is too large, or of other layouts than these."""
     if image.width * image.height > MAX_CELLS:
         raise ValueError(f"{image.width} x {image.height} pixels")
     codec, *_, arguments = image.tile[0]
@@ -275,11 +273,10 @@ def _layout(image: Any) -> str:
     # The last argument of a PPM is its greatest value, unless that is the greatest of its bytes.
     greatest = 65535 if image.mode == "I" else 255
     scaled = codec.startswith("ppm") and rest not in ([], [greatest])
-    if scaled or layout not in LAYOUTS or codec == "bmp_rle":
-        raise ValueError(f"its pixels are stored as {codec} {arguments}; save an 8-bit PNG")
+    if scaled or layout not in layouts or codec == "bmp_rle":
+        raise ValueError(f"its pixels are stored as {codec} {arguments}; save an 8-bit grey PNG")
     if "transparency" in image.info and image.mode != "P":
         raise ValueError("one of its colours is transparent; save it with an alpha channel")
-    return str(layout)
 
 
 def _grey(image: Any) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:

@@ -339,10 +339,6 @@ class FieldCache:
         # may at worst forget what another has just kept.
         self._kept: list[_Kept] = []
 
-    def has_costs(self, grid: GridMap, rule: MoveRule) -> bool:
-        """Return whether the network gives the costs of a map's moves, see `DistanceField`."""
-        return self._costs(grid, rule) is not None
-
     def find(self, grid: GridMap, goals: Goals, rule: MoveRule) -> QField | None:
         """Return the field of a map toward the nearest of some goals if it is kept, else None."""
         for kept in self._of_rule(rule):
@@ -355,7 +351,7 @@ class FieldCache:
         """Return the field of a map toward the nearest of some goals: several, if it has costs."""
         field = self.find(grid, goals, rule)
         if field is None:
-            costs = self._costs(grid, rule)
+            costs = self.costs(grid, rule)
             if costs is None:
                 field = network_field(self.network, grid, goals[0], rule)
             else:
@@ -369,17 +365,16 @@ class FieldCache:
         """Return what is kept for a move rule, used last first."""
         return [kept for kept in reversed(self._kept) if kept.rule is rule]
 
-    def _costs(self, grid: GridMap, rule: MoveRule) -> MoveCosts | None:
-        """Return the costs of a map's moves: known, from those of the map it patches, or new."""
-        known = self._of_rule(rule)
+    def costs(self, grid: GridMap, rule: MoveRule) -> MoveCosts | None:
+        """Return the costs of a map's moves, if a network gives them: see `DistanceField`."""
+        known, costs = self._of_rule(rule), None
         for kept in known:
             if grid.same_cells(kept.grid):
                 return kept.costs
-        costs = None
         for kept in known:
             boxes = grid.patches_since(kept.grid)
-            if boxes is not None and kept.costs is not None and costs is None:
-                costs = kept.costs.after(grid, boxes)
+            if boxes is not None and kept.costs is not None:
+                costs = costs or kept.costs.after(grid, boxes)
         costs = costs or self.network.move_costs(grid, rule)
         self._use(_Kept(grid, rule, costs))
         return costs
@@ -388,8 +383,8 @@ class FieldCache:
         """Give a new field what a field of an older map knows, if there is one."""
         shift_from = cache(lambda older: shift_between(older, new.grid))  # many are of one map
         for kept in self._of_rule(new.move_rule):
-            old, shift = kept.field, shift_from(kept.grid)
-            if shift is None or not isinstance(old, DistanceField):
+            old = kept.field
+            if not isinstance(old, DistanceField) or (shift := shift_from(kept.grid)) is None:
                 continue
             moved_goals = tuple((x + shift[0], y + shift[1]) for x, y in old.goals)
             if moved_goals == new.goals and new.take_over(old, shift, start):

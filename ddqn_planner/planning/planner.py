@@ -285,7 +285,7 @@ class Planner:
             yield Plan(status, move_rule=rule)
             return
         goals = tuple(sorted({goal for goal in request.goals if grid.is_free(goal)}))
-        if len(goals) > 1 and not self.fields.has_costs(grid, rule):
+        if len(goals) > 1 and self.fields.costs(grid, rule) is None:
             yield None
             goals = self._nearest_alone(request, goals)
         plan = yield from self._roll_out(request, goals)
@@ -317,7 +317,7 @@ class Planner:
         plan = known.rollout_if_known(start, straight) if known else None
         if plan is None or (not plan.path.size and request.reach >= 1):
             yield None
-        if plan is None and goals and self.fields.has_costs(grid, request.move_rule):
+        if plan is None and goals and self.fields.costs(grid, request.move_rule):
             field = self.fields.get(grid, goals, request.move_rule, start)
             assert isinstance(field, DistanceField)
             plan = field.rollout(start, straight, VISITS)

@@ -81,7 +81,12 @@ class PoseField:
             proved = self._bound(number)
             if proved <= bound * SAME or self._least == math.inf:
                 return proved
-            most = self._until_look(number, limit)
+            shift, most = self._aim.shift, limit
+            # Tiles of half the size take 4 times as long, and show that narrower gaps are closed.
+            # Once a path is known, they hardly prove more.
+            if shift > SHIFT or (shift > FINEST and proved == math.inf):
+                until_look = (UNGUIDED << 3 * (SHIFT + 1 - shift)) - self.visits
+                most = min(limit, max(until_look, 0))
             how = self._aim, 1.0 if self._aim.weight > 1 else 1 / bound, most, self.world, self.body
             self._size, visits, done = kernels.grow(self.known, self._heap, self._size, *how)
             limit, self.visits = limit - visits, self.visits + visits
@@ -91,7 +96,7 @@ class PoseField:
                 return None
             elif visits < most:  # the heap is full
                 self._order(self._aim.weight)
-            elif self._can_leave(number):
+            elif proved < math.inf or self._can_leave(number):
                 self._look_at_map()
                 self._order(self._aim.weight)
             else:
@@ -103,15 +108,6 @@ class PoseField:
             return math.inf
         cost = float(self.known.distance[number])
         return cost / least if (least := min(self._least, cost)) else 1.0
-
-    def _until_look(self, number: int, limit: int) -> int:
-        """Return how many states are visited before the next look at the map pays, or a limit."""
-        shift, is_found = self._aim.shift, self.known.mark[number] != kernels.UNREACHED
-        # Tiles of half the size take 4 times as long, and show that narrower gaps are closed. Once
-        # a path is known, they hardly prove more.
-        if shift == FINEST or (shift == SHIFT and is_found):
-            return limit
-        return min(max((UNGUIDED << 3 * (SHIFT + 1 - shift)) - self.visits, 0), limit)
 
     def _order(self, weight: float) -> None:
         """Begin a round: what is open or waits is ordered toward the start."""

@@ -77,22 +77,28 @@ def in_cells(poses: Float64, grid: GridMap) -> Float64:
     return np.column_stack([turned / grid.resolution - 0.5, yaw])
 
 
+def nearest_pose(poses: Float64, robot: Any, grid: GridMap, reach: tuple[float, float]) -> int:
+    """Return which of some poses (N, 3) is nearest to a robot; -1 if none is within reach."""
+    x, y, yaw = (poses - robot).T
+    apart, turn = np.hypot(x, y) / grid.resolution, np.abs(turn_between(0, yaw))
+    is_near = (apart <= reach[0]) & (turn <= reach[1])
+    far = np.where(is_near, apart / REACH[0] + turn / REACH[1], np.inf)
+    return int(far.argmin()) if is_near.any() else -1
+
+
 def rest_of_poses(
     way: Any, robot: Any, grid: GridMap, body: Body, reach: tuple[float, float] = REACH
 ) -> Float64:
     """Return a path from the pose nearest to a robot on; empty if it is far, or has no room."""
     poses: Float64 = np.asarray(way, dtype=np.float64).reshape(-1, 3)
-    path, (x, y, yaw) = in_cells(poses, grid), in_cells(robot, grid)[0]
-    apart = np.hypot(path[:, 0] - x, path[:, 1] - y)
-    turn = np.abs(turn_between(path[:, 2], yaw))
-    near = np.flatnonzero((apart <= reach[0]) & (turn <= reach[1]))
-    if not len(near):
+    first = nearest_pose(poses, robot, grid, reach)
+    if first < 0:
         return poses[:0]
-    first = int(near[(apart / REACH[0] + turn / REACH[1])[near].argmin()])
-    cells = cells_of(path[first:])
+    path = in_cells(poses[first:], grid)
+    cells = cells_of(path)
     occupied, (outline, within) = occupied_for_body(grid).view(np.uint8), body
     # What is inside the body at a later pose has come through its outline.
-    if touches(path[first:], outline, occupied) or touches(path[first:][:1], within, occupied):
+    if touches(path, outline, occupied) or touches(path[:1], within, occupied):
         return poses[:0]
     if grid.forbidden is not None:
         actions = {tuple(move): 1 << action for action, move in enumerate(MOVES.tolist())}

@@ -187,12 +187,9 @@ class PosePlanner:
             found = self._differences(known.grid, request.grid)
             if found is None or len(found[0]):
                 continue
-            x, y, yaw = (way.poses - request.start).T
-            far, turn = np.hypot(x, y) / request.grid.resolution, np.abs(turn_between(0, yaw))
-            is_near = (far <= ON_PATH[0]) & (turn <= ON_PATH[1])
-            apart = np.where(is_near, far + turn, np.inf)
-            plan = way.plan(int(apart.argmin()), request.grid)
-            if is_near.any() and plan.bound <= request.bound * paths.SAME:
+            first = paths.nearest_pose(way.poses, request.start, request.grid, ON_PATH)
+            plan = way.plan(first, request.grid) if first >= 0 else None
+            if plan is not None and plan.bound <= request.bound * paths.SAME:
                 return plan
         return None
 

@@ -19,6 +19,7 @@ from ddqn_planner.planning.field import CHANGED_SHARE, overlap, shift_between
 SHIFT: Final = 2  # so many bits tell where in its tile a cell lies, along a side
 TILE: Final = 1 << SHIFT  # cells of a side
 BORDER: Final = 128  # occupied cells around the map, so that a body sweeps none beyond the bits
+PER_COST: Final = np.append(MULTIPLIERS, MULTIPLIERS[-1:])  # of costs 0 to 100 and, last, unknown
 State: TypeAlias = tuple[int, int, int]  # x, y, heading
 FINE = 0.01  # cells between two points of the origin's way, which tell the cells that it passes
 WORD, LAST_BIT, ONE, FULL = np.uint64(64), np.uint64(63), np.uint64(1), np.uint64(2**64 - 1)
@@ -51,7 +52,6 @@ class World(NamedTuple):
 
     bits: NDArray[np.uint64]  # (rows, words): a bit for each occupied cell, with the border
     cost: NDArray[np.int8]  # (H, W)
-    multipliers: NDArray[np.float32]  # (102,): of costs 0 to 100 and, last, unknown
     slowness: NDArray[np.float32]  # (H, W)
     forbidden: NDArray[np.uint8]  # (H, W)
     tile: NDArray[np.uint8]  # (T,): whether the body can reach an occupied cell, once it is known
@@ -155,7 +155,6 @@ def world_of(
     return World(
         bits,
         _layer(body_costs(grid), np.int8),
-        MULTIPLIERS if grid.cost is None else np.append(MULTIPLIERS, MULTIPLIERS[-1:]),
         _layer(grid.slowness, np.float32),
         _layer(grid.forbidden, np.uint8),
         tile,
@@ -228,7 +227,7 @@ def multiplier_in(x: int, y: int, world: Any) -> Any:
     """Return what a cell of the origin's way costs per cell of its length."""
     factor = np.float32(1)
     if world.cost.size > 0:
-        factor = world.multipliers[world.cost[y, x]]
+        factor = PER_COST[world.cost[y, x]]
     if world.slowness.size > 0:
         factor *= world.slowness[y, x]
     return factor

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, read_map_file
-from ddqn_planner.grid.motions import HEADINGS, Motions
 from ddqn_planner.model.networks import GOAL, OBSTACLE, ROBOT, observation_background, observe
 from ddqn_planner.resources import find_resource
 from ddqn_planner.training.exploring_starts import initial_cells
@@ -52,7 +51,6 @@ class GridVectorEnvironment:
 
     # Cells are numbers y * W + x. The results of moves are looked up in tables (S, 8, H * W).
     # `reset` begins the first episodes too; one that has ended keeps its last cell until then.
-    headings = 1
 
     def __init__(
         self,
@@ -72,13 +70,19 @@ class GridVectorEnvironment:
 
         maps = [observation_background(s.grid.occupancy, s.goal) for s in scenarios]
         self.background = np.stack(maps)
-        self.legal, self.free_reward, self.next_cell, free_SC = self._tables()
+        tables, to_number = (len(maps), len(MOVES), -1), np.array([1, self.shape[1]])
+        with_rules = list(zip(self.scenarios, self.move_rules, strict=True))
+        legal = [s.grid.legal_moves(rule) for s, rule in with_rules]
+        reward = [move_reward(s.grid, s.start, s.goal, rule, parameters) for s, rule in with_rules]
+        self.legal = np.stack(legal).reshape(tables)
+        self.free_reward = np.stack(reward).reshape(tables)
         collision = np.float32(parameters.obstacle_reward)
         self.rewards = np.where(self.legal, self.free_reward, collision)
-        to_number = np.array([1, self.shape[1]]) * self.headings
+        self.next_cell = np.arange(self.background.shape[1]) + (MOVES @ to_number)[:, None]
         self.start = np.array([s.start for s in scenarios]) @ to_number
         self.goal = np.array([s.goal for s in scenarios]) @ to_number
 
+        free_SC = np.stack([~s.grid.occupancy.ravel() for s in scenarios])
         free_SC[np.arange(len(self.goal)), self.goal] = False
         _, self._free = np.nonzero(free_SC)
         self._free_count = free_SC.sum(axis=1)
@@ -87,17 +91,6 @@ class GridVectorEnvironment:
         self.scenario = np.zeros(parameters.environments, dtype=np.int64)
         self.cell = self.start[self.scenario]
         self.steps = np.zeros(parameters.environments, dtype=np.int64)
-
-    def _tables(self) -> Tables:
-        """Return what is legal, its reward (S, 8, C), where it leads (8, C), first cells (S, C)."""
-        tables, p = (len(self.scenarios), len(MOVES), -1), self.parameters
-        with_rules = list(zip(self.scenarios, self.move_rules, strict=True))
-        legal = [s.grid.legal_moves(rule) for s, rule in with_rules]
-        reward = [move_reward(s.grid, s.start, s.goal, rule, p) for s, rule in with_rules]
-        free_SC = np.stack([~s.grid.occupancy.ravel() for s in self.scenarios])
-        offset = MOVES @ np.array([1, self.shape[1]])
-        next_cell = np.arange(free_SC.shape[1]) + offset[:, None]
-        return np.stack(legal).reshape(tables), np.stack(reward).reshape(tables), next_cell, free_SC
 
     def reset(self, mask: NDArray[np.bool_] | None = None) -> None:
         """Start new episodes: all, or those where `mask` (N,) is True."""
@@ -123,53 +116,7 @@ class GridVectorEnvironment:
 
     def observations(self) -> Observations:
         """Return what the robots observe: (N, H, W) float32."""
-        return observe(self.background[self.scenario], self.cell // self.headings, self.shape)
-
-
-class PoseVectorEnvironment(GridVectorEnvironment):
-    """The same for a robot with a body: K primitives of each heading, which bump into obstacles."""
-
-    # Cells are poses here, numbers (y * W + x) * 16 + heading. The maps repeat in all directions,
-    # so that the robot meets obstacles alone. Its episodes begin on obstacles, too: what is beneath
-    # it is part of its body. A heading with fewer primitives than others has some of them twice.
-    headings = HEADINGS
-
-    def __init__(
-        self,
-        scenarios: Sequence[Scenario],
-        motions: Motions,
-        swept: NDArray[np.bool_],
-        parameters: HyperParameters,
-        random: np.random.Generator,
-    ) -> None:
-        of_heading = [np.flatnonzero(motions.start == heading) for heading in range(HEADINGS)]
-        most = max(map(len, of_heading))
-        self.primitive = np.array([np.resize(numbers, most) for numbers in of_heading]).T
-        self.motions, self.swept = motions, swept
-        super().__init__(scenarios, MoveRule.ROBOT_SAFE, parameters, random)
-
-    def _tables(self) -> Tables:
-        (height, width), motions, primitive_KN = self.shape, self.motions, self.primitive
-        y, x = np.mgrid[:height, :width].reshape(2, -1, 1)
-        dx, dy = motions.offset[primitive_KN].T[..., None, :].swapaxes(1, 3)
-        cell_KCN = (y + dy) % height * width + (x + dx) % width
-        next_cell = cell_KCN * HEADINGS + motions.end[primitive_KN][:, None]
-        maps = [around(s.grid.occupancy, self.swept) == 0 for s in self.scenarios]
-        legal_SPC = np.stack(maps).reshape(len(maps), len(self.swept), -1)
-        legal = legal_SPC[:, primitive_KN].swapaxes(2, 3).reshape(len(maps), len(primitive_KN), -1)
-        reward = np.tile(-motions.cost[primitive_KN], (len(maps), 1, height * width))
-        first = np.ones((len(maps), height * width * HEADINGS), dtype=np.bool_)
-        return legal, reward, next_cell.reshape(len(primitive_KN), -1), first
-
-
-def around(occupancy: NDArray[np.bool_], seen_PSS: NDArray[Any]) -> NDArray[np.float32]:
-    """Return the sum of what each primitive has for the cells that are occupied: (P, H, W)."""
-    total = np.zeros((len(seen_PSS), *occupancy.shape), dtype=np.float32)
-    near = np.arange(seen_PSS.shape[1]) - seen_PSS.shape[1] // 2
-    for y, x in np.argwhere(occupancy):
-        from_y, from_x = (y - near) % occupancy.shape[0], (x - near) % occupancy.shape[1]
-        total[:, from_y[:, None], from_x] += seen_PSS
-    return total
+        return observe(self.background[self.scenario], self.cell, self.shape)
 
 
 class GridEnvironment(gymnasium.Env[Observations, np.int64]):

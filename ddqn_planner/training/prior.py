@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,9 +11,6 @@ from torch import nn
 from ddqn_planner.experience.posterior import cells_of
 from ddqn_planner.experience.prior import FEATURES, UNUSUAL, Float32, Prior, map_features
 from ddqn_planner.grid import GridMap
-
-if TYPE_CHECKING:
-    from ddqn_planner.experience import Experience
 
 UNITS = 16
 RIDGE = 10.0  # the weight of so many places speaks against each linear prediction
@@ -24,9 +21,8 @@ FOLDS = 6  # networks that each leave out a part of the places; one more learns 
 BLOCKS, PLACES = 12, (8, 32)  # near places are alike: so many in a row are left out together
 DOUBT = 2.0  # what is foretold must be so many standard errors from nothing to be believed
 REPLAYED = 512  # places of older maps, and as many of this one, are kept to learn from again
-
-
 FEWEST_PLACES = 32  # from which a prior is learned
+MOST = 6.0  # weight of a place: those on every way do not govern all
 
 
 def prior_of(grid: GridMap, table: Any, older: Prior | None, seed: int = 0) -> Prior | None:
@@ -37,12 +33,8 @@ def prior_of(grid: GridMap, table: Any, older: Prior | None, seed: int = 0) -> P
     if seen.sum() < FEWEST_PLACES:
         return older
     weight, log = table[seen, :2].T
-    return train_prior(map_features(grid)[y[seen], x[seen]], log / weight, weight, older, seed)
-
-
-def teach_prior(experience: Experience, grid: GridMap, seed: int = 0) -> None:
-    """Let the places of experience that lie on a map teach its prior."""
-    experience.prior = prior_of(grid, experience.evidence.table, experience.prior, seed)
+    features, mean = map_features(grid)[y[seen], x[seen]], log / weight
+    return train_prior(features, mean, np.minimum(weight, MOST), older, seed)
 
 
 def train_prior(

@@ -7,39 +7,33 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import GridMap, MoveRule
 from ddqn_planner.grid.footprint import read_footprint
-from ddqn_planner.grid.motions import HEADINGS, Motions, make_motions, read_lattice
+from ddqn_planner.grid.motions import HEADINGS, make_motions, read_lattice
 from ddqn_planner.model import ModelMetadata, RobotNetwork, package_version
 from ddqn_planner.model.robot import BodyCertificate
 from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions, double_dqn_gradient
-from ddqn_planner.training.environment import PoseVectorEnvironment, Scenario, around
+from ddqn_planner.training.exploring_starts import initial_cells
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.propagation import value_iteration
 
-# Shapes: B = a batch, U units, S x S cells around the robot, K = primitives of a heading, C = cells
-# by heading.
+# Shapes: B = a batch, U units, K = primitives of each of N headings (those with few have some
+# twice), M maps, which repeat in all directions, C poses, numbers (y * W + x) * 16 + heading.
 
-# Every episode starts at any pose, and all actions are random. The batch and the environments are
-# per unit. A collision costs much more than a primitive, so that all successes teach about as much.
+# Every episode is one random primitive from any pose. The batch and the environments are per unit.
+# A collision costs much more than a primitive, so that all successes teach about as much.
 ROBOT: Final = HyperParameters(
-    network="propagation",
-    reward="path_cost",
     learning_rate=4.5e-5,
     batch_size=24,
     gamma=0.2,
     obstacle_reward=-1000.0,
-    goal_reward=0.0,
     p_r=1.0,
     steps=40_000_000,
     replay_capacity=200_000,
     learning_starts=250,
     target_interval=2000,
-    epsilon_end=1.0,
-    max_episode_steps=1,
     environments=12,
 )
 FIRST: Final = 0.3, 1.0  # the weights and the thresholds of a network that knows nothing
@@ -50,44 +44,22 @@ CHECKED: Final = 100  # updates between two proofs
 MARGIN: Final = 0.02  # of the proof, with which the training ends
 
 
-def random_scenarios(side: int, random: np.random.Generator) -> list[Scenario]:
-    """Draw maps, wider than what the robot sees, with one obstacle: so it is known what was hit."""
-    width, scenarios = side + 5, []
-    for _ in range(max(4, min(16, 60_000 // width**2))):  # fewer, if they are large
-        start, goal, occupied = random.choice(width**2, 3, replace=False).tolist()
-        occupancy = np.zeros((width, width), dtype=np.bool_)
-        occupancy.flat[occupied] = True
-        ends = (start % width, start // width), (goal % width, goal // width)
-        scenarios.append(Scenario(GridMap(occupancy), *ends))
-    return scenarios
+def random_maps(
+    side: int, random: np.random.Generator
+) -> tuple[int, NDArray[np.int64], NDArray[np.int64]]:
+    """Draw maps with one obstacle, so it is known what was hit: width, goals (M,), obstacles."""
+    width = side + 5  # more than what the robot sees
+    count = max(4, min(16, 60_000 // width**2))  # fewer, if they are large
+    # Three cells are drawn, and two used: the draws belong to what one seed gives.
+    drawn = np.array([random.choice(width**2, 3, replace=False) for _ in range(count)])
+    return width, drawn[:, 1] * HEADINGS, np.column_stack(np.divmod(drawn[:, 2], width))
 
 
 class RobotTrainer:
     """Trains a `RobotNetwork` by Double DQN; the same arguments give the same network."""
 
-    def __init__(self, footprint: NDArray[np.float64], motions: Motions, seed: int) -> None:
-        self.network, self.seed = RobotNetwork.untrained(footprint, motions), seed
-        tensors, units = self.network.tensors, self.network.sizes["units"]
-        counts = {name: min(4096, units * getattr(ROBOT, name)) for name in PER_UNIT}
-        self.parameters = replace(ROBOT, **counts)
-        draws = np.random.SeedSequence(seed).spawn(4)
-        maps, initial, self._exploration, self._sampling = map(np.random.default_rng, draws)
-        swept = self.network.swept_by_unit
-        scenarios = random_scenarios(swept.shape[1], maps)
-        body = self.network.motions, self.network.of_primitives(swept)
-        self.environment = PoseVectorEnvironment(scenarios, *body, self.parameters, initial)
-        self._replay = ReplayBuffer(self.parameters.replay_capacity)
-        self.steps = self.updates = 0
-
-        tensors["weight"][:], tensors["threshold"][:] = FIRST
-        # A unit's weights in a row, and one more of 0 for what it does not see.
-        self._weight = np.pad(tensors["weight"].reshape(units, -1), ((0, 0), (0, 1)))
-        self._threshold = tensors["threshold"]
-        self._obstacle = np.array([np.argwhere(s.grid.occupancy)[0, ::-1] for s in scenarios])
-
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         footprint: str | None,
         motion: str | None,
         turning_radius: float,
@@ -95,19 +67,53 @@ class RobotTrainer:
         lattice: str | None,
         seed: int,
         padding: float = 0.0,
-    ) -> RobotTrainer:
-        """Return the trainer of a robot as a user describes it; a ValueError says what is wrong."""
+    ) -> None:
         if motion is not None and lattice is None:
             motions = make_motions(motion, turning_radius, resolution)
         elif lattice is not None and motion is None:
             motions = read_lattice(lattice)
         else:
             raise ValueError(f"motion is {motion}, lattice is {lattice}; give one of the two")
-        return cls(read_footprint(footprint, padding), motions, seed)
+        self.network = RobotNetwork.untrained(read_footprint(footprint, padding), motions)
+        self.seed = seed
+        tensors, units = self.network.tensors, self.network.sizes["units"]
+        counts = {name: min(4096, units * getattr(ROBOT, name)) for name in PER_UNIT}
+        self.parameters = replace(ROBOT, **counts)
+        draws = np.random.SeedSequence(seed).spawn(4)
+        maps, *generators = map(np.random.default_rng, draws)
+        self._initial, self._exploration, self._sampling = generators
+        swept = self.network.swept_by_unit
+        self.width, self.goal_M, self.obstacle_M2 = random_maps(swept.shape[1], maps)
+
+        of_heading = [np.flatnonzero(motions.start == heading) for heading in range(HEADINGS)]
+        most = max(map(len, of_heading))
+        self.primitive_KN = np.array([np.resize(numbers, most) for numbers in of_heading]).T
+        y, x = np.mgrid[: self.width, : self.width].reshape(2, -1, 1)
+        dx, dy = motions.offset[self.primitive_KN].T[..., None, :].swapaxes(1, 3)
+        cell_KCN = (y + dy) % self.width * self.width + (x + dx) % self.width
+        next_KCN = cell_KCN * HEADINGS + motions.end[self.primitive_KN][:, None]
+        self.next_KC = next_KCN.reshape(most, -1)
+        self.reward_KC = np.tile(-motions.cost[self.primitive_KN], self.width**2)
+        is_first_MC = np.arange(self.next_KC.shape[1]) != self.goal_M[:, None]
+        _, self._first = np.nonzero(is_first_MC)  # where episodes start: on obstacles, too
+        self._replay = ReplayBuffer(self.parameters.replay_capacity)
+        self.steps = self.updates = 0
+
+        tensors["weight"][:], tensors["threshold"][:] = FIRST
+        # A unit's cells in a row, and one more of 0 for what it does not see.
+        one_more = (0, 0), (0, 1)
+        self._weight = np.pad(tensors["weight"].reshape(units, -1), one_more)
+        self._swept = np.pad(swept.reshape(units, -1), one_more)
+        self._threshold = tensors["threshold"]
+        # Where a robot that has turned by quarters sees an obstacle, so many rows and columns away.
+        side = swept.shape[1]
+        near, seen = np.arange(side) - side // 2, np.arange(side * side).reshape(side, side)
+        self._place = np.full((4, self.width, self.width), side * side)
+        for quarter in range(4):
+            self._place[quarter][np.ix_(near, near)] = np.rot90(seen, -quarter)
 
     def run(self, until: int) -> Iterator[BodyCertificate]:
         """Train until all is proved, or so many steps are done; yield what is proved so far."""
-        self.environment.reset()
         self._settle()
         certificate = self.network.certificate()
         yield certificate
@@ -123,20 +129,28 @@ class RobotTrainer:
 
     def metadata(self) -> ModelMetadata:
         """Return what the model file says of the network as it is now."""
-        first = self.environment.scenarios[0].grid.fingerprint
+        occupancy = np.zeros((self.width, self.width), dtype=np.bool_)
+        occupancy[tuple(self.obstacle_M2[0])] = True
         p, sizes = self.parameters, self.network.sizes
-        of_training = first, self.steps, self.seed, package_version()
+        of_training = GridMap(occupancy).fingerprint, self.steps, self.seed, package_version()
         return ModelMetadata(self.network.name, sizes, MoveRule.ROBOT_SAFE, p.gamma, *of_training)
 
     def _step(self) -> None:
         """Let each robot try a random primitive, and remember what came of it."""
-        e, p = self.environment, self.parameters
-        scenario, cell = e.scenario.copy(), e.cell
-        actions = self._exploration.integers(len(e.primitive), size=p.environments)
-        reward, terminated, truncated = e.move(actions)
-        discount = np.where(terminated, 0.0, p.gamma).astype(np.float32)
-        self._replay.add(Transitions(scenario, cell, actions, reward, e.cell, discount))
-        e.reset(terminated | truncated)
+        p, maps = self.parameters, len(self.goal_M)
+        scenario = self._initial.integers(maps, size=p.environments)
+        count = np.full(p.environments, len(self._first) // maps)
+        places = self._first, scenario * count, count
+        cell = initial_cells(self.goal_M[scenario], *places, p.p_r, self._initial)
+        actions = self._exploration.integers(len(self.primitive_KN), size=p.environments)
+        unit_BK, place_B = self._observed(scenario, cell)
+        legal = ~self._swept[unit_BK[np.arange(len(cell)), actions], place_B]
+        next_cell = np.where(legal, self.next_KC[actions, cell], cell)
+        collision = np.float32(p.obstacle_reward)
+        reward = np.where(legal, self.reward_KC[actions, cell], collision)
+        goes_on = legal & (next_cell != self.goal_M[scenario])
+        discount = np.where(goes_on, p.gamma, 0.0).astype(np.float32)
+        self._replay.add(Transitions(scenario, cell, actions, reward, next_cell, discount))
         self.steps += p.environments
 
     def _update(self) -> None:
@@ -145,12 +159,11 @@ class RobotTrainer:
         batch = self._replay.sample(p.batch_size, self._sampling)
         states = np.tile(batch.scenario, 2), np.concatenate([batch.cell, batch.next_cell])
         unit_2BK, place_2B = self._observed(*states)
-        logit_2BK = self._threshold[unit_2BK] - self._weight[unit_2BK, place_2B[:, None]]
-        p_2BK = 0.5 + 0.5 * np.tanh(0.5 * logit_2BK)
+        p_2BK = self._success(unit_2BK, place_2B)
         collision = np.float32(p.obstacle_reward)
         gain_2BK = self._return_SCK[states] - collision
         q = self._q_SCK[batch.scenario, batch.next_cell], collision + p_2BK * gain_2BK
-        q_gradient = double_dqn_gradient(p.target, batch, *map(torch.from_numpy, q)).numpy()
+        q_gradient = double_dqn_gradient(p.target, batch, *q)
         taken = np.arange(p.batch_size), batch.action
         by_logit_B = (q_gradient * gain_2BK[: p.batch_size])[taken]
         by_logit_B *= p_2BK[taken] * (1 - p_2BK[taken])
@@ -170,35 +183,26 @@ class RobotTrainer:
         self, scenario: NDArray[np.int64], cell: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the unit of each action, (B, K), and the place of the obstacle, (B,)."""
-        (height, width), side = self.environment.shape, self.network.sizes["side"]
-        reach, heading, cell = side // 2, cell % HEADINGS, cell // HEADINGS
-        x, y = self._obstacle[scenario].T
-        x = (x - cell % width + reach) % width - reach
-        y = (y - cell // width + reach) % height - reach
-        for quarter in range(1, 4):
-            turned = heading // (HEADINGS // 4) >= quarter
-            x, y = np.where(turned, (y, -x), (x, y))
-        far = np.maximum(np.abs(x), np.abs(y)) > reach
-        place_B = np.where(far, side * side, (y + reach) * side + x + reach)
-        return self.network.unit[self.environment.primitive[:, heading]].T, place_B
+        heading, cell, width = cell % HEADINGS, cell // HEADINGS, self.width
+        y, x = self.obstacle_M2[scenario].T
+        seen = heading // (HEADINGS // 4), (y - cell // width) % width, (x - cell % width) % width
+        return self.network.unit[self.primitive_KN[:, heading]].T, self._place[seen]
+
+    def _success(
+        self, unit_BK: NDArray[np.int64], place_B: NDArray[np.int64]
+    ) -> NDArray[np.float32]:
+        """Return p(s, a) of what `_observed` returns: (B, K)."""
+        logit_BK = self._threshold[unit_BK] - self._weight[unit_BK, place_B[:, None]]
+        p_BK: NDArray[np.float32] = 0.5 + 0.5 * np.tanh(0.5 * logit_BK)
+        return p_BK
 
     def _settle(self) -> None:
         """As the target network, settle V on every map."""
-        e, p = self.environment, self.parameters
-        weight_PSS = self.network.of_primitives(
-            self._weight[:, :-1].reshape(self.network.tensors["weight"].shape)
-        )
-        threshold_P11 = self._threshold[self.network.unit][:, None, None]
-        self._return_SCK = np.empty(e.free_reward.swapaxes(1, 2).shape, np.float32)
+        p, cells = self.parameters, np.arange(self.next_KC.shape[1])
+        self._return_SCK = np.empty((len(self.goal_M), *self.next_KC.T.shape), np.float32)
         self._q_SCK = np.empty_like(self._return_SCK)
-        for number, scenario in enumerate(e.scenarios):
-            logit_PC = (threshold_P11 - around(scenario.grid.occupancy, weight_PSS)).reshape(
-                len(weight_PSS), -1
-            )
-            p_CK = (0.5 + 0.5 * np.tanh(0.5 * logit_PC[e.primitive])).transpose(2, 1, 0)
-            p_1CK = p_CK.reshape(1, -1, len(e.primitive))
-            given = e.free_reward[[number]].swapaxes(1, 2), e.goal[[number]], e.next_cell, p.gamma
-            (return_CK,) = value_iteration(p_1CK, *given, p.obstacle_reward)
-            self._return_SCK[number] = return_CK
-            collision = np.float32(p.obstacle_reward)
-            self._q_SCK[number] = collision + p_1CK[0] * (return_CK - collision)
+        for number in range(len(self.goal_M)):
+            p_1CK = self._success(*self._observed(np.full_like(cells, number), cells))[None]
+            given = self.reward_KC.T[None], self.goal_M[[number]], self.next_KC, p.gamma
+            (returns,), (q,) = value_iteration(p_1CK, *given, p.obstacle_reward)
+            self._return_SCK[number], self._q_SCK[number] = returns, q

@@ -305,10 +305,13 @@ def test_the_bottom_row_of_the_image_of_directions_is_row_0(tmp_path: Path) -> N
 def test_an_image_that_holds_no_directions_is_refused(tmp_path: Path) -> None:
     for image, name, named in (
         (GREY.resize((2, 3)), "d.png", "has 2 x 3 pixels; give 3 x 2, as the map's image"),
-        (GREY.convert("RGB"), "d.png", "stored as RGB; save 8 bits of grey"),
-        *((GREY.convert(mode), "d.png", f"stored as {mode}") for mode in ("LA", "P", "1", "I;16")),
+        *(
+            (GREY.convert(mode), "d.png", f"stored as zip {mode}")
+            for mode in ("RGB", "LA", "P", "1")
+        ),
+        (GREY.convert("I;16"), "d.png", "stored as zip I;16B; save an 8-bit grey PNG"),
         (GREY, "d.jpg", "not readable .* give a PPM, PNG image"),
-        (b"P5\n3 2\n100\n" + bytes(6), "d.pgm", "save an 8-bit PNG"),
+        (b"P5\n3 2\n100\n" + bytes(6), "d.pgm", "save an 8-bit grey PNG"),
         (b"P5\n3 2\n255\n" + bytes(5), "d.pgm", "not readable"),
     ):
         with pytest.raises(MapDataError, match=rf"{name}'.*{named}"):

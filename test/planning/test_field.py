@@ -245,7 +245,7 @@ def test_a_map_made_of_others_is_as_new(place: Place, rule: MoveRule, data: Data
         fresh = replace(fresh, seconds_per_cell=grid.seconds_per_cell)
         start, goal = (data.draw(st.sampled_from(grid.free_cells()[::7])) for _ in range(2))
         assert planner.plan(grid, start, goal, rule) == new_planner().plan(fresh, start, goal, rule)
-        costs, new = (one.fields._costs(grid, rule) for one in (planner, new_planner()))
+        costs, new = (one.fields.costs(grid, rule) for one in (planner, new_planner()))
         assert costs is not None
         assert new is not None
         for ours, expected in ((costs.patch, new.patch), (costs.value, new.value)):

@@ -1,6 +1,7 @@
 """Plans for bodies with a heading, against Dijkstra over the same poses and against polygons."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import pairwise
 from types import SimpleNamespace
@@ -172,6 +173,30 @@ def test_what_the_map_tells_is_left_at_least(motion: str, seed: int) -> None:
         for row, column, _ in np.argwhere(np.isfinite(best)):
             left = way_left(column, row, field._aim)
             assert left <= best[row, column].min() + 1e-3
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_requests_that_share_a_field_prove_their_own_bounds(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    occupancy = random.random((80, 120)) < 0.01
+    occupancy[30:50, 50:70] = False  # around the goal
+    grid, (motions, swept) = GridMap(occupancy, CELL), robot("differential")
+    x, y, heading = 60, 40, int(random.integers(16))
+    best = least_costs(grid, motions, swept, (x, y, heading))
+    goal, body = pose_of(grid, motions, (x, y, heading)), planner("differential")
+    starts = random.permutation(np.argwhere(np.isfinite(best)))[:60].tolist()
+
+    def is_asked(state: list[int], bound: float) -> bool:
+        row, column, turned = state
+        start = pose_of(grid, motions, (column, row, turned))
+        found, least = plan(body, grid, start, goal, bound=bound), best[row, column, turned]
+        if np.abs(found.poses[0] - start)[:2].max() > 1e-6:
+            return False  # it lies beside the path planned last
+        assert least / 1.0001 <= found.cost <= least * found.bound * 1.0001
+        return True
+
+    with ThreadPoolExecutor(4) as threads:
+        assert sum(threads.map(is_asked, starts, [1.0, 2.0] * 30)) > 40
 
 
 def test_a_second_look_sees_a_wall_that_is_thinner_than_a_tile(monkeypatch: Any) -> None:

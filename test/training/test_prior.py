@@ -6,7 +6,7 @@ from random_maps import generate_map
 
 from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience.prior import Prior, map_features
-from ddqn_planner.training.prior import REPLAYED, teach_prior, train_prior
+from ddqn_planner.training.prior import REPLAYED, prior_of, train_prior
 
 Places = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Features (N, F), log slowness (N,) and weights (N,)."""
@@ -86,6 +86,10 @@ def test_an_older_map_is_not_forgotten_and_known_places_are_not_kept_twice() -> 
     assert share_foretold(once, rooms(2)) > 0.7
     again = train_prior(*hall, once)
     assert all(np.array_equal(*pair) for pair in zip(once, again, strict=True))
+
+
+def teach_prior(experience: Experience, grid: GridMap) -> None:
+    experience.prior = prior_of(grid, experience.evidence.table, experience.prior)
 
 
 def test_the_places_of_experience_teach_its_prior_where_they_lie_on_a_map() -> None:

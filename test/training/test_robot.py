@@ -44,7 +44,7 @@ def test_the_command_trains_a_robot_that_is_proved(capsys: Any, tmp_path: Path) 
 def test_the_same_seed_trains_the_same_model() -> None:
     contents = []
     for seed in (1, 1, 2):
-        trainer = RobotTrainer.of(*TINY, seed)
+        trainer = RobotTrainer(*TINY, seed)
         for _ in trainer.run(30_000):
             pass
         contents.append(model_bytes(trainer.network, trainer.metadata()))
@@ -52,33 +52,30 @@ def test_the_same_seed_trains_the_same_model() -> None:
 
 
 def test_a_robot_bumps_where_its_body_touches_an_obstacle() -> None:
-    environment = RobotTrainer.of(*TINY, 0).environment
-    motions, swept = environment.motions, environment.swept
-    height, width = environment.shape
-    reach, random = swept.shape[1] // 2, np.random.default_rng(0)
-    environment.reset()
-    collisions = 0
+    trainer = RobotTrainer(*TINY, 0)
+    motions, width = trainer.network.motions, trainer.width
+    swept = trainer.network.of_primitives(trainer.network.swept_by_unit)
+    reach, collisions = swept.shape[1] // 2, 0
     for _ in range(20):
-        cells, number = environment.cell, environment.scenario.copy()
-        actions = random.integers(len(environment.primitive), size=len(cells))
-        reward, terminated, _ = environment.move(actions)
-        for i, (cell, action) in enumerate(zip(cells, actions, strict=True)):
-            (y, x), heading = divmod(cell // 16, width), cell % 16
-            primitive = environment.primitive[action, heading]
-            assert motions.start[primitive] == heading
-            # The maps repeat in all directions.
-            rows, columns = (np.arange(-reach, reach + 1) + at for at in (y, x))
-            occupancy = environment.scenarios[number[i]].grid.occupancy
-            seen = occupancy[np.ix_(rows % height, columns % width)]
-            bumps = bool((seen & swept[primitive]).any())
-            dx, dy = motions.offset[primitive]
-            after = (y + dy) % height * width + (x + dx) % width
-            after = cell if bumps else 16 * after + motions.end[primitive]
-            assert environment.cell[i] == after
-            assert terminated[i] == (bumps or after == environment.goal[number[i]])
-            assert reward[i] == (-1000 if bumps else -motions.cost[primitive])
-            collisions += bumps
-        environment.reset(terminated)
+        trainer._step()
+    made = (values[: trainer.steps] for values in trainer._replay.transitions)
+    for number, cell, action, reward, after, discount in zip(*made, strict=True):
+        (y, x), heading = divmod(cell // 16, width), cell % 16
+        primitive = trainer.primitive_KN[action, heading]
+        assert motions.start[primitive] == heading
+        # The maps repeat in all directions.
+        rows, columns = (np.arange(-reach, reach + 1) + at for at in (y, x))
+        occupancy = np.zeros((width, width), dtype=bool)
+        occupancy[tuple(trainer.obstacle_M2[number])] = True
+        seen = occupancy[np.ix_(rows % width, columns % width)]
+        bumps = bool((seen & swept[primitive]).any())
+        dx, dy = motions.offset[primitive]
+        reached = 16 * ((y + dy) % width * width + (x + dx) % width) + motions.end[primitive]
+        assert after == (cell if bumps else reached)
+        goes_on = not bumps and after != trainer.goal_M[number]
+        assert discount == (np.float32(trainer.parameters.gamma) if goes_on else 0)
+        assert reward == (-1000 if bumps else -motions.cost[primitive])
+        collisions += bumps
     assert 30 < collisions < 2000
 
 
