@@ -85,7 +85,7 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
     # (Dijkstra), and with one bucket per unit, as no move costs less than 1.
     least = costs.least * (1 - 1e-7) if start else 0.0  # whatever the rounding
     bounds, buckets = (costs.straight * least, costs.diagonal * least), BUCKETS if start else 1
-    distance, state, opened, _ = known
+    distance, state, opened, is_final = known
     # A power of 2, so that a slot takes no division.
     ring = 1 << int((costs.highest + bounds[1]) * buckets + 2).bit_length()
     capacity = 9 + int(CAPACITY * math.sqrt(distance.size))
@@ -102,10 +102,10 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
         how = start, bounds, buckets, limit, offsets, costs.low
         queue = opened, order, bucket, used
         taken, visited, is_full = _grow(distance, state, queue, how, costs[:6])
-        left = [bucket[slot, : used[slot]] for slot in np.flatnonzero(used)]
+        left = [bucket[slot, : used[slot]] for slot in used.nonzero()[0]]
         opened = np.concatenate([opened[taken:], *left])
         limit, capacity = limit - visited, 4 * capacity
-    return known._replace(opened=opened), limit >= 0 or not opened.size
+    return Known(distance, state, opened, is_final), limit >= 0 or not opened.size
 
 
 @in_place
@@ -303,13 +303,6 @@ def _roll_out(distance: Any, cell: int, path: Any, toward: Any, costs: Any) -> i
                     least, best = aside, MOVE_Y[action] * width + MOVE_X[action]
         cell = cell + best if best else 0
     return number
-
-
-def value_of(distance: Distances, costs: MoveCosts) -> NDArray[np.float32]:
-    """Return minus the cost of the best path from each cell of a whole field: (C,) float32."""
-    value = np.negative(distance, dtype=np.float32, casting="same_kind")
-    np.copyto(value, -np.inf, where=value == 0)  # sooner than by an index
-    return value
 
 
 def q_of(distance: Distances, costs: MoveCosts) -> NDArray[np.float32]:
