@@ -70,8 +70,8 @@ def test_the_posterior_is_that_of_a_gaussian_markov_random_field(seed: int) -> N
     for drive in drives:  # solved again where evidence changed
         experience.record(*drive)
         posterior = experience.evidence.over(grid)
-    variance, common = posterior.variance, posterior.expected[0]
-    surplus = experience.evidence.surplus
+    variance, surplus = experience.evidence.variance, experience.evidence.surplus
+    common = posterior.expected[0]
     # The same from its definition, with one equation per free cell.
     free = ~grid.occupancy
     number = np.where(free, np.cumsum(free).reshape(free.shape) - 1, -1)
