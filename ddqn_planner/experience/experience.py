@@ -234,7 +234,7 @@ class Experience:
     def uncertainty(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: the standard deviation of the log slowness, most if unknown."""
         posterior = self.evidence.over(grid)
-        return math.sqrt(posterior.variance) * posterior.over(posterior.unknown, 1.0)
+        return math.sqrt(self.evidence.variance) * posterior.over(posterior.unknown, 1.0)
 
     def expected_time(self, grid: GridMap, cells: Cells) -> ExpectedTime:
         """Return the time that a path takes, with an interval of 90 %.
