@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from ddqn_planner.model.networks import observe
 from ddqn_planner.training.double_dqn import Transitions, double_dqn_gradient
-from ddqn_planner.training.propagation import take_step
+from ddqn_planner.training.propagation import FUSED
 from ddqn_planner.training.trainer import Trainer
 
 
@@ -48,9 +48,14 @@ class TorchLearner:
             for name, weight in module.named_parameters():
                 weight.data.copy_(torch.from_numpy(part[name]))
                 part[name] = weight.data.numpy()
-        for part in moments:
-            part.update({name: tensor.copy() for name, tensor in part.items()})
-        self._parts = [{n: torch.from_numpy(t) for n, t in part.items()} for part in trainer._parts]
+        weights, rate = [*self._online.parameters()], trainer.parameters.learning_rate
+        self._adam = torch.optim.Adam(weights, rate, fused=FUSED)
+        for name, weight in self._online.named_parameters():
+            state = {"step": torch.tensor(float(trainer.updates))}
+            for key, part in zip(("exp_avg", "exp_avg_sq"), moments, strict=True):
+                state[key] = torch.from_numpy(part[name].copy())
+                part[name] = state[key].numpy()
+            self._adam.state[weight] = state
         trainer._player, trainer._learner = None, self
 
     def settle(self) -> None:
@@ -77,6 +82,4 @@ class TorchLearner:
         gradient_BA = torch.from_numpy(double_dqn_gradient(kind, batch, *q))
         self._online.zero_grad()
         torch.autograd.backward(q_2BA[: len(gradient_BA)], gradient_BA)
-        weights = self._online.named_parameters()
-        gradients = {name: weight.grad for name, weight in weights if weight.grad is not None}
-        take_step(self._parts, gradients, number, self.environment.parameters.learning_rate)
+        self._adam.step()

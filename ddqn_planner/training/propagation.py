@@ -104,10 +104,10 @@ class PropagationLearner:
             gradients |= _gradients(layer, by_output, input_BF)
             by_input_BF = by_output @ self._online[f"{layer}.weight"]
             by_output = torch.ops.aten.threshold_backward(by_input_BF, input_BF, 0)
-        take_step(self._parts, gradients, number, self.environment.parameters.learning_rate)
+        _take_step(self._parts, gradients, number, self.environment.parameters.learning_rate)
 
 
-def take_step(parts: Sequence[Tensors], gradients: Tensors, number: int, rate: float) -> None:
+def _take_step(parts: Sequence[Tensors], gradients: Tensors, number: int, rate: float) -> None:
     """Take Adam's step of this number, given θ, θ⁻, Adam's moments and the gradients."""
     of_each = parts[0], gradients, *parts[2:]
     weights, slopes, mean, square = ([of[name] for name in parts[0]] for of in of_each)
