@@ -56,7 +56,7 @@ def trained_field(planner: Planner) -> QField:
     parts = [{name: tensor.copy() for name, tensor in network.tensors.items()} for _ in range(4)]
     learner = PropagationLearner(network, tuple(parts), environment)
     q_CA = learner.q_values(np.zeros_like(cells), cells)
-    q_AHW = q_CA.T.reshape(len(MOVES), *occupancy.shape).numpy()
+    q_AHW = q_CA.T.reshape(len(MOVES), *occupancy.shape)
     return QField(SCENARIO.goal, q_AHW, legal_moves(occupancy, MOVE_RULE))
 
 

@@ -1,5 +1,7 @@
 """The paper's network, trained by torch: what the compiled training is compared with."""
 
+from typing import Any
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -58,11 +60,11 @@ class TorchLearner:
         background, shape = self.environment.background[scenario], self.environment.shape
         return torch.from_numpy(observe(background, cell, shape))
 
-    def q_values(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
+    def q_values(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> NDArray[Any]:
         """Return Q(s, a) of robots in `cell` (B,) on the maps `scenario` (B,): (B, 8)."""
         with torch.inference_mode():
             answer: Tensor = self._online(self._observe(scenario, cell))
-        return answer
+        return answer.numpy()
 
     def update(self, batch: Transitions, number: int) -> None:
         """Make an update, of this number."""
@@ -71,7 +73,8 @@ class TorchLearner:
         cells = np.concatenate([batch.cell, batch.next_cell])
         q_2BA = self._online(self._observe(np.tile(batch.scenario, 2), cells))
         kind = self.environment.parameters.target
-        gradient_BA = double_dqn_gradient(kind, batch, target_BA, q_2BA.detach())
+        q = target_BA.numpy(), q_2BA.numpy(force=True)
+        gradient_BA = torch.from_numpy(double_dqn_gradient(kind, batch, *q))
         self._online.zero_grad()
         torch.autograd.backward(q_2BA[: len(gradient_BA)], gradient_BA)
         weights = self._online.named_parameters()

@@ -214,7 +214,7 @@ def optimal_value(environment: GridVectorEnvironment) -> NDArray[np.float32]:
     """Return V* of the first scenario, exact by value iteration: (C,) float32."""
     e, p, near_AC = environment, environment.parameters, neighbours(environment.shape)
     given = e.legal[:1].astype(np.float32).swapaxes(1, 2), e.free_reward[:1].swapaxes(1, 2)
-    (return_CA,) = value_iteration(*given, e.goal[:1], near_AC, p.gamma, p.obstacle_reward)
+    (return_CA,), _ = value_iteration(*given, e.goal[:1], near_AC, p.gamma, p.obstacle_reward)
     return np.array(np.where(e.legal[0].T, return_CA, np.float32(p.obstacle_reward)).max(axis=1))
 
 

@@ -20,6 +20,7 @@ from ddqn_planner.experience.experience import (
     STAND_DISTANCE,
     Experience,
     averaged,
+    ways,
 )
 from ddqn_planner.files import Appender, WorkFolder, differences
 from ddqn_planner.grid import GridMap
@@ -66,11 +67,9 @@ class Drive(NamedTuple):
     @property
     def metres(self) -> float:
         """How far the robot drove; noise of its poses counts as little as standing does."""
-        total, at = 0.0, self.positions[0].tolist()
-        for mean in averaged(self.seconds, self.positions, WINDOW)[1].tolist():
-            if math.dist(at, mean) >= STEP:
-                total, at = total + math.dist(at, mean), mean
-        return total + math.dist(at, self.positions[-1].tolist())
+        means = averaged(self.seconds, self.positions, WINDOW)[1]
+        way = [self.positions[:1], means[ways(means, STEP)], self.positions[-1:]]
+        return float(np.hypot(*np.diff(np.concatenate(way), axis=0).T).sum())
 
     def teach(self, experience: Experience, grid: GridMap | None = None) -> None:
         """Let experience learn from it; where the robot gave up, moves fail."""
@@ -199,12 +198,12 @@ class DriveFolder(WorkFolder):
                         f"folder, or learn anew: ddqn-planner learn {folder} --map MAP"
                     )
                 self.experience = saved
-            if is_new and self.drives:  # learn anew from the drives that it holds
-                for drive in read_drives(self.record_path):
-                    drive.teach(self.experience)
             self._record = files.enter_context(closing(Appender(self.record_path)))
             if self.record_path.stat().st_size == 0:
                 self._record.append(HEADER)
+            if is_new:  # learn anew from the drives that it holds
+                for drive in read_drives(self.record_path):
+                    drive.teach(self.experience)
 
     def add(
         self, outcome: DriveEnd, seconds: Float64, positions: Float64, grid: GridMap | None = None

@@ -140,7 +140,7 @@ class Experience:
         for part in _believed_parts(time, position, max_speed, self.max_pause):
             seconds, at = averaged(time[part], position[part], WINDOW / speed)
             # Standing at the ends of a drive is no waiting on the way.
-            way = np.array(_ways(at, STAND_DISTANCE)[1:], dtype=np.int64)
+            way = np.array(ways(at, STAND_DISTANCE)[1:], dtype=np.int64)
             if not len(way):
                 continue
             leaves = way[1:] - 1
@@ -234,7 +234,7 @@ class Experience:
     def uncertainty(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: the standard deviation of the log slowness, most if unknown."""
         posterior = self.evidence.over(grid)
-        return math.sqrt(posterior.variance) * posterior.over(posterior.unknown, 1.0)
+        return math.sqrt(self.evidence.variance) * posterior.over(posterior.unknown, 1.0)
 
     def expected_time(self, grid: GridMap, cells: Cells) -> ExpectedTime:
         """Return the time that a path takes, with an interval of 90 %.
@@ -376,7 +376,7 @@ def averaged(time: Float64, position: Float64, window: float) -> tuple[Float64, 
     return means[:, 0], means[:, 1:]
 
 
-def _ways(position: Float64, metres: float) -> list[int]:
+def ways(position: Float64, metres: float) -> list[int]:
     """Return the indices of the first position, and of each that is so far from the one before."""
     kept, points = [0], position.tolist()
     for index, at in enumerate(points):

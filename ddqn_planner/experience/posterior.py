@@ -73,7 +73,6 @@ class Posterior:
             x, y = self.middle.T
             features = map_features(self.grid)[y, x]
             self.foretold[:] = self.prior.log_slowness(features) if self.prior else 0
-        self.variance = evidence.variance  # of the log slowness of places
         self.expected = evidence.trust[0] + evidence.trust[1] * self.foretold
         places = self.places_at(evidence.table[:, 3:5])
         inside = places >= 0
@@ -81,7 +80,7 @@ class Posterior:
         # A lattice whose links have strength 1 has about the variance ln(32 / kappa) / 4 pi;
         # 1 is added for cells of many metres, where that would be negative.
         kappa = (self.spacing / CORRELATION) ** 2
-        scale = self.variance / (math.log1p(32 / kappa) / (4 * math.pi)) / NOISE
+        scale = evidence.variance / (math.log1p(32 / kappa) / (4 * math.pi)) / NOISE
         visits = scale * np.bincount(places[inside], weight, len(self.middle))
         # Half of the noise is added, as the mean of its exponential is more than 1.
         seen = scale * np.bincount(places[inside], log + weight * NOISE / 2, len(self.middle))

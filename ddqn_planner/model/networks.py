@@ -229,16 +229,15 @@ class PropagationQNetwork(QNetwork):
 
     def _costs_of(self, patch_P9: NDArray[np.int8], move_rule: MoveRule, timed: bool) -> Array:
         """Return each move's cost, infinite if not possible, or the tries if `timed`: (P, 8)."""
-        cost_PA = np.empty((len(patch_P9), len(MOVES)), dtype=np.float32)
-        for begin in range(0, len(patch_P9), BATCH):
-            batch = slice(begin, begin + BATCH)
-            feature_BI = self.features(patch_P9[batch], move_rule)
+        costs = []
+        for batch_B9 in np.split(patch_P9, range(BATCH, len(patch_P9), BATCH)):
+            feature_BI = self.features(batch_B9, move_rule)
             multiplier_BA = np.minimum(self.multiplier(feature_BI), MAX_MULTIPLIER)
             cost_BA = move_rule.lengths * self.tries(feature_BI)
             cost_BA *= 1 if timed else multiplier_BA
             # Comparisons with NaN are false, and NumPy's minimum and maximum keep it.
-            cost_PA[batch] = np.where(multiplier_BA >= 1, cost_BA, np.inf)
-        return cost_PA
+            costs.append(np.where(multiplier_BA >= 1, cost_BA, np.inf))
+        return np.concatenate(costs, dtype=np.float32)
 
 
 class AnyMapQNetwork(PropagationQNetwork):

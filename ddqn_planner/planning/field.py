@@ -6,7 +6,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -218,7 +218,11 @@ class DistanceField(QField):
     @cached_property
     def value(self) -> NDArray[np.float32]:
         """(H, W) float32: the greatest Q of a legal move, and at the goal the greatest of all."""
-        value = self._layer(kernels.value_of)
+        with self._lock:
+            self._grow()
+            distance = self.known.distance.reshape(-1, self.costs.width)[1:-1, 1:-1]
+            value = np.negative(distance, dtype=np.float32, casting="same_kind")
+        np.copyto(value, -np.inf, where=value == 0)  # sooner than by an index; goals are 0 too
         greatest = value.max()
         for x, y in self.goals:
             value[y, x] = greatest
@@ -381,13 +385,16 @@ class FieldCache:
 
     def _repair(self, new: DistanceField, start: Cell | None) -> None:
         """Give a new field what a field of an older map knows, if there is one."""
-        shift_from = cache(lambda older: shift_between(older, new.grid))  # many are of one map
+        older: GridMap | None = None
         for kept in self._of_rule(new.move_rule):
             old = kept.field
-            if not isinstance(old, DistanceField) or (shift := shift_from(kept.grid)) is None:
+            if not isinstance(old, DistanceField):
                 continue
-            moved_goals = tuple((x + shift[0], y + shift[1]) for x, y in old.goals)
-            if moved_goals == new.goals and new.take_over(old, shift, start):
+            if kept.grid is not older:  # many are of one map
+                older, shift = kept.grid, shift_between(kept.grid, new.grid)
+            x, y = shift or (0, 0)
+            moved_goals = tuple((goal[0] + x, goal[1] + y) for goal in old.goals)
+            if shift and moved_goals == new.goals and new.take_over(old, shift, start):
                 # The place will hardly be again what it was.
                 self._kept = [other for other in self._kept if other.field is not old]
                 return

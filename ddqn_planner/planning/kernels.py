@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -85,7 +84,7 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
     # (Dijkstra), and with one bucket per unit, as no move costs less than 1.
     least = costs.least * (1 - 1e-7) if start else 0.0  # whatever the rounding
     bounds, buckets = (costs.straight * least, costs.diagonal * least), BUCKETS if start else 1
-    distance, state, opened, _ = known
+    distance, state, opened, is_final = known
     # A power of 2, so that a slot takes no division.
     ring = 1 << int((costs.highest + bounds[1]) * buckets + 2).bit_length()
     capacity = 9 + int(CAPACITY * math.sqrt(distance.size))
@@ -102,10 +101,10 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
         how = start, bounds, buckets, limit, offsets, costs.low
         queue = opened, order, bucket, used
         taken, visited, is_full = _grow(distance, state, queue, how, costs[:6])
-        left = [bucket[slot, : used[slot]] for slot in np.flatnonzero(used)]
+        left = [bucket[slot, : used[slot]] for slot in used.nonzero()[0]]
         opened = np.concatenate([opened[taken:], *left])
         limit, capacity = limit - visited, 4 * capacity
-    return known._replace(opened=opened), limit >= 0 or not opened.size
+    return Known(distance, state, opened, is_final), limit >= 0 or not opened.size
 
 
 @in_place
@@ -206,18 +205,18 @@ def _grow(distance: Any, state: Any, queue: Any, how: Any, costs: Any) -> tuple[
 
 
 @inlined
-def _least(distance: Any, cell: int, enough: float, costs: Any) -> float:
-    """Return the least cost of a path from a cell, or the first that is enough."""
-    least = np.inf
+def _best(distance: Any, cell: int, enough: float, costs: Any) -> tuple[float, int]:
+    """Return the least cost of a path from a cell and its action, or the first that is enough."""
+    least, best = np.inf, -1
     for action in range(8):
         after = distance[np.uint64(cell + MOVE_Y[action] * costs[-1] + MOVE_X[action])]
         if after > 0:
             cost = after + cost_of(cell, action, costs)
             if cost < least:
-                least = cost
+                least, best = cost, action
                 if least <= enough:
                     break
-    return least
+    return least, best
 
 
 def take_back(known: Known, costs: MoveCosts, changed: Cells, limit: int) -> Known | None:
@@ -237,7 +236,7 @@ def _take_back(distance: Any, state: Any, changed: Any, lost: Any, waiting: Any,
     first, end, count, judged, opened = 0, changed.size, 0, 0, 0
     while first < end or judged < count + changed.size:
         # First all lose what has no support; then they and the changed cells take what is left. In
-        # one loop, as `_least` takes long to compile.
+        # one loop, as `_best` takes long to compile.
         loses = first < end
         if loses:
             cell = np.int64(waiting[first])
@@ -250,7 +249,7 @@ def _take_back(distance: Any, state: Any, changed: Any, lost: Any, waiting: Any,
             continue
         if known <= 0:
             distance[cell], state[cell], known = 0.0, UNREACHED, np.inf
-        least = _least(distance, cell, known if loses else 0.0, costs)
+        least, _ = _best(distance, cell, known if loses else 0.0, costs)
         if not loses and least < known:
             distance[cell], state[cell] = least, OPEN
             waiting[opened] = cell
@@ -305,39 +304,33 @@ def _roll_out(distance: Any, cell: int, path: Any, toward: Any, costs: Any) -> i
     return number
 
 
-def value_of(distance: Distances, costs: MoveCosts) -> NDArray[np.float32]:
-    """Return minus the cost of the best path from each cell of a whole field: (C,) float32."""
-    value = np.negative(distance, dtype=np.float32, casting="same_kind")
-    np.copyto(value, -np.inf, where=value == 0)  # sooner than by an index
-    return value
+def policy_of(distance: Distances, costs: MoveCosts) -> NDArray[np.int8]:
+    """Return the greedy action of each cell of a whole field, -1 without one: (C,) int8."""
+    policy = np.full(distance.size, -1, np.int8)
+    _policy_of(distance, policy, costs[:6])
+    return policy
+
+
+@in_place
+def _policy_of(distance: Any, policy: Any, costs: Any) -> None:
+    for cell in range(costs[-1] + 1, distance.size - costs[-1] - 1):
+        enough = distance[cell] * SAME
+        least, action = _best(distance, cell, enough, costs)
+        if least <= enough:
+            policy[cell] = action
 
 
 def q_of(distance: Distances, costs: MoveCosts) -> NDArray[np.float32]:
     """Return minus the cost of the best path through each action: (8, C) float32."""
-    q = np.empty((8, distance.size), np.float32)
-    for action, cost in enumerate(_costs_through(distance, costs)):
-        np.negative(cost, q[action], casting="same_kind")
+    q = np.full((8, distance.size), -np.inf, np.float32)
+    _q_of(distance, q, costs[:6])
     return q
 
 
-def policy_of(distance: Distances, costs: MoveCosts) -> NDArray[np.int8]:
-    """Return the first best action of each cell of a whole field, -1 without one: (C,) int8."""
-    policy, enough = np.full(distance.size, -1, np.int8), distance * SAME
-    for action, cost in enumerate(_costs_through(distance, costs)):
-        np.copyto(policy, np.int8(action), where=(cost <= enough) & (policy < 0))
-    return policy
-
-
-def _costs_through(distance: Distances, costs: MoveCosts) -> Iterator[Distances]:
-    """Yield, in one array, the cost of the best path from each cell through each action."""
-    through = np.full(distance.size, np.inf)
-    for action in range(8):
-        _write_through(distance, action, through, costs[:6])
-        yield through
-
-
 @in_place
-def _write_through(distance: Any, action: int, through: Any, costs: Any) -> None:
-    for cell in range(costs[-1] + 1, distance.size - costs[-1] - 1):
-        after = distance[cell + MOVE_Y[action] * costs[-1] + MOVE_X[action]]
-        through[cell] = after + cost_of(cell, action, costs) if after > 0 else np.inf
+def _q_of(distance: Any, q: Any, costs: Any) -> None:
+    for action in range(8):
+        for cell in range(costs[-1] + 1, distance.size - costs[-1] - 1):
+            after = distance[cell + MOVE_Y[action] * costs[-1] + MOVE_X[action]]
+            if after > 0:
+                q[action, cell] = -(after + cost_of(cell, action, costs))

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
+
+Q: TypeAlias = NDArray[np.float32]
 
 # Dimensions: B = a batch, A = 8 actions.
 
@@ -50,19 +50,16 @@ class ReplayBuffer:
         return Transitions._make(stored[indices] for stored in self.transitions)
 
 
-def double_dqn_gradient(
-    kind: str, batch: Transitions, target_BA: Tensor, online_2BA: Tensor
-) -> Tensor:
+def double_dqn_gradient(kind: str, batch: Transitions, target_BA: Q, online_2BA: Q) -> Q:
     """Return the gradient of the mean squared temporal-difference error by Q of states: (B, 8)."""
     # Given is Q of the next states by θ⁻, and Q of the states and then the next ones by θ.
-    q_BA, online_BA = online_2BA.chunk(2)
-    numbers = batch.action[:, None], batch.reward[:, None], batch.discount[:, None]
-    action_B1, reward_B1, discount_B1 = map(torch.from_numpy, numbers)
+    q_BA, online_BA = np.split(online_2BA, 2)
     # Double DQN (van Hasselt et al. 2016, equation 4) selects the next action with θ and evaluates
     # it with θ⁻. DQN (Mnih et al. 2015) does both with θ⁻, the paper's target as printed with θ.
     selection_BA = target_BA if kind == "dqn" else online_BA
     evaluation_BA = online_BA if kind == "printed" else target_BA
-    greedy_B1 = selection_BA.argmax(dim=1, keepdim=True)
-    y_B1 = reward_B1 + discount_B1 * evaluation_BA.gather(1, greedy_B1)
-    error_B1 = q_BA.gather(1, action_B1) - y_B1
-    return torch.zeros_like(q_BA).scatter_(1, action_B1, 2 / len(q_BA) * error_B1)
+    each = np.arange(len(q_BA))
+    y_B = batch.reward + batch.discount * evaluation_BA[each, selection_BA.argmax(axis=1)]
+    gradient_BA = np.zeros_like(q_BA)
+    gradient_BA[each, batch.action] = 2 / len(q_BA) * (q_BA[each, batch.action] - y_B)
+    return gradient_BA

@@ -22,6 +22,7 @@ BLOCKS, PLACES = 12, (8, 32)  # near places are alike: so many in a row are left
 DOUBT = 2.0  # what is foretold must be so many standard errors from nothing to be believed
 REPLAYED = 512  # places of older maps, and as many of this one, are kept to learn from again
 FEWEST_PLACES = 32  # from which a prior is learned
+MOST = 6.0  # weight of a place: those on every way do not govern all
 
 
 def prior_of(grid: GridMap, table: Any, older: Prior | None, seed: int = 0) -> Prior | None:
@@ -32,7 +33,8 @@ def prior_of(grid: GridMap, table: Any, older: Prior | None, seed: int = 0) -> P
     if seen.sum() < FEWEST_PLACES:
         return older
     weight, log = table[seen, :2].T
-    return train_prior(map_features(grid)[y[seen], x[seen]], log / weight, weight, older, seed)
+    features, mean = map_features(grid)[y[seen], x[seen]], log / weight
+    return train_prior(features, mean, np.minimum(weight, MOST), older, seed)
 
 
 def train_prior(

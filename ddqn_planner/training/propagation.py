@@ -54,18 +54,17 @@ class PropagationLearner:
         p_SCA = _activations(self._target, feature_UI)[-1].numpy()[self._place_SC]
         cost_SCA = self._cost(self._target, feature_UI).numpy()[self._place_SC]
         reward_SCA = -cost_SCA if self.uses_costs else e.free_reward.swapaxes(1, 2)
-        collision, gamma = np.float32(e.parameters.obstacle_reward), e.parameters.gamma
-        near_AC = neighbours(e.shape)
-        return_SCA = value_iteration(p_SCA, reward_SCA, e.goal, near_AC, gamma, float(collision))
-        self._q_SCA = collision + p_SCA * (return_SCA - collision)
+        gamma, collision = e.parameters.gamma, e.parameters.obstacle_reward
+        given = reward_SCA, e.goal, neighbours(e.shape), gamma, collision
+        return_SCA, self._q_SCA = value_iteration(p_SCA, *given)
         # A state: the features, the return r + γ V(s') of each move (γ V(s') where r is learned),
         # r_o. A gradient through V would diverge: none flows.
         returns = return_SCA + cost_SCA, np.full_like(return_SCA[..., :1], collision)
         self._state_SCX = np.concatenate([self._feature_UI[self._place_SC], *returns], axis=2)
 
-    def q_values(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
+    def q_values(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> NDArray[np.float32]:
         """Return Q(s, a) of robots in `cell` (B,) on the maps `scenario` (B,): (B, 8)."""
-        return self._evaluate(scenario, cell)[0]
+        return self._evaluate(scenario, cell)[0].numpy()
 
     def _evaluate(
         self, scenario: NDArray[np.int64], cell: NDArray[np.int64]
@@ -90,8 +89,8 @@ class PropagationLearner:
         count, target = len(batch.cell), self.environment.parameters.target
         states = np.tile(batch.scenario, 2), np.concatenate([batch.cell, batch.next_cell])
         q_2BA, gain_2BA, activations = self._evaluate(*states)
-        target_BA = torch.from_numpy(self._q_SCA[batch.scenario, batch.next_cell])
-        gradient_BA = double_dqn_gradient(target, batch, target_BA, q_2BA)
+        q = self._q_SCA[batch.scenario, batch.next_cell], q_2BA.numpy()
+        gradient_BA = torch.from_numpy(double_dqn_gradient(target, batch, *q))
         *inputs, p_BA = (activation[:count] for activation in activations)
         by_gain_BA = gradient_BA * p_BA
         by_output = by_gain_BA * (1 - p_BA) * gain_2BA[:count]
@@ -144,8 +143,8 @@ def value_iteration(
     neighbours_AC: NDArray[np.int64],
     gamma: float,
     collision: float,
-) -> NDArray[np.float32]:
-    """Iterate V until it settles; return r + γ V(s') of each successful move: (S, C, 8) float32."""
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Iterate V until it settles; return r + γ V(s') and Q(s, a): (S, C, 8) float32 each."""
     # V(s) = max_a Q(s, a), Q(s, a) = p (r + γ V(s')) + (1 - p) r_o, V(goal) = 0. Off the map V is
     # r_o, which with γ = 1 must be less than any path's return. Into occupied cells p is 0.
     maps, cells, _ = success_SCA.shape
@@ -158,7 +157,7 @@ def value_iteration(
     gain_SCA, base_SCA, near_CA = map(np.ascontiguousarray, (gain_SCA, base_SCA, neighbours_AC.T))
     _settle(value_SC, gain_SCA, base_SCA, near_CA)
     return_SCA: NDArray[np.float32] = reward_SCA + np.float32(gamma) * value_SC[:, near_CA]
-    return return_SCA
+    return return_SCA, np.float32(collision) + success_SCA * (return_SCA - np.float32(collision))
 
 
 @compiled

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import GridMap, MoveRule
@@ -164,7 +163,7 @@ class RobotTrainer:
         collision = np.float32(p.obstacle_reward)
         gain_2BK = self._return_SCK[states] - collision
         q = self._q_SCK[batch.scenario, batch.next_cell], collision + p_2BK * gain_2BK
-        q_gradient = double_dqn_gradient(p.target, batch, *map(torch.from_numpy, q)).numpy()
+        q_gradient = double_dqn_gradient(p.target, batch, *q)
         taken = np.arange(p.batch_size), batch.action
         by_logit_B = (q_gradient * gain_2BK[: p.batch_size])[taken]
         by_logit_B *= p_2BK[taken] * (1 - p_2BK[taken])
@@ -199,13 +198,11 @@ class RobotTrainer:
 
     def _settle(self) -> None:
         """As the target network, settle V on every map."""
-        p, collision = self.parameters, np.float32(self.parameters.obstacle_reward)
-        cells = np.arange(self.next_KC.shape[1])
+        p, cells = self.parameters, np.arange(self.next_KC.shape[1])
         self._return_SCK = np.empty((len(self.goal_M), *self.next_KC.T.shape), np.float32)
         self._q_SCK = np.empty_like(self._return_SCK)
         for number in range(len(self.goal_M)):
             p_1CK = self._success(*self._observed(np.full_like(cells, number), cells))[None]
             given = self.reward_KC.T[None], self.goal_M[[number]], self.next_KC, p.gamma
-            return_1CK = value_iteration(p_1CK, *given, p.obstacle_reward)
-            self._return_SCK[number] = return_1CK[0]
-            self._q_SCK[number] = collision + p_1CK[0] * (return_1CK[0] - collision)
+            (returns,), (q,) = value_iteration(p_1CK, *given, p.obstacle_reward)
+            self._return_SCK[number], self._q_SCK[number] = returns, q

@@ -132,7 +132,7 @@ class Trainer:
         greedy = self._exploration.random(count) >= self.epsilon
         if greedy.any():
             q_NA = self._learner.q_values(self.environment.scenario, self.environment.cell)
-            actions[greedy] = q_NA.argmax(dim=1).numpy()[greedy]
+            actions[greedy] = q_NA.argmax(axis=1)[greedy]
         return actions
 
     def _update(self) -> None:

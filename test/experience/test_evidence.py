@@ -70,8 +70,8 @@ def test_the_posterior_is_that_of_a_gaussian_markov_random_field(seed: int) -> N
     for drive in drives:  # solved again where evidence changed
         experience.record(*drive)
         posterior = experience.evidence.over(grid)
-    variance, common = posterior.variance, posterior.expected[0]
-    surplus = experience.evidence.surplus
+    variance, surplus = experience.evidence.variance, experience.evidence.surplus
+    common = posterior.expected[0]
     # The same from its definition, with one equation per free cell.
     free = ~grid.occupancy
     number = np.where(free, np.cumsum(free).reshape(free.shape) - 1, -1)
@@ -246,6 +246,15 @@ def test_a_wait_is_not_spread_along_the_way_or_to_other_ways() -> None:
     assert at(HALL, slowness, 7, 5) > 5
     for x, y in ((5.5, 5), (8.5, 5), (7, 6.5)):
         assert at(HALL, slowness, x, y) < 1.3
+
+
+def test_a_wait_beside_a_wall_costs_nothing_behind_it() -> None:
+    experience = driven(straight((2, 5), (12, 5)))
+    experience.record_failure((5, 5.1))
+    slowness = experience.slowness(MAPS[1])
+    assert at(HALL, slowness, 5, 5.1) > 10
+    assert at(HALL, slowness, 5, 5.6) < 1.3
+    assert at(HALL, experience.slowness(HALL), 5, 5.4) > 10
 
 
 def test_where_robots_wait_at_several_places_they_are_expected_to_wait_elsewhere_too() -> None:

@@ -232,7 +232,8 @@ def test_with_another_rclpy_its_own_executor_runs_the_node(monkeypatch: pytest.M
     rclpy.shutdown()
 
 
-def test_callbacks_resume_in_order_unless_destroyed() -> None:
+def test_callbacks_resume_in_order_unless_destroyed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(of_nodes, "EVENTS_PERIOD", 1000.0)  # else it looks again after that
     called, awaited, stopping = [], Future(), threading.Event()
 
     async def begin() -> None:
