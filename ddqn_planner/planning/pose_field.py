@@ -17,7 +17,7 @@ from ddqn_planner.planning.pose_paths import SAME, Way
 from ddqn_planner.planning.pose_world import SHIFT, TILE, Body, State, World
 
 NO_RESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)  # not in all versions of Python
-HEAP = 2**16  # entries that a heap has room for, at least
+HEAP = 2**18  # entries that a heap has room for, at least
 LOST = 1 / 2  # of the cost of the last start; if a repair takes more back, a new field is quicker
 UNGUIDED = 2**14  # states that are visited before a look at the map pays
 FINEST = 1  # the shift of the smallest tiles that it looks at
