@@ -17,11 +17,10 @@ from ddqn_planner.planning.pose_paths import SAME, Way
 from ddqn_planner.planning.pose_world import SHIFT, TILE, Body, State, World
 
 NO_RESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)  # not in all versions of Python
-HEAP = 2**16  # entries that a heap has room for, at least
+HEAP = 2**18  # entries that a heap has room for, at least
 LOST = 1 / 2  # of the cost of the last start; if a repair takes more back, a new field is quicker
 UNGUIDED = 2**14  # states that are visited before a look at the map pays
 FINEST = 1  # the shift of the smallest tiles that it looks at
-FIRST = 1.2  # a first path is looked for as if with this bound, if a smaller one is asked for
 NOWHERE = Aim(0, 0, -1, 1.0, np.empty(0, np.float32), SHIFT + 1, 0)
 GREEDY = 1.5  # the first round's weight is the bound to the power of this: mostly that will do
 
@@ -76,7 +75,7 @@ class PoseField:
             known = self._aim if start[:2] == self._aim[:2] else NOWHERE
             self._aim = known._replace(x=start[0], y=start[1], number=number)
             self.visits = 0  # for this start
-            self._order(max(bound, FIRST) ** GREEDY)
+            self._order(bound**GREEDY)
         while True:
             proved = self._bound(number)
             if proved <= bound * SAME or self._least == math.inf:
