@@ -23,7 +23,7 @@ VARIANCE, VARIED_PLACES = 1.0, 4.0  # of the log slowness of places, as if of so
 LEAST_VARIANCE, MOST_VARIANCE = 0.05, 2.0
 ALIKE = 8.0  # so many places of a path tell as much of other places as one alone
 NOMINAL = 2.0  # inverse variance of the log slowness of all places, before the first drive
-TRUST, TRUSTED = 0.2, 0.25  # in the prior: at first, and the inverse variance of that
+TRUST, TRUSTED = 0.2, 1.0  # in the prior: at first, and the inverse variance of that
 SURE_PLACES = 20  # fewer say nothing about the robot's speed in the open
 KNOWN = 0.7  # weight of visits from which a place is known
 
@@ -162,9 +162,14 @@ class Evidence:
         for _ in range(3):  # either tells of the other
             # Bayesian regression of the log slowness on 1 and on what the prior foretold.
             shares = columns.T / (self.variance + NOISE / weight) / ALIKE
-            precision = np.diag([NOMINAL, TRUSTED]) + shares @ columns
-            fitted = np.linalg.solve(precision, [0, TRUSTED * TRUST] + shares @ log)
-            self.trust = np.maximum(fitted, [-math.inf, 0])
+            variances = np.linalg.inv(np.diag([NOMINAL, TRUSTED]) + shares @ columns)
+            # Few places may be slow by chance where the prior says so: it is worth a standard
+            # error less than they tell.
+            doubt = (1 - TRUSTED * variances[1, 1]) * math.sqrt(variances[1, 1])
+            fitted = variances[1] @ ([0, TRUSTED * TRUST] + shares @ log)
+            worth = max(float(fitted) - doubt, 0)
+            in_common = shares[0] @ (log - worth * foretold) / (NOMINAL + shares[0].sum())
+            self.trust = float(in_common), worth
             squares = (log - columns @ self.trust) ** 2 - NOISE / weight
             total = VARIED_PLACES * VARIANCE + squares.sum() / ALIKE
             variance = total / (VARIED_PLACES + len(log) / ALIKE)
