@@ -1,7 +1,5 @@
 """A robot's drives: from its poses, and in a folder that learns from them."""
 
-from __future__ import annotations
-
 import math
 import os
 import re

@@ -1,7 +1,5 @@
 """A robot's drives in recordings: a trainer's folder, CSV and MCAP files, and bags."""
 
-from __future__ import annotations
-
 import cmath
 import csv
 import math

@@ -1,7 +1,5 @@
 """A robot's footprint, and the cells that it sweeps."""
 
-from __future__ import annotations
-
 import ast
 import math
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """Motion primitives: what a robot with a heading can do next, made here or read from a lattice."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Model files: safetensors with JSON metadata. Nothing in them is unpickled."""
 
-from __future__ import annotations
-
 import json
 import os
 import reprlib

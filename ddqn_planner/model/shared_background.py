@@ -5,8 +5,6 @@ them show in a few windows more. C = cells of a map, L = windows, F = filters, U
 layer after the convolution, D = windows that may differ.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple

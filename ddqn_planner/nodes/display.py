@@ -1,7 +1,5 @@
 """What RViz shows: a Q field's value as a map, its policy as arrows, a body along its path."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any

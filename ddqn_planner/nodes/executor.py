@@ -1,7 +1,5 @@
 """The executor of the nodes."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """A node that a lifecycle manager, or the node itself, configures, activates, and stops."""
 
-from __future__ import annotations
-
 from functools import partialmethod
 from typing import Any
 from uuid import uuid4

@@ -1,7 +1,5 @@
 """The map server node: serves a map file, and adds the paper's static noise to it."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from functools import partial
 from typing import Any, Final

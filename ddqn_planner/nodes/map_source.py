@@ -1,7 +1,5 @@
 """The map that the planner plans on: the last one, with updates, directions and expected times."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Nav2's planning actions and its service, for a node where nav2_msgs is installed."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Awaitable, Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """The planner's parameters, in the words of its ``--help``."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from ddqn_planner.grid import MoveRule

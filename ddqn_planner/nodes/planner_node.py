@@ -1,7 +1,5 @@
 """The planner node: plans on the map from the robot's pose to the goal pose."""
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Callable, Coroutine
 from contextlib import suppress

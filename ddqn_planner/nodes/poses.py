@@ -1,7 +1,5 @@
 """Where the robot is, and poses in the map's frame, by TF where tf2_ros is installed."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 import time

@@ -1,7 +1,5 @@
 """What the planner node says: what became of a request, its log, and `/diagnostics`."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping

@@ -1,7 +1,5 @@
 """From a request to its outcome: with the map, the parameters, and the model, loaded here."""
 
-from __future__ import annotations
-
 import gc
 import math
 import threading

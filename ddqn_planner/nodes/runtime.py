@@ -1,7 +1,5 @@
 """What the nodes share: parameters, services, topics, the background worker, the shutdown."""
 
-from __future__ import annotations
-
 import json
 import os
 import queue

@@ -3,8 +3,6 @@
 # To compile takes time at the first start of an installation, most of all memory that a kernel
 # allocates, slices, and `min`, `max` and `int`. So arrays are passed in, empty ones for none.
 
-from __future__ import annotations
-
 import math
 from typing import Any, Final, NamedTuple
 

@@ -1,7 +1,5 @@
 """Parts of paths: searches, the way out of a start, what is left of a path under way."""
 
-from __future__ import annotations
-
 import heapq
 from typing import Any
 

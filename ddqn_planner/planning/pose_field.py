@@ -1,7 +1,5 @@
 """The least costs of poses toward a goal: grown as far as a start needs, with a proved bound."""
 
-from __future__ import annotations
-
 import math
 import mmap
 from typing import Any

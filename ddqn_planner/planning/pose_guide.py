@@ -1,7 +1,5 @@
 """What a map tells of the way to a start: a lower bound, and where to look first."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, Final, NamedTuple
 

@@ -1,7 +1,5 @@
 """How values spread over poses from the goal, and how they are repaired: in compiled code."""
 
-from __future__ import annotations
-
 from typing import Any, Final, NamedTuple
 
 import numpy as np

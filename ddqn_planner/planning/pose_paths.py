@@ -1,7 +1,5 @@
 """Paths of poses: what is left of one, whether a body has room along it, what it costs."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, Final, NamedTuple
 

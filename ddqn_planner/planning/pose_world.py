@@ -1,7 +1,5 @@
 """A body on a map, as kernels see them: where it has room, and what its primitives cost."""
 
-from __future__ import annotations
-
 from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Straight segments between cells, and paths of few of them: string pulling, in compiled code."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, Final, TypeAlias
 

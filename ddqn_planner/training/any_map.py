@@ -1,7 +1,5 @@
 """The training of the model for any map: small random maps, both move rules, all costs."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Double DQN: replay memory, and the gradient of the online network θ; θ⁻ is the target network."""
 
-from __future__ import annotations
-
 from typing import NamedTuple, TypeAlias
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The grid environment: N robots in NumPy, and one robot with Gymnasium's interface."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any

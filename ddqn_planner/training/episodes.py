@@ -1,7 +1,5 @@
 """The episodes of a training, and their record, ``episodes.csv``."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from enum import Enum

@@ -1,7 +1,5 @@
 """How good a Q field is: its greedy rollout from every free cell, against the exact optimum."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

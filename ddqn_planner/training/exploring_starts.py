@@ -1,7 +1,5 @@
 """Improvement 1 of the paper (section 4.1, "initialisation"): exploring starts, as RRT samples."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """All hyper-parameters of training, defined once for the nodes, the command line and the tests."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields
 from typing import Any
 

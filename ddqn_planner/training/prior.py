@@ -1,7 +1,5 @@
 """Trains the prior: a small network that foretells from the map how slow places are."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

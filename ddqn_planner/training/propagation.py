@@ -1,7 +1,5 @@
 """Double DQN of the propagation networks, in torch: their states on given maps, and updates."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, TypeAlias
 

@@ -1,7 +1,5 @@
 """The reward of a legal move: improvement 2 of the paper (section 4.2), or minus its cost."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """The training of a robot's model: it bumps into obstacles until its body is proved."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Final

@@ -1,7 +1,5 @@
 """A training run: a trainer with a folder for its episodes, its checkpoint and its model."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict

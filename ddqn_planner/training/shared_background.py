@@ -1,7 +1,5 @@
 """Double DQN of the paper's network, compiled: the steps and updates of `Trainer`."""
 
-from __future__ import annotations
-
 from collections import namedtuple
 from collections.abc import Callable, Iterable
 from dataclasses import fields
