@@ -31,7 +31,9 @@ WINDOWS = 5_000  # that all steps of one call look at: so it returns within mill
 Tensors = dict[str, NDArray[np.float32]]
 
 # The hyper-parameters that are numbers, for compiled code.
-NUMBERS: Any = {f.name: type(f.default) for f in fields(HyperParameters) if f.type != "str"}
+NUMBERS: Any = {
+    f.name: type(f.default) for f in fields(HyperParameters) if not isinstance(f.default, str)
+}
 Numbers: Any = namedtuple("Numbers", [*NUMBERS])  # type: ignore[misc]
 
 
