@@ -300,11 +300,11 @@ class GridMap:
     def same_cells(self, other: GridMap) -> bool:
         """Return whether all cells of two maps are equal, wherever the maps lie."""
         check_grid(other, "other")
-        if self._occupied != other._occupied:
-            return False
         boxes = self.patches_since(other)
         if boxes is not None:
             return not any(self.differs(other, box, box).any() for box in reversed(boxes))
+        if self._occupied != other._occupied:
+            return False
         layers = ((getattr(self, name), getattr(other, name)) for name in LAYERS)
         return all(mine is its or np.array_equal(mine, its) for mine, its in layers)
 
