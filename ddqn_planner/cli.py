@@ -104,8 +104,8 @@ def _plan_cells(options: Any, planner: api.Planner, grid: GridMap, start: Cell, 
     seconds, rule = time.perf_counter() - began, plan.move_rule
     optimum = value = None
     if plan.cells and grid.is_free(plan.cells[0]):
-        legal, no_costs = grid.legal_moves(rule), np.ones(grid.occupancy.shape, "f4")
-        shortest = search(plan.cells[0], plan.cells[-1], legal, no_costs, rule)
+        no_costs = api.GridMap(grid.occupancy, forbidden=grid.forbidden)
+        shortest = search(plan.cells[0], plan.cells[-1], no_costs, rule)
         optimum = path_length(shortest, rule)
     if options.picture and plan.cells and planner.network.supports((grid.height, grid.width)):
         value = planner.q_field(grid, plan.cells[-1], rule).value

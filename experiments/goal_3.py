@@ -121,8 +121,8 @@ def best_moves(scenario: Scenario) -> NDArray[np.bool_]:
 def fixed_path(maps: Sequence[Scenario]) -> tuple[Cell, ...]:
     """Return the cheapest path if a cell costs 1, and 1 more for each map where it is occupied."""
     occupied = sum(scenario.grid.occupancy.astype(np.float32) for scenario in maps)
-    legal = legal_moves(SCENARIO.grid.occupancy, MOVE_RULE)
-    return search(SCENARIO.start, SCENARIO.goal, legal, np.float32(1) + occupied, MOVE_RULE)
+    grid = SCENARIO.grid.with_layers(slowness=np.float32(1) + occupied)
+    return search(SCENARIO.start, SCENARIO.goal, grid, MOVE_RULE)
 
 
 def report(settings: Settings) -> str:

@@ -259,6 +259,11 @@ class GridMap:
         """Return which moves are legal in each cell, see `legal_moves`: (8, H, W) bool."""
         return legal_moves(self.occupancy, move_rule, self.forbidden)
 
+    def for_moves(self, move_rule: MoveRule | str) -> tuple[Any, ...]:
+        """Return what compiled code asks whether a move is legal."""
+        forbidden = NO_DIRECTIONS if self.forbidden is None else self.forbidden
+        return self.occupancy, forbidden, MoveRule(move_rule).cuts_corners
+
     def reachable(
         self, cells: ArrayLike, move_rule: MoveRule | str, backward: bool = False
     ) -> NDArray[np.bool_]:
@@ -269,9 +274,7 @@ class GridMap:
         reached[array[:, 1], array[:, 0]] = True
         waiting, first = np.empty(reached.size, np.int64), np.flatnonzero(reached)
         waiting[: first.size] = first  # each cell waits at most once
-        forbidden = NO_DIRECTIONS if self.forbidden is None else self.forbidden
-        of_map = self.occupancy, forbidden, MoveRule(move_rule).cuts_corners
-        flood(of_map, backward, reached, waiting, first.size)
+        flood(self.for_moves(move_rule), backward, reached, waiting, first.size)
         return reached
 
     @cached_property

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.compiled import in_place
+from ddqn_planner.compiled import in_place, inlined
 from ddqn_planner.grid.arguments import Cell, Cells, Choice, Occupancy, cell_inside
 
 if TYPE_CHECKING:
@@ -160,13 +160,22 @@ def _dijkstra(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> Any:
     return dijkstra(graph, indices=y * grid.width + x, return_predecessors=True)
 
 
+@inlined
+def is_legal(x: int, y: int, action: int, of_map: Any) -> Any:  # pragma: no cover
+    """Return whether a move between free cells is legal, see `GridMap.for_moves`."""
+    occupancy, forbidden, cuts_corners = of_map
+    if forbidden.size > 0 and forbidden[y, x] >> action & 1:
+        return False
+    to_x, to_y = x + MOVES[action, 0], y + MOVES[action, 1]
+    return cuts_corners or not (occupancy[y, to_x] or occupancy[to_y, x])
+
+
 @in_place
 def flood(
     of_map: Any, backward: bool, reached: Any, waiting: Any, count: int
 ) -> None:  # pragma: no cover
     """Mark all cells to which moves lead from those that wait, or backward, from which."""
-    occupancy, forbidden, cuts_corners = of_map
-    height, width = reached.shape
+    occupancy, (height, width) = of_map[0], reached.shape
     while count > 0:
         count -= 1
         y, x = waiting[count] // width, waiting[count] % width
@@ -174,14 +183,11 @@ def flood(
             to_x, to_y = x + MOVES[action, 0], y + MOVES[action, 1]
             if not (0 <= to_x < width and 0 <= to_y < height) or reached[to_y, to_x]:
                 continue
-            is_closed = occupancy[to_y, to_x]
-            if not cuts_corners:
-                is_closed |= occupancy[y, to_x] | occupancy[to_y, x]
-            if forbidden.size > 0:
-                # Backward, the opposite move leads here from the next cell.
-                at_x, at_y, by = (to_x, to_y, action ^ 4) if backward else (x, y, action)
-                is_closed |= (forbidden[at_y, at_x] >> by & 1) != 0
-            if not is_closed:
+            if occupancy[to_y, to_x]:
+                continue
+            # Backward, the opposite move leads here from the next cell.
+            at_x, at_y, by = (to_x, to_y, action ^ 4) if backward else (x, y, action)
+            if is_legal(at_x, at_y, by, of_map):
                 reached[to_y, to_x] = True
                 waiting[count] = to_y * width + to_x
                 count += 1

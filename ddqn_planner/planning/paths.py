@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import compiled
-from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves
+from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import Cells, Occupancy
-from ddqn_planner.grid.moves import cells_along
+from ddqn_planner.grid.moves import cells_along, is_legal
 from ddqn_planner.planning.field import Goals
 from ddqn_planner.planning.plan import ROUNDING, PlanRequest, PlanStatus
 from ddqn_planner.planning.segments import (
@@ -31,24 +31,23 @@ NEARER_TO_GOAL = 1e-9
 def search(
     start: Cell,
     end: Cell | NDArray[np.bool_],
-    legal: NDArray[np.bool_],
-    multiplier: NDArray[np.float32],
+    grid: GridMap,
     move_rule: MoveRule,
     value: NDArray[np.float32] | None = None,
 ) -> tuple[Cell, ...]:
-    """Return a path to a cell, or to the nearest of a mask, by `legal` moves; empty without one."""
+    """Return a legal path to a cell, or to the nearest of a mask; empty without one."""
     # A* (Hart, Nilsson and Raphael 1968) with -V as its heuristic: a good field leads straight to
     # the end, and with any, each cell is visited at most once. Without values it is Dijkstra.
+    shape = grid.occupancy.shape
     if not isinstance(end, np.ndarray):
-        (x, y), end = end, np.zeros(multiplier.shape, dtype=np.bool_)
+        (x, y), end = end, np.zeros(shape, dtype=np.bool_)
         end[y, x] = True
-    if value is None:
-        value = np.zeros_like(multiplier)
-    entered_by, found = _search(start, end, legal, multiplier, move_rule.lengths, value, MOVES)
+    value = np.zeros(shape, np.float32) if value is None else value
+    costs = grid.cost_multiplier, move_rule.lengths
+    entered_by, found = _search(start, end, value, costs, grid.for_moves(move_rule))
     if found < 0:
         return ()
-    width = multiplier.shape[1]
-    cells = [(found % width, found // width)]
+    cells = [(found % grid.width, found // grid.width)]
     while cells[-1] != start:
         x, y = cells[-1]
         dx, dy = MOVES[entered_by[y, x]].tolist()
@@ -58,10 +57,10 @@ def search(
 
 @compiled
 def _search(
-    start: Cell, ends: Any, legal: Any, multiplier: Any, lengths: Any, value: Any, moves: Any
+    start: Cell, ends: Any, value: Any, costs: Any, of_map: Any
 ) -> tuple[NDArray[np.int8], int]:
     """Return the action by which each cell was entered, (H, W) int8, and the end's number or -1."""
-    width = ends.shape[1]
+    (multiplier, lengths), (height, width) = costs, ends.shape
     entered_by = np.full(ends.shape, -1, dtype=np.int8)
     visited = np.zeros(ends.shape, dtype=np.bool_)
     # Of each move: its order, the cost of the path with it, the cell it leads to, the action.
@@ -75,18 +74,17 @@ def _search(
         entered_by[y, x] = entered
         if ends[y, x]:
             return entered_by, cell
-        for action in range(moves.shape[0]):
-            if not legal[action, y, x]:
+        for action in range(8):
+            to_x, to_y = x + MOVES[action, 0], y + MOVES[action, 1]
+            if not (0 <= to_x < width and 0 <= to_y < height) or visited[to_y, to_x]:
                 continue
-            next_x, next_y = x + moves[action, 0], y + moves[action, 1]
-            if visited[next_y, next_x]:
-                continue
-            mean_multiplier = (np.float64(multiplier[y, x]) + multiplier[next_y, next_x]) / 2
-            through = cost + lengths[action] * mean_multiplier
-            order = through - value[next_y, next_x]
-            if np.isnan(order):
-                order = np.inf
-            heapq.heappush(waiting, (order, through, next_y * width + next_x, action))
+            if not of_map[0][to_y, to_x] and is_legal(x, y, action, of_map):
+                mean_multiplier = (np.float64(multiplier[y, x]) + multiplier[to_y, to_x]) / 2
+                through = cost + lengths[action] * mean_multiplier
+                order = through - value[to_y, to_x]
+                if np.isnan(order):
+                    order = np.inf
+                heapq.heappush(waiting, (order, through, to_y * width + to_x, action))
     return entered_by, -1
 
 
@@ -126,11 +124,10 @@ def find_way_out(request: PlanRequest, ends: NDArray[np.bool_]) -> tuple[Cell, .
     """Return the shortest way from a start that is not free to one of some free cells, or ()."""
     grid, rule, (goal_x, goal_y) = request.grid, request.move_rule, request.goal
     obstacles = obstacles_in_the_way(grid, request.start, request.start_clearing_radius)
-    legal = legal_moves(~ends & (obstacles | ~grid.occupancy), rule, grid.forbidden)
-    everywhere_1 = np.ones(ends.shape, np.float32)
+    leaving = GridMap(~ends & (obstacles | ~grid.occupancy), forbidden=grid.forbidden)
     y, x = np.ogrid[: grid.height, : grid.width]
     value = (-NEARER_TO_GOAL * np.hypot(x - goal_x, y - goal_y)).astype(np.float32)
-    return search(request.start, ends, legal, everywhere_1, rule, value)
+    return search(request.start, ends, leaving, rule, value)
 
 
 def _near(cells: NDArray[np.bool_], centre: Cell, distance: float) -> NDArray[np.int64]:

@@ -317,8 +317,7 @@ class Planner:
         if not plan.path.size and request.method is PlanMethod.ASTAR_FALLBACK:
             yield None
             began = time.perf_counter()
-            of_field = field.legal, grid.cost_multiplier, rule, field.value
-            cells = np.array(search(way_out[-1], field.goal, *of_field))
+            cells = np.array(search(way_out[-1], field.goal, grid, rule, field.value))
             plan = Plan(PlanStatus.SUCCEEDED, cells, PlanMethod.ASTAR_FALLBACK)
         if plan.path.size:
             yield _dressed(request, plan, way_out, began)

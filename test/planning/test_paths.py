@@ -225,7 +225,7 @@ def test_a_search_finds_any_legal_path(place: Place, rule: MoveRule, data: Data)
     legal = legal_moves(grid.occupancy, rule)
     distances = shortest_distances(grid, goal, rule)
 
-    cells = search(start, goal, legal, grid.cost_multiplier, rule, value)
+    cells = search(start, goal, grid, rule, value)
     assert (cells != ()) == np.isfinite(distances[start[1], start[0]])
     if cells:
         assert (cells[0], cells[-1]) == (start, goal)
@@ -235,7 +235,7 @@ def test_a_search_finds_any_legal_path(place: Place, rule: MoveRule, data: Data)
 
     cheapest = distances[start[1], start[0]]
     for known in (None, -distances.astype(np.float32)):  # nothing is known, or all is
-        cells = search(start, goal, legal, grid.cost_multiplier, rule, known)
+        cells = search(start, goal, grid, rule, known)
         if cells:
             assert path_cost(grid, cells, rule) == pytest.approx(cheapest)
 
@@ -246,9 +246,8 @@ def test_a_search_follows_the_values_even_on_a_detour() -> None:
     value = np.zeros((3, 5), np.float32)
     for x, y in detour:
         value[y, x] = 100
-    legal = legal_moves(grid.occupancy, rule)
-    assert set(search((0, 0), (4, 0), legal, grid.cost_multiplier, rule, value)) <= set(detour)
-    assert len(search((0, 0), (4, 0), legal, grid.cost_multiplier, rule)) == 5
+    assert set(search((0, 0), (4, 0), grid, rule, value)) <= set(detour)
+    assert len(search((0, 0), (4, 0), grid, rule)) == 5
 
 
 @settings(max_examples=300)
