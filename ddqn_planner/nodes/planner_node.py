@@ -26,10 +26,8 @@ from ddqn_planner.nodes.requests import (
     UNCHANGED,
     ActiveGoal,
     ModelSource,
-    PathUnderWay,
     Requests,
     read_model,
-    way_of,
 )
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker, spin_until_shutdown, unless
 from ddqn_planner.planning import Planner
@@ -111,7 +109,9 @@ class PlannerNode(ManagedNode):
     def deactivate(self) -> None:
         """Forget the active goal."""
         super().deactivate()
-        self._active, self._followed = ActiveGoal([]), PathUnderWay()
+        self._active = ActiveGoal([])
+        # Of actions whose path can be kept, and of those whose path can get better, the last ones.
+        self._followed: Outcome | None = None
         self._newest: Outcome | None = None
         self._report.change()
 
@@ -158,7 +158,7 @@ class PlannerNode(ManagedNode):
         self._requests.settings = self._settings
         self._map.apply_parameters(changed)
         if "path_simplification" in changed:
-            self._followed = PathUnderWay()
+            self._followed = None
         self._plan_for(ActiveGoal(self._active.poses))
 
     def _on_model(self, message: UInt8MultiArray) -> None:
@@ -177,7 +177,7 @@ class PlannerNode(ManagedNode):
         self._replan.trigger()
 
     def _on_start(self) -> None:
-        self._plan_for(ActiveGoal(self._active.poses, self._active.path))
+        self._plan_for(ActiveGoal(self._active.poses, self._active.followed))
 
     def _plan_for(self, active: ActiveGoal) -> None:
         """Plan at once, whatever was planned: the one before may have a plan under way."""
@@ -216,7 +216,7 @@ class PlannerNode(ManagedNode):
         active, goals = self._active, self._active.poses
         if not goals:
             return
-        planning = self._requests.plan(None, goals, followed=active.path, active=active)
+        planning = self._requests.plan(None, goals, followed=active.followed, active=active)
         outcome = await self._answer(goals, planning)
         if outcome.status in (UNCHANGED.status, NOT_ACTIVE.status):
             return
@@ -243,7 +243,7 @@ class PlannerNode(ManagedNode):
         to_publish, path = _paths(outcome, path_bytes, path_message)
         if len(outcome.plan.path):
             if form == self._settings.path_simplification:  # else the next path is a new one
-                self._followed = way_of(outcome)
+                self._followed = outcome
             # It gets the better path with its next request.
             self._improve_later(outcome, None)
             self._plan_publisher.publish(to_publish)

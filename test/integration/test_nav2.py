@@ -252,7 +252,7 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
 
         node._requests.plan = plan_and_set
         run(node._plan_for_action(ends[0], [ends[1]], "", lambda: None))
-        assert len(node._followed.path) == 0
+        assert node._followed is None
 
         # A path that cannot be checked is not valid, and the node lives.
         request, validity = SimpleNamespace(path=PathMessage()), SimpleNamespace()
