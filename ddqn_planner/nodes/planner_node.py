@@ -157,8 +157,6 @@ class PlannerNode(ManagedNode):
         self._start.listen()
         self._requests.settings = self._settings
         self._map.apply_parameters(changed)
-        if "path_simplification" in changed:
-            self._followed = None
         self._plan_for(ActiveGoal(self._active.poses))
 
     def _on_model(self, message: UInt8MultiArray) -> None:
@@ -227,7 +225,7 @@ class PlannerNode(ManagedNode):
         logged = goals, outcome.goal, outcome.status, outcome.plan.method
         if self._logged != logged:
             self._logged = logged
-            self._report.log(outcome)
+            self._report.log(outcome, paths=True)
 
     def _publish(self, outcome: Outcome, active: ActiveGoal) -> None:
         if active.is_news(outcome):
@@ -237,13 +235,11 @@ class PlannerNode(ManagedNode):
     async def _plan_for_action(
         self, start: PoseStamped | None, goals: list[PoseStamped], name: str, given_up: GivenUp
     ) -> tuple[Path, Outcome]:
-        form = self._settings.path_simplification
         planning = self._requests.plan(start, goals, None, name, self._followed)
         outcome = await self._answer(goals, planning, given_up)
         to_publish, path = _paths(outcome, path_bytes, path_message)
         if len(outcome.plan.path):
-            if form == self._settings.path_simplification:  # else the next path is a new one
-                self._followed = outcome
+            self._followed = outcome
             # It gets the better path with its next request.
             self._improve_later(outcome, None)
             self._plan_publisher.publish(to_publish)
@@ -312,7 +308,6 @@ class PlannerNode(ManagedNode):
     def _on_look(self) -> None:
         is_frequent = bool(self._active.poses) and self._settings.replan_period < IDLE_PERIOD
         self._look_soon(self._waits_for_pose or is_frequent)
-        self._report.log_paths()
         if self._is_configured:
             self._look_for_news()
         if self._report.is_due():

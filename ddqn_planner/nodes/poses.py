@@ -21,6 +21,7 @@ from ddqn_planner.nodes.runtime import STEADY, BaseNode
 READ_PERIOD, TF_DEPTH = 0.5, 1000  # seconds between two reads, and messages that come meanwhile
 SILENCE = 2.0  # seconds after which odometry that comes no more does not tell where the robot is
 REMEDY = "; or install tf2_ros (apt install ros-jazzy-tf2-ros-py), which transforms it"
+NEWEST = Time()
 TYPES = {"odom": Odometry, "initialpose": PoseWithCovarianceStamped, "goal_pose": PoseStamped}
 
 
@@ -65,8 +66,6 @@ class Frames:
 
     def _transform_at(self, stamped: PoseStamped, map_frame: str) -> TransformStamped:
         stamp, frames = Time.from_msg(stamped.header.stamp), (map_frame, stamped.header.frame_id)
-        if not stamp.nanoseconds:
-            return self._newest(*frames)
         try:
             return self._lookup(*frames, stamp)
         except ValueError:
@@ -78,28 +77,25 @@ class Frames:
 
     def origin_of(self, frame: str, map_frame: str) -> PoseStamped:
         """Return where a frame's origin is now; ValueError if TF does not know it of now."""
-        return transformed(PoseStamped(), self._newest(map_frame, frame))
+        return transformed(PoseStamped(), self._lookup(map_frame, frame))
 
-    def _newest(self, target: str, source: str) -> TransformStamped:
-        newest = self._lookup(target, source)
-        stamp = Time.from_msg(newest.header.stamp)
-        age, limit = (self._node.get_clock().now() - stamp).nanoseconds / 1e9, self._tolerance()
-        # Static transforms have the stamp 0, and are never too old.
-        if stamp.nanoseconds and abs(age) > limit:
-            when = f"{age:.3g} s old" if age > 0 else f"{-age:.3g} s in the future"
-            raise ValueError(f"the newest is {when}, more than transform_tolerance, {limit:g} s")
-        return newest
-
-    def _lookup(self, target: str, source: str, stamp: Time | None = None) -> TransformStamped:
+    def _lookup(self, target: str, source: str, stamp: Time = NEWEST) -> TransformStamped:
         """Return the transform from a frame to another at a time, by default the newest."""
         if not self.available:
             raise ValueError("tf2_ros is not installed")
         self.listen()
         self._read()
         try:
-            return self._buffer.lookup_transform(target, source, stamp or Time())
+            found = self._buffer.lookup_transform(target, source, stamp)
         except self._tf2_ros.TransformException as error:
             raise ValueError(str(error)) from None
+        of = Time.from_msg(found.header.stamp)
+        age, limit = (self._node.get_clock().now() - of).nanoseconds / 1e9, self._tolerance()
+        # Static transforms have the stamp 0, and are never too old.
+        if of.nanoseconds and not stamp.nanoseconds and abs(age) > limit:
+            when = f"{age:.3g} s old" if age > 0 else f"{-age:.3g} s in the future"
+            raise ValueError(f"the newest is {when}, more than transform_tolerance, {limit:g} s")
+        return found
 
     def listen(self) -> None:
         """Listen to TF from now on: most robots do not need it, and each message costs time."""

@@ -93,15 +93,17 @@ class ActiveGoal:
 
 
 def path_under_way(last: Outcome | None, request: Request, frame: str) -> Any:
-    """Return the last path in cells of a request's map, or none if that has another place."""
-    # A path of cells is none of poses: the model may be another one.
-    if last is None or frame != last.header.frame_id or not isinstance(last.request, type(request)):
+    """Return the last path in cells of a request's map; none if it has another place or form."""
+    if last is None or frame != last.header.frame_id:
         return ()
-    if isinstance(last.plan, PosePlan):
-        return last.plan.poses
-    if (shift := shift_between(last.request.grid, request.grid)) is None:
+    plan, before = last.plan, last.request  # with another model perhaps
+    if isinstance(request, PoseRequest):
+        return plan.poses if isinstance(plan, PosePlan) else ()
+    if not isinstance(before, PlanRequest) or before.simplified != request.simplified:
         return ()
-    cells = last.plan.path + np.array(shift, np.int32)
+    if (shift := shift_between(before.grid, request.grid)) is None:
+        return ()
+    cells = plan.path + np.array(shift, np.int32)
     return cells if request.grid.contains((*cells[-1].tolist(),)) else ()
 
 
