@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import fields
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import ddqn_planner as api
-from ddqn_planner.files import WorkFolder, differences, write_atomically
-from ddqn_planner.plan_command import add_map_options, plan, read_map
+from ddqn_planner.files import WorkFolder, differences, write_atomically, write_csv
 from ddqn_planner.resources import find_map, with_remedy
 
 # A command imports what it needs, and no other command's libraries: the names of `api` do so, too.
 if TYPE_CHECKING:
+    from ddqn_planner.grid import Cell, GridMap, MapFile
     from ddqn_planner.training.environment import Scenario
-    from ddqn_planner.training.hyper_parameters import HyperParameters
     from ddqn_planner.training.run import TrainingRun
+
+# Options of `plan` that only one kind of model can follow.
+OF_CELLS: Final = "robot_radius", "move_rule", "mode", "start_clearing_radius", "cells"
+OF_BODIES: Final = "yaws", "yaw_tolerance", "bound"
 
 
 class HelpFormatter(argparse.HelpFormatter):
@@ -44,20 +46,174 @@ def exit_code(program: str, run: Callable[[], int]) -> int:
         return 2
 
 
+def plan(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
+    """Plan a path on a map file, and print it."""
+    from ddqn_planner.warm_up import warm_up
+
+    _add_map_options(parser, None)
+    modes = [method.value for method in api.PlanMethod]
+    _add_options(
+        parser,
+        ("model", str, "any_map", "name or file; that of train-robot has a body"),
+        ("mode", modes, "greedy", "astar_fallback: search if steps get stuck"),
+        ("occupied-threshold", int, 65, "a cell of this value or more is occupied, percent"),
+        ("allow-unknown", bool, False, "treat unknown cells as free"),
+        ("use-map-costs", bool, False, "free cells cost by their values, unknown ones most"),
+        ("robot-radius", float, 0.0, "distance that the path keeps from obstacles, metres"),
+        ("clearance-weight", float, 0.0, "how strongly to avoid cells near obstacles, 0 to 1"),
+        ("tolerance", float, 0.0, "how far a goal that is occupied or cut off may move, metres"),
+        ("start-clearing-radius", float, 0.0, "obstacles so near to a start do not count, metres"),
+        ("yaw-tolerance", float, 0.0, "body: how far such a goal may turn, radians"),
+        ("bound", float, 1.0, "body: how many times the least cost a path may have"),
+        ("cells", bool, False, "print each cell of the path, as X Y"),
+        ("csv", Path, None, "write the path's cells and metres, or its poses"),
+        ("json", bool, False, "print JSON instead of text"),
+        ("picture", Path, None, "draw map, path, and the value or the body"),
+    )
+    words, pair = "body: headings in the map frame, radians", ("START", "GOAL")
+    parser.add_argument("--yaws", type=float, nargs=2, default=(0, 0), metavar=pair, help=words)
+    options = parser.parse_args(arguments)
+    map_file, start, goal = _read_map(options)
+    planner = api.Planner.load(options.model)
+    has_body = planner.pose_planner is not None
+    others, kind = (OF_CELLS, "without") if has_body else (OF_BODIES, "with")
+    given = parser.parse_args(arguments, argparse.Namespace(**dict.fromkeys(others)))
+    if wrong := [name for name in others if getattr(given, name) is not None]:
+        problem = f"--{wrong[0].replace('_', '-')} is for models {kind} a body, unlike "
+        raise ValueError(f"{problem}{options.model}; leave it out, or give another --model")
+    grid = map_file.grid(options.occupied_threshold, options.allow_unknown, options.use_map_costs)
+    grid = api.inflate(grid, options.robot_radius, options.clearance_weight)
+    next(warm_up(planner))  # so that the time leaves out how long compiled code takes to load
+    return (_plan_poses if has_body else _plan_cells)(options, planner, grid, start, goal)
+
+
+def _plan_cells(options: Any, planner: api.Planner, grid: GridMap, start: Cell, goal: Cell) -> int:
+    import numpy as np
+
+    from ddqn_planner.grid import path_length
+    from ddqn_planner.grid.arguments import as_number
+    from ddqn_planner.planning.paths import search
+
+    metres = 0, np.inf, "metres, 0 or more"
+    tolerance = as_number("--tolerance", options.tolerance, *metres)
+    radius = as_number("--start-clearing-radius", options.start_clearing_radius, *metres)
+    asked = options.move_rule, options.mode, tolerance / grid.resolution
+    radius /= grid.resolution
+    began = time.perf_counter()
+    plan = planner.plan(grid, start, goal, *asked, start_clearing_radius=radius)
+    seconds, rule = time.perf_counter() - began, plan.move_rule
+    optimum = value = None
+    if plan.cells and grid.is_free(plan.cells[0]):
+        legal, no_costs = grid.legal_moves(rule), np.ones(grid.occupancy.shape, "f4")
+        shortest = search(plan.cells[0], plan.cells[-1], legal, no_costs, rule)
+        optimum = path_length(shortest, rule)
+    if options.picture and plan.cells and planner.network.supports((grid.height, grid.width)):
+        value = planner.q_field(grid, plan.cells[-1], rule).value
+    lines = [f"{x} {y}" for x, y in plan.cells if options.cells]
+    if plan.cells:
+        driven = path_length(plan.path) * grid.resolution
+        lines.append(f"start {plan.cells[0]}, goal {plan.cells[-1]}, {driven:.2f} m")
+        known = "" if optimum is None else f"optimum {optimum:.2f} under {rule.value}, "
+        known += "" if plan.cost is None else f"cost {plan.cost:.2f}, "
+        known += f"{plan.method.value}, planned in {seconds * 1e3:.1f} ms"
+        lines.append(f"length {plan.length:.2f} cells, {known}")
+    answer: Any = {"cells": plan.cells, "method": plan.method.value, "length": plan.length}
+    answer |= {"optimum": optimum, "move_rule": rule.value, "planning_seconds": seconds}
+    rows = [(*cell, *np.round(grid.cell_to_world(cell), 6)) for cell in plan.cells]
+    table = ("x", "y", "x_metres", "y_metres"), rows
+    title = f"{plan.length:.2f} cells" if plan.cells else plan.status.value
+    return _show(options, grid, plan, answer, lines, table, title=title, value=value)
+
+
+def _plan_poses(options: Any, planner: api.Planner, grid: GridMap, start: Cell, goal: Cell) -> int:
+    import numpy as np
+
+    from ddqn_planner.planning.pose_paths import in_cells
+
+    assert planner.pose_planner is not None
+    cells_and_yaws = zip((start, goal), options.yaws, strict=True)
+    first, last = ((*grid.cell_to_world(cell), yaw) for cell, yaw in cells_and_yaws)
+    tolerance = options.tolerance, options.yaw_tolerance
+    began = time.perf_counter()
+    plan = planner.plan_poses(grid, first, last, tolerance, options.bound)
+    seconds = time.perf_counter() - began
+    metres = plan.length * grid.resolution
+    title = f"{metres:.2f} m" if plan.cells else plan.status.value
+    known = f"at most {plan.bound:.3f} times the least cost, planned in {seconds * 1e3:.1f} ms"
+    lines = [f"{metres:.2f} m, {len(plan.poses)} poses, {known}"]
+    answer = {"poses": plan.poses.tolist(), "metres": metres, "cost": plan.cost}
+    answer |= {"bound": plan.bound, "planning_seconds": seconds}
+    ends = plan.poses[[0, -1]] if plan.cells else np.array([first, last])
+    footprint = planner.pose_planner.footprint / grid.resolution
+    body = footprint, in_cells(plan.poses, grid), in_cells(ends, grid)
+    table = ("x", "y", "yaw"), np.round(plan.poses, 6).tolist()
+    return _show(options, grid, plan, answer, lines, table, title=title, body=body)
+
+
+def _show(
+    options: Any, grid: GridMap, plan: Any, answer: Any, lines: list[str], table: Any, **drawn: Any
+) -> int:
+    """Print JSON, or a map and lines, or why there is no path; write and draw what is asked for."""
+    from ddqn_planner.pictures import MAX_TEXT_WIDTH, draw_text, save_picture
+
+    if options.json:
+        print(json.dumps({"status": plan.status.name, "reason": plan.status.value, **answer}))
+    elif plan.cells:
+        if grid.width <= MAX_TEXT_WIDTH or sys.stdout.isatty():
+            print(draw_text(grid, plan.cells))
+        print(*lines, sep="\n")
+    else:
+        hint = " for the body; --picture shows it" if "body" in drawn else ""
+        print(f"no path: {plan.status.value}{hint}", file=sys.stderr)
+    if options.csv:
+        write_csv(options.csv, *table)
+    if options.picture:
+        save_picture(options.picture, grid, plan.cells, **drawn)
+    return 0 if plan.cells else 1
+
+
+def _add_options(parser: argparse.ArgumentParser, *options: tuple[str, Any, Any, str]) -> None:
+    """Add options of a name, a type or choices, a default and words; a flag's type is bool."""
+    for name, kind, default, words in options:
+        how = {"action": "store_true"} if kind is bool else {"type": kind, "metavar": "X"}
+        how = {"choices": kind} if isinstance(kind, Sequence) else how
+        parser.add_argument(f"--{name}", default=default, help=words, **how)
+
+
+def _add_map_options(parser: argparse.ArgumentParser, move_rule: str | None) -> None:
+    parser.add_argument("map", help="ROS map YAML, MovingAI .map, or name of a shipped map")
+    for name in ("start", "goal"):
+        words = f"the {name}'s cell, by default the map file's"
+        parser.add_argument(f"--{name}", type=int, nargs=2, metavar=("X", "Y"), help=words)
+    words = "which diagonal moves are legal" + ("" if move_rule else ", by default as in training")
+    _add_options(parser, ("move-rule", [rule.value for rule in api.MoveRule], move_rule, words))
+
+
+def _read_map(options: Any) -> tuple[MapFile, Cell, Cell]:
+    """Return the map file, the start and the goal that the options give."""
+    from ddqn_planner.grid import read_map_file
+
+    map_file = read_map_file(find_map(options.map))
+    start, goal = options.start or map_file.start, options.goal or map_file.goal
+    if start is None or goal is None:
+        raise ValueError(f"{options.map} names no start and goal; give --start X Y and --goal X Y")
+    return map_file, tuple(start), tuple(goal)
+
+
 def train(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     """Train a model on a map file, into a folder. Run the same command again to resume."""
     from ddqn_planner.training.environment import Scenario
     from ddqn_planner.training.evaluation import evaluate
     from ddqn_planner.training.hyper_parameters import HyperParameters
 
-    add_map_options(parser, "corner_cutting")
+    _add_map_options(parser, "corner_cutting")
     _add_training_options(parser, "runs/train", HyperParameters())
     options = parser.parse_args(arguments)
-    map_file, start, goal = read_map(options)
-    scenario, rule = Scenario(map_file.grid(), start, goal), api.MoveRule(options.move_rule)
-    run = _run_training(options, lambda: [scenario], rule)
-    field = run.trainer.planner().q_field(scenario.grid, goal)
-    evaluation, plan = evaluate(field, scenario.grid, rule), field.rollout(start)
+    map_file, start, goal = _read_map(options)
+    scenario = Scenario(map_file.grid(), start, goal)
+    trainer = _run_training(options, lambda: [scenario]).trainer
+    field = trainer.planner().q_field(scenario.grid, goal)
+    evaluation, plan = evaluate(field, scenario.grid, field.move_rule), field.rollout(start)
     print(
         f"the greedy rollout solves {evaluation.solved} of {evaluation.starts} starts, mean length "
         f"{evaluation.mean_ratio:.4f} of the optimum; from the start "
@@ -70,13 +226,13 @@ def train_any_map(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> 
     """Train a model for any map on small random maps. Run the same command again to resume."""
     from ddqn_planner.training.any_map import ANY_MAP, MAPS, random_scenarios
 
-    parser.add_argument("--maps", type=int, default=MAPS, metavar="N", help="number of maps")
+    _add_options(parser, ("maps", int, MAPS, "number of maps"))
     _add_training_options(parser, "runs/any_map", ANY_MAP)
+    parser.set_defaults(move_rule="robot_safe")
     options = parser.parse_args(arguments)
     if options.maps < 1:
         raise ValueError(f"--maps is {options.maps}; give at least 1")
-    draw = partial(random_scenarios, options.seed, options.maps)
-    _run_training(options, draw, api.MoveRule.ROBOT_SAFE)
+    _run_training(options, lambda: random_scenarios(options.seed, options.maps))
     return 0
 
 
@@ -87,7 +243,8 @@ def train_robot(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> in
     from ddqn_planner.model import save_model
     from ddqn_planner.training.robot import ROBOT, RobotTrainer
 
-    for name, kind, default, words in (
+    _add_options(
+        parser,
         ("footprint", str, None, "'[[x, y], ...]', metres, or a radius, as in Nav2's costmaps"),
         ("padding", float, 0.0, "metres by which the body counts as larger: room for a controller"),
         ("motion", str, None, "differential, ackermann or omnidirectional"),
@@ -97,8 +254,7 @@ def train_robot(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> in
         ("out", str, "my_robot.safetensors", "the model's file"),
         ("seed", int, 0, "seed of the training"),
         ("steps", int, ROBOT.steps, "transitions after which to give up"),
-    ):
-        parser.add_argument(f"--{name}", type=kind, default=default, metavar="X", help=words)
+    )
     options = parser.parse_args(arguments)
     how = options.turning_radius, options.resolution, options.lattice, options.seed, options.padding
     trainer = RobotTrainer(options.footprint, options.motion, *how)
@@ -114,24 +270,16 @@ def train_robot(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> in
     return int(not certificate.proved)
 
 
-def _add_training_options(
-    parser: argparse.ArgumentParser, out: str, parameters: HyperParameters
-) -> None:
-    parser.add_argument("--out", type=Path, default=Path(out), help="folder of the run")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the training")
+def _add_training_options(parser: argparse.ArgumentParser, out: str, parameters: Any) -> None:
+    _add_options(parser, ("out", Path, out, "folder of the run"))
+    _add_options(parser, ("seed", int, 0, "seed of the training"))
     for entry in fields(parameters):
-        parser.add_argument(
-            f"--{entry.name.replace('_', '-')}",
-            type=type(entry.default),
-            default=getattr(parameters, entry.name),
-            choices=entry.metadata.get("choices"),
-            help=entry.metadata["source"],
-        )
+        kind = entry.metadata.get("choices") or type(entry.default)
+        default, words = getattr(parameters, entry.name), entry.metadata["source"]
+        _add_options(parser, (entry.name.replace("_", "-"), kind, default, words))
 
 
-def _run_training(
-    options: Any, scenarios: Callable[[], Sequence[Scenario]], move_rule: api.MoveRule
-) -> TrainingRun:
+def _run_training(options: Any, scenarios: Callable[[], Sequence[Scenario]]) -> TrainingRun:
     """Train into ``--out`` until ``--steps`` or a signal to stop; return the closed run."""
     import torch  # before the scenarios are made, which may take seconds
     from tqdm import tqdm
@@ -141,15 +289,15 @@ def _run_training(
 
     torch.set_num_threads(1)  # as fast as two for such small networks, and always the same result
     values = {entry.name: getattr(options, entry.name) for entry in fields(HyperParameters)}
-    parameters = HyperParameters(**values)
+    parameters, rule = HyperParameters(**values), api.MoveRule(options.move_rule)
     with ExitStack() as stack:
-        run = TrainingRun(options.out, scenarios(), move_rule, parameters, options.seed)
+        run = TrainingRun(options.out, scenarios(), rule, parameters, options.seed)
         trainer = stack.enter_context(closing(run)).trainer
         print(run.description)
-        interrupted = threading.Event()
+        signals: list[int] = []
         # An exception could interrupt a step; a flag is read between two steps.
         for number in (signal.SIGINT, signal.SIGTERM):
-            before = signal.signal(number, lambda *_: interrupted.set())
+            before = signal.signal(number, lambda number, _: signals.append(number))
             stack.callback(signal.signal, number, before)
         # disable=None: no bar if the output is not a terminal.
         with tqdm(total=parameters.steps, initial=trainer.steps, disable=None) as bar:
@@ -158,7 +306,7 @@ def _run_training(
                 for episode in finished:
                     figures = {"episode": episode.number, "average reward": episode.average_reward}
                     bar.set_postfix(figures, refresh=False)
-                if interrupted.is_set():
+                if signals:
                     run.try_to_save()
                     print(f"stopped at step {trainer.steps}; run the same command to resume")
                     break
@@ -191,7 +339,8 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     words = "trainers' folders, bags, MCAP files, or CSV files with the columns seconds, x, y"
     parser.add_argument("drives", type=Path, nargs="+", help=words)
     parser.add_argument("--map", required=True, help="ROS map YAML, or name of a shipped map")
-    for name, kind, default, words in (
+    _add_options(
+        parser,
         ("out", Path, None, "by default experience.npz in the first folder, or beside the file"),
         ("experience", Path, None, "older file that the drives add to; else all is learned anew"),
         ("nominal-speed", float, None, "a first guess, m/s; by default 0.5, or --experience's"),
@@ -199,8 +348,7 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
         ("topic", str, "", "MCAP: of poses or transforms, by default that with most of them"),
         ("frame", str, "map", "MCAP: the map's frame"),
         ("robot-frame", str, "", "MCAP: by default any that ends in base_link"),
-    ):
-        parser.add_argument(f"--{name}", type=kind, default=default, metavar="X", help=words)
+    )
     options = parser.parse_args(arguments)
     grid = api.load_map(find_map(options.map))
     of_robot = {"nominal_speed": options.nominal_speed, "robot_width": options.robot_width}
@@ -244,8 +392,7 @@ def warm_up(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
 
     parser.add_argument("model", nargs="?", default="any_map", help="name or file")
     planner, began = api.Planner.load(parser.parse_args(arguments).model), time.perf_counter()
-    for _ in stages(planner, learns=True):
-        pass
+    list(stages(planner, learns=True))
     print(f"compiled, or loaded, in {time.perf_counter() - began:.1f} s")
     return 0
 
@@ -264,10 +411,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     names = parser.add_subparsers(required=True, metavar="|".join(COMMANDS))
     parsers = {}
     for name, command in COMMANDS.items():
-        words, _, _ = str(command.__doc__).partition(".")
-        parsers[name] = names.add_parser(
-            name, help=words, description=command.__doc__, formatter_class=HelpFormatter
-        )
+        how: Any = {"description": command.__doc__, "formatter_class": HelpFormatter}
+        parsers[name] = names.add_parser(name, help=str(command.__doc__).split(".")[0], **how)
     if not arguments or arguments[0] not in COMMANDS:
         parser.parse_args(arguments)  # ends with the help, or an error
     name, *others = arguments

@@ -17,10 +17,8 @@ OBSTACLE_COLOUR, PATH_COLOUR, DIRECTION_COLOUR = "#22223b", "#d1495b", "#6c757d"
 VALUE_COLOURS = ("#f4f1de", "#cfe8dc", "#93cfc8", "#4fa3b5")
 """From the worst value to the best: light to dark, so that the order shows without colours too."""
 
-# Codes of colours: outside the map, free, occupied, the path, its ends.
-TERMINAL = ("9", "8;5;255", "8;5;236", "8;5;167", "8;5;33")
-
-MAX_TEXT_WIDTH = 64  # cells of the widest map that is worth printing: two characters for each
+SIGNS = ".>^<v#*SG"  # of a map as text: where one has to stand for several, it is the last of them
+MAX_TEXT_WIDTH = 64  # signs in a row, two characters for each
 MAX_SIDE_WITH_LINES = 64  # cells of the longest side of a map with lines between its cells
 MAX_ARROWS = 48  # arrows of one-way zones along the longest side of a map
 OUTLINES = 30  # of a body along its path
@@ -28,43 +26,31 @@ ONE_WAY = 1e-9  # the mean direction of a cell that is not one-way is shorter
 
 
 def draw_text(grid: GridMap, cells: Sequence[Cell]) -> str:
-    """Return the map as text, y upwards: # occupied, . or an arrow free, * path, S and G ends."""
-    letters = np.full(grid.occupancy.shape, ".")
+    """Return the map as text, y upwards: # occupied, . or an arrow free, * path, S and G ends.
+
+    A character of a wide map stands for a square of cells, and shows the last of `SIGNS` in it.
+    """
+    shown = np.where(grid.occupancy, SIGNS.index("#"), 0)
     if grid.forbidden is not None:
         x, y = _mean_directions(grid.forbidden)
-        quarter = np.rint(np.arctan2(y, x) / (np.pi / 2)).astype(np.int64)
-        letters = np.where(np.hypot(x, y) > ONE_WAY, np.array(list(">^<v"))[quarter], letters)
-    letters[grid.occupancy] = "#"
-    for x, y in cells:
-        letters[y, x] = "*"
-    for letter, (x, y) in zip("SG", (*cells[:1], *cells[-1:]), strict=False):
-        letters[y, x] = letter
-    return "\n".join(" ".join(row) for row in letters[::-1])
-
-
-def draw_blocks(grid: GridMap, cells: Sequence[Cell], columns: int, lines: int) -> str:
-    """Return the map for a terminal of so many characters, each of them two coloured squares."""
-    side = max(-(-grid.width // columns), -(-grid.height // (2 * lines)))  # cells
-    shown = np.where(grid.occupancy, 2, 1)
-    shown[tuple(np.transpose(cells)[::-1])] = 3
-    for x, y in (cells[0], cells[-1]):
-        shown[y, x] = 4
-    shown = np.pad(shown, [(0, -grid.height % (2 * side)), (0, -grid.width % side)])
-    rows, width = shown.shape[0] // side, shown.shape[1] // side
-    squares = shown.reshape(rows, side, width, side).max(axis=(1, 3))[::-1]
-    return "\n".join(
-        "".join(f"\x1b[3{TERMINAL[a]};4{TERMINAL[b]}m▀" for a, b in zip(*pair, strict=True))
-        + "\x1b[0m"
-        for pair in zip(squares[::2], squares[1::2], strict=True)
-    )
+        quarter = np.rint(np.arctan2(y, x) / (np.pi / 2)).astype(np.int64) % 4
+        in_zone = ~grid.occupancy & (np.hypot(x, y) > ONE_WAY)
+        shown[in_zone] = quarter[in_zone] + 1
+    for sign, places in (("*", cells), ("S", cells[:1]), ("G", cells[-1:])):
+        for x, y in places:
+            shown[y, x] = SIGNS.index(sign)
+    side = -(-grid.width // MAX_TEXT_WIDTH)  # cells
+    for axis, size in enumerate(shown.shape):
+        shown = np.maximum.reduceat(shown, range(0, size, side), axis)
+    return "\n".join(" ".join(SIGNS[sign] for sign in row) for row in shown[::-1])
 
 
 def save_picture(
     path: str | Path,
     grid: GridMap,
     cells: Sequence[Cell],
-    value: NDArray[np.float32] | None,
-    title: str,
+    value: NDArray[np.float32] | None = None,
+    title: str = "",
     value_label: str = "value: max Q(s, a)",
     body: tuple[Array, Array, Array] | None = None,  # see `draw_body`
 ) -> None:

@@ -56,7 +56,7 @@ class TorchLearner:
                 state[key] = torch.from_numpy(part[name].copy())
                 part[name] = state[key].numpy()
             self._adam.state[weight] = state
-        trainer._player, trainer._learner = None, self
+        trainer._learner = self
 
     def settle(self) -> None:
         """Do nothing: this network knows no values of maps."""

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from ddqn_planner.grid import arguments
 from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell, Occupancy
 from ddqn_planner.grid.copies import ORIGIN, Box, replaced
-from ddqn_planner.grid.moves import MoveRule, component_labels, flood, legal_moves
+from ddqn_planner.grid.moves import MoveRule, flood, legal_moves
 
 MAX_COST_MULTIPLIER = 5.0
 """That of a cell of value 100 or unknown; as in Nav2's NavFn planner: 50 if free, at most 253."""
@@ -22,6 +22,8 @@ MAX_COST_MULTIPLIER = 5.0
 LAYERS = "occupancy", "cost", "forbidden", "slowness"  # what its moves depend on
 PATCHED = {"occupancy", "cost", "obstacles"}  # layers of which patches change some cells
 MAX_PATCHES = 512  # so many are known of a map, one after the other
+
+NO_DIRECTIONS = np.frombuffer(b"", np.uint8).reshape(0, 0)  # not to be written to, as those of maps
 
 # (101,): the multiplier of each cost, 0 to 100
 MULTIPLIERS = np.linspace(1, MAX_COST_MULTIPLIER, OCCUPIED + 1, dtype=np.float32)
@@ -209,7 +211,7 @@ class GridMap:
         """Return the same map with other layers, which are neither checked nor copied."""
         stale = {"cost_multiplier", "fingerprint"}
         if layers.keys() & PATCHED:
-            stale |= {"_history", "_labels", "_occupied"}
+            stale |= {"_history", "_occupied"}
         else:
             layers["_history"] = self._history  # which may not be there yet
         kept = {name: value for name, value in vars(self).items() if name not in stale}
@@ -248,11 +250,12 @@ class GridMap:
 
     def labels(self, move_rule: MoveRule | str) -> NDArray[np.int32]:
         """Return (H, W) int32: each free cell's component, from 1 on, whatever is forbidden."""
+        from scipy import ndimage
+
         # If a diagonal move needs both side cells free, two straight moves can replace it.
-        reach = int(MoveRule(move_rule).cuts_corners)
-        if reach not in self._labels:
-            self._labels[reach] = component_labels(self.occupancy, reach)
-        return self._labels[reach]
+        joined = ndimage.generate_binary_structure(2, 2 if MoveRule(move_rule).cuts_corners else 1)
+        labels: NDArray[np.int32] = ndimage.label(~self.occupancy, joined)[0]
+        return labels
 
     def legal_moves(self, move_rule: MoveRule | str) -> NDArray[np.bool_]:
         """Return which moves are legal in each cell, see `legal_moves`: (8, H, W) bool."""
@@ -264,24 +267,19 @@ class GridMap:
         """Return (H, W) bool: where paths from some free cells (N, 2) lead, or backward, begin."""
         array = arguments.cells_inside(cells, self.occupancy.shape)
         backward = arguments.as_flag("backward", backward)
-        if self.forbidden is None:
-            labels = self.labels(move_rule)
-            return np.isin(labels, labels[array[:, 1], array[:, 0]])
         reached = np.zeros(self.occupancy.shape, dtype=np.bool_)
         reached[array[:, 1], array[:, 0]] = True
-        waiting, cells = np.empty(reached.size, np.int64), np.flatnonzero(reached)
-        waiting[: cells.size] = cells  # each cell waits at most once
-        flood(self.legal_moves(move_rule), reached, waiting, cells.size, backward)
+        waiting, first = np.empty(reached.size, np.int64), np.flatnonzero(reached)
+        waiting[: first.size] = first  # each cell waits at most once
+        forbidden = NO_DIRECTIONS if self.forbidden is None else self.forbidden
+        of_map = self.occupancy, forbidden, MoveRule(move_rule).cuts_corners
+        flood(of_map, backward, reached, waiting, first.size)
         return reached
 
     @cached_property
     def _history(self) -> tuple[tuple[object, Box], ...]:
         """The last versions, its own at the end, and the box that differs from the one before."""
         return ((object(), ORIGIN),)
-
-    @cached_property
-    def _labels(self) -> dict[int, NDArray[np.int32]]:
-        return {}
 
     @cached_property
     def fingerprint(self) -> str:
@@ -302,11 +300,11 @@ class GridMap:
     def same_cells(self, other: GridMap) -> bool:
         """Return whether all cells of two maps are equal, wherever the maps lie."""
         check_grid(other, "other")
-        if self._occupied != other._occupied:
-            return False
         boxes = self.patches_since(other)
         if boxes is not None:
             return not any(self.differs(other, box, box).any() for box in reversed(boxes))
+        if self._occupied != other._occupied:
+            return False
         layers = ((getattr(self, name), getattr(other, name)) for name in LAYERS)
         return all(mine is its or np.array_equal(mine, its) for mine, its in layers)
 

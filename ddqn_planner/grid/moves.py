@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.compiled import in_place, inlined
+from ddqn_planner.compiled import in_place
 from ddqn_planner.grid.arguments import Cell, Cells, Choice, Occupancy, cell_inside
 
 if TYPE_CHECKING:
@@ -160,72 +160,28 @@ def _dijkstra(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> Any:
     return dijkstra(graph, indices=y * grid.width + x, return_predecessors=True)
 
 
-def component_labels(occupancy: Any, reach: int) -> Any:
-    """Return (H, W) int32 labels, see `GridMap.labels`."""
-    height, width = occupancy.shape
-    labels = np.zeros((height + 1, width + 2), np.int32)
-    _label(np.ascontiguousarray(occupancy), reach, labels, np.zeros(labels.size // 2, np.int32))
-    return labels[1:, 1:-1]
-
-
-@in_place
-def _label(occupancy: Any, reach: int, labels: Any, parent: Any) -> None:  # pragma: no cover
-    """Label free cells by union-find, given a border of 0 on three sides of the labels."""
-    count, (height, width) = 0, occupancy.shape
-    for y in range(height):
-        for x in range(width):
-            if occupancy[y, x]:
-                continue
-            label = labels[y + 1, x]
-            sides = 0 if labels[y, x + 1] else reach  # a free cell above joins those beside it
-            for column in range(x + 1 - sides, x + 2 + sides):
-                above = labels[y, column]
-                if label == 0:
-                    label = above
-                elif above != 0 and above != label:
-                    label, above = _root(label, parent), _root(above, parent)
-                    parent[max(label, above)] = label = min(label, above)
-            if label == 0:
-                count += 1
-                parent[count] = label = count
-            labels[y + 1, x + 1] = label
-    # A parent is less than its children: numbers are in the order of the components' first cells.
-    components = 0
-    for label in range(1, count + 1):
-        if parent[label] == label:
-            components += 1
-            parent[label] = components
-        else:
-            parent[label] = parent[parent[label]]
-    for y in range(height):
-        for x in range(width):
-            labels[y + 1, x + 1] = parent[labels[y + 1, x + 1]]
-
-
-@inlined
-def _root(label: int, parent: Any) -> int:
-    """Return the least label of those that are joined so far, and shorten the way to it."""
-    while parent[label] != label:
-        parent[label] = parent[parent[label]]
-        label = parent[label]
-    return label
-
-
 @in_place
 def flood(
-    legal: Any, reached: Any, waiting: Any, count: int, backward: bool
+    of_map: Any, backward: bool, reached: Any, waiting: Any, count: int
 ) -> None:  # pragma: no cover
-    """Mark all cells to which legal moves lead from those that wait, or backward, from which."""
+    """Mark all cells to which moves lead from those that wait, or backward, from which."""
+    occupancy, forbidden, cuts_corners = of_map
     height, width = reached.shape
     while count > 0:
         count -= 1
         y, x = waiting[count] // width, waiting[count] % width
         for action in range(8):
-            next_x, next_y = x + MOVES[action, 0], y + MOVES[action, 1]
-            if not (0 <= next_x < width and 0 <= next_y < height) or reached[next_y, next_x]:
+            to_x, to_y = x + MOVES[action, 0], y + MOVES[action, 1]
+            if not (0 <= to_x < width and 0 <= to_y < height) or reached[to_y, to_x]:
                 continue
-            # The opposite move leads back from the next cell.
-            if legal[(action + 4) % 8, next_y, next_x] if backward else legal[action, y, x]:
-                reached[next_y, next_x] = True
-                waiting[count] = next_y * width + next_x
+            is_closed = occupancy[to_y, to_x]
+            if not cuts_corners:
+                is_closed |= occupancy[y, to_x] | occupancy[to_y, x]
+            if forbidden.size > 0:
+                # Backward, the opposite move leads here from the next cell.
+                at_x, at_y, by = (to_x, to_y, action ^ 4) if backward else (x, y, action)
+                is_closed |= (forbidden[at_y, at_x] >> by & 1) != 0
+            if not is_closed:
+                reached[to_y, to_x] = True
+                waiting[count] = to_y * width + to_x
                 count += 1

@@ -73,17 +73,14 @@ class MoveCosts(NamedTuple):
                     after = after._replace(**{name: layer.ravel()})
         return after
 
-    def _least(self, value: NDArray[np.uint8]) -> float:
-        """Return a multiplier that none on free cells is less than, given cells' values."""
-        cost = int((value - np.uint8(1)).min())  # that of an unknown cell is 255 here
-        return float(2 * self.low[min(cost, OCCUPIED) + 1])
-
     def on(self, grid: GridMap, patch: NDArray[Any]) -> MoveCosts:
         """Return the costs on a map, given its patches, with its directions and expected times."""
         costs = self._replace(patch=patch, width=grid.width + 2)
         if self.terms.size and grid.cost is not None:
             value = cell_values(grid.occupancy, grid.cost)
-            costs = costs._replace(value=value, least=self._least(value))
+            lowest = int((value - np.uint8(1)).min())  # an unknown cell has a cost of 255 here
+            least = float(2 * self.low[min(lowest, OCCUPIED) + 1])
+            costs = costs._replace(value=value, least=least)
         if grid.forbidden is not None:
             forbidden = np.pad(grid.forbidden, 1).ravel()
             patch, table = _with_directions(patch, self.table, forbidden)
@@ -122,53 +119,29 @@ def _occurring(values: NDArray[np.uint8], occurs: NDArray[np.bool_]) -> None:
 
 def cell_values(occupancy: NDArray[np.bool_], cost: NDArray[np.int8]) -> NDArray[np.uint8]:
     """Return the value of each cell, see `VALUES`: (C,) uint8."""
-    values = _with_border(occupancy, np.uint8, VALUES - 1)
-    _cell_values(occupancy, cost, values)
-    return values.ravel()
-
-
-@in_place
-def _cell_values(
-    occupancy: NDArray[np.bool_], cost: NDArray[np.int8], values: NDArray[np.uint8]
-) -> None:
-    """Write the value of each cell inside the border."""
-    for y in range(occupancy.shape[0]):
-        for x in range(occupancy.shape[1]):
-            values[y + 1, x + 1] = VALUES - 1 if occupancy[y, x] else cost[y, x] - UNKNOWN
+    # The cost of an occupied cell is 0.
+    values = cost.view(np.uint8) + np.uint8(-UNKNOWN) + occupancy * np.uint8(OCCUPIED)
+    return np.pad(values, 1, constant_values=VALUES - 1).ravel()
 
 
 def patch_numbers(occupancy: NDArray[np.bool_]) -> NDArray[np.uint16]:
     """Return each cell's patch: (C,) uint16, with bit 3 y + x where its cell (x, y) is occupied."""
-    numbers = _with_border(occupancy, np.uint16, OUTSIDE)
-    rows = np.ones((3, numbers.shape[1]), np.uint8)  # all rows would be memory to fetch
-    _patch_numbers(occupancy, rows, numbers)
+    occupied = np.pad(occupancy, 1, constant_values=True).view(np.uint8)
+    numbers = np.full(occupied.shape, OUTSIDE, np.uint16)
+    _patch_numbers(occupied, numbers)
     return numbers.ravel()
 
 
-def _with_border(inside: NDArray[Any], kind: type, value: int) -> NDArray[Any]:
-    """Return an array with one more cell on each side, and a value in these alone."""
-    array = np.empty((inside.shape[0] + 2, inside.shape[1] + 2), kind)
-    array[0] = array[-1] = array[:, 0] = array[:, -1] = value
-    return array
-
-
 @in_place
-def _patch_numbers(
-    occupancy: NDArray[np.bool_], rows: NDArray[np.uint8], numbers: NDArray[np.uint16]
-) -> None:
-    """Write the number of each cell inside the border; three rows are known at a time."""
-    height, width = occupancy.shape
-    for y in range(height + 1):
-        below, here, above = (y + 2) % 3, y % 3, (y + 1) % 3
-        for x in range(width):
-            rows[above, x + 1] = occupancy[y, x] if y < height else 1
-        if y == 0:
-            continue
-        for x in range(width):
-            bits = rows[below, x] + 2 * rows[below, x + 1] + 4 * rows[below, x + 2]
-            bits += 8 * rows[here, x] + 16 * rows[here, x + 1] + 32 * rows[here, x + 2]
-            bits += 64 * rows[above, x] + 128 * rows[above, x + 1] + 256 * rows[above, x + 2]
-            numbers[y, x + 1] = bits
+def _patch_numbers(occupied: NDArray[np.uint8], numbers: NDArray[np.uint16]) -> None:
+    """Write the number of each cell inside the border."""
+    for y in range(1, numbers.shape[0] - 1):
+        for x in range(1, numbers.shape[1] - 1):
+            below, here, above = occupied[y - 1], occupied[y], occupied[y + 1]
+            bits = below[x - 1] + 2 * below[x] + 4 * below[x + 1]
+            bits += 8 * here[x - 1] + 16 * here[x] + 32 * here[x + 1]
+            bits += 64 * above[x - 1] + 128 * above[x] + 256 * above[x + 1]
+            numbers[y, x] = bits
 
 
 def patches(occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None) -> NDArray[np.int8]:

@@ -78,10 +78,12 @@ def grid_from_values(
 
 
 def occupancy_message(
-    values: NDArray[np.int8], resolution: float, origin: Origin, header: Header
+    values: NDArray[Any] | None, resolution: float, origin: Origin, header: Header
 ) -> OccupancyGrid:
-    """Make a map message of values 0..100, or -1 where unknown; see `GridMap` for the rest."""
+    """Make a message of a map's values or forbidden directions, see `GridMap`; empty of none."""
     message = OccupancyGrid(header=header)
+    if values is None:
+        return message
     message.info.map_load_time = header.stamp
     message.info.resolution = float(resolution)
     message.info.height, message.info.width = (int(size) for size in values.shape)
@@ -90,15 +92,6 @@ def occupancy_message(
     message.info.origin.orientation = quaternion(origin[2])
     message.data = array.array("b", values.astype(np.int8, copy=False).tobytes())
     return message
-
-
-def directions_message(
-    forbidden: NDArray[np.uint8] | None, resolution: float, origin: Origin, header: Header
-) -> OccupancyGrid:
-    """Make the message of a map's forbidden directions, see `GridMap`; without cells for none."""
-    if forbidden is None:
-        return OccupancyGrid(header=header)
-    return occupancy_message(forbidden.view(np.int8), resolution, origin, header)
 
 
 def value_message(field: QField | None, grid: GridMap, header: Header) -> OccupancyGrid:

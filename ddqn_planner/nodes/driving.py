@@ -15,17 +15,11 @@ from numpy.typing import NDArray
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
-from std_msgs.msg import String, UInt8MultiArray
 
-from ddqn_planner.experience.drives import (
-    RECORD,
-    DriveEnd,
-    DriveFolder,
-    DriveRecorder,
-    read_drives,
-)
+from ddqn_planner.experience import drives
+from ddqn_planner.experience.drives import DriveEnd, DriveFolder, DriveRecorder
 from ddqn_planner.grid import GridMap
-from ddqn_planner.nodes.conversions import bytes_message, occupancy_message, path_bytes
+from ddqn_planner.nodes.conversions import occupancy_message, path_bytes
 from ddqn_planner.nodes.poses import Frames, listen
 from ddqn_planner.nodes.runtime import LATCHED, STEADY
 from ddqn_planner.resources import with_remedy
@@ -35,7 +29,6 @@ if TYPE_CHECKING:
 
 NAVIGATION = "navigate_to_pose/_action/status"
 Float64 = NDArray[np.float64]
-RETRY_PERIOD = 5.0  # seconds after which what failed for a full disk is tried again
 SLOWEST = 10.0  # the slowness that ``~/slowness`` shows as 100
 WRONG = np.log(1.5)  # of the nominal speed, compared with that of drives
 MORE_PLACES = 1.1  # times as many as the last time
@@ -136,20 +129,13 @@ class Driving:
         self._folder: DriveFolder | None = None
         self._last_drive, self._is_disk_full = "", False
         self._shown: GridMap | None = None
-        self._saved = node.create_publisher(String, "~/experience_saved", LATCHED)
-        self._published = node.create_publisher(UInt8MultiArray, "~/experience", LATCHED)
         self._slowness = node.create_publisher(OccupancyGrid, "~/slowness", LATCHED)
         frames, names = Frames(node), node.value("robots") or [""]
         robots = dict.fromkeys(names)  # one that is named twice drives once
         self._robots = [DrivingRobot(node, frames, name, self._on_drive) for name in robots]
-        node.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
-        node.create_timer(0.1, self._show_slowness, clock=STEADY)
-        node.create_timer(RETRY_PERIOD, self._retry, clock=STEADY)
         self._places_of_prior, self._is_speed_wrong = 0, False
         group = MutuallyExclusiveCallbackGroup()  # it awaits the worker
         self._learning = node.create_timer(1.0, self._learn_prior, group, clock=STEADY)
-        for name in ("start", "stop", "save", "replay", "forget"):
-            node.create_trigger(f"~/{name}", getattr(self, name))
         self.start()
 
     def _recording(self) -> DriveFolder | None:
@@ -185,10 +171,8 @@ class Driving:
         if self._is_speed_wrong and not was_wrong:
             wrong = f"the robot drives {speed:.3g} m/s in the open, nominal_speed is {given:g}"
             self._node.get_logger().warning(f"{wrong}; set it before you learn anew")
-        self._published.publish(bytes_message("experience", folder.experience.to_bytes()))
-        self._node.note_saving("the drives are", folder.save_error)
-        if not folder.save_error:
-            self._saved.publish(String(data=str(folder.experience_path)))
+        data, path = folder.experience.to_bytes(), folder.experience_path
+        self._node.tell_saved("the drives are", data, path, folder.save_error)
 
     async def _learn_prior(self) -> None:
         """Train the prior, and again once drives have shown a tenth more places."""
@@ -213,13 +197,6 @@ class Driving:
         if folder is self._recording() and len(evidence.places) >= known:  # else it was forgotten
             folder.experience.prior = prior
             self._save(folder)
-
-    def _retry(self) -> None:
-        folder = self._recording()
-        if folder is not None and folder.save_error:
-            self._save(folder)
-        elif self._node.state == "failed" and self._is_disk_full:
-            self.start()
 
     def _draw(self, place: MapInFrame, positions: Float64) -> None:
         yaw = np.arctan2(*np.diff(positions, axis=0).T[::-1])
@@ -302,11 +279,18 @@ class Driving:
 
     def replay(self) -> tuple[bool, str]:
         """Draw the recorded drives."""
-        file = self._node.folder / RECORD
-        drives = (drive.positions[::5] for drive in read_drives(file))  # else it takes long
-        return self._node.replay(self._node.map, file, drives, self._draw, "drive on")
+        file = self._node.folder / drives.RECORD
+        ways = (drive.positions[::5] for drive in drives.read_drives(file))  # else it takes long
+        return self._node.play(self._node.map, file, ways, self._draw, "drive on")
 
-    def _publish_diagnostics(self) -> None:
+    def look(self) -> None:
+        """Try again what failed for a full disk, and show what is learned, each second."""
+        folder = self._recording()
+        if folder is not None and folder.save_error:
+            self._save(folder)
+        elif self._node.state == "failed" and self._is_disk_full:
+            self.start()
+        self._show_slowness()
         values = {"last drive": self._last_drive}
         for robot in self._robots:
             values |= robot.told()

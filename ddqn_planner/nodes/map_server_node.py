@@ -9,18 +9,11 @@ from nav_msgs.msg import OccupancyGrid
 from nav_msgs.srv import GetMap, LoadMap
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import (
-    OCCUPIED,
-    Cell,
-    GridMap,
-    MapFile,
-    MoveRule,
-    read_map_file,
-    scatter_obstacles,
-    shortest_path,
-)
+from ddqn_planner.grid import OCCUPIED, Cell, GridMap, MapFile, MoveRule, read_map_file
 from ddqn_planner.grid.map_file import MapDataError, MapMetadataError, MapNotFoundError
-from ddqn_planner.nodes.conversions import MIN_RESOLUTION, directions_message, occupancy_message
+from ddqn_planner.grid.moves import shortest_path
+from ddqn_planner.grid.noise import scatter_obstacles
+from ddqn_planner.nodes.conversions import MIN_RESOLUTION, occupancy_message
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Declared, spin_until_shutdown
 from ddqn_planner.resources import PACKAGE, find_map
 
@@ -88,7 +81,7 @@ class MapServerNode(BaseNode):
         assert self._loaded is not None
         place = self._loaded.resolution, self._loaded.origin, self.header(self.value("frame_id"))
         self._served = occupancy_message(values, *place)
-        self._directions.publish(directions_message(self._loaded.forbidden, *place))
+        self._directions.publish(occupancy_message(self._loaded.forbidden, *place))
         self._publisher.publish(self._served)
 
     def _on_get_map(self, request: GetMap.Request, response: GetMap.Response) -> GetMap.Response:

@@ -19,27 +19,12 @@ from rclpy.timer import Timer
 from std_msgs.msg import Float32, Header, String, UInt8MultiArray
 
 from ddqn_planner.grid import Cell, MoveRule, read_map_file
-from ddqn_planner.nodes.conversions import (
-    along,
-    bytes_message,
-    cell_from_pose,
-    check_pose,
-    grid_from_message,
-    path_bytes,
-    path_message,
-)
+from ddqn_planner.nodes import conversions, runtime
 from ddqn_planner.nodes.driving import NO_MAP, Driving, MapInFrame, explained
 from ddqn_planner.nodes.parameters import MOVE_RULES, OF_MAPS
 from ddqn_planner.nodes.poses import check_source, listen
 from ddqn_planner.nodes.report import Refusals
-from ddqn_planner.nodes.runtime import (
-    LATCHED,
-    STEADY,
-    BaseNode,
-    Declared,
-    Worker,
-    spin_until_shutdown,
-)
+from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Declared, Worker
 from ddqn_planner.resources import find_map
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
@@ -96,20 +81,22 @@ class TrainerNode(BaseNode):
         self._read_map_file()
         self.create_subscription(OccupancyGrid, "map", self._on_map, LATCHED)
         self._driving: Driving | None = None
-        if self.value("learn_from") == "driving":
+        is_driving = self.value("learn_from") == "driving"
+        self._learned = "experience" if is_driving else "model"
+        self._saved = self.create_publisher(String, f"~/{self._learned}_saved", LATCHED)
+        self._publisher = self.create_publisher(UInt8MultiArray, f"~/{self._learned}", LATCHED)
+        if is_driving:
             self._driving = Driving(self)
-            return
-        self.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
-        self._reward_publisher = self.create_publisher(Float32, "~/average_reward", 100)
-        self._saved_publisher = self.create_publisher(String, "~/model_saved", LATCHED)
-        self._model_publisher = self.create_publisher(UInt8MultiArray, "~/model", LATCHED)
-        for which, topic in (("start", "initialpose"), ("goal", "goal_pose")):
-            listen(self, topic, 10, self.refusals, partial(self._on_pose, which))
-        group = ReentrantCallbackGroup()  # the others are answered while ~/start waits
-        for name in ("start", "stop", "save", "replay"):
-            self.create_trigger(f"~/{name}", getattr(self, f"_on_{name}"), callback_group=group)
-        # While the node answers already; only ~/start waits for it.
-        self._imported = self.worker.call(import_training)
+        else:
+            self._rewards = self.create_publisher(Float32, "~/average_reward", 100)
+            for which, topic in (("start", "initialpose"), ("goal", "goal_pose")):
+                listen(self, topic, 10, self.refusals, partial(self._on_pose, which))
+            # While the node answers already; only ~/start waits for it.
+            self._imported = self.worker.call(import_training)
+        learner, group = self._driving or self, ReentrantCallbackGroup()
+        for name in ("start", "stop", "save", "replay", *["forget"] * is_driving):
+            self.create_trigger(f"~/{name}", getattr(learner, name), callback_group=group)
+        self.create_timer(1.0, learner.look, clock=STEADY)
 
     @property
     def folder(self) -> FilePath:
@@ -138,18 +125,20 @@ class TrainerNode(BaseNode):
         self.map = MapInFrame(grid, "map")
         for which, cell in (("start", map_file.start), ("goal", map_file.goal)):
             if cell is not None:
-                path = path_message(*along([cell], grid), Header(frame_id="map"), Quaternion())
+                path = conversions.path_message(
+                    *conversions.along([cell], grid), Header(frame_id="map"), Quaternion()
+                )
                 self._poses[which] = path.poses[0]
 
     def _on_map(self, message: OccupancyGrid) -> None:
         with self.refusals.taking("map"):
-            grid = grid_from_message(message, *map(self.value, OF_MAPS))
+            grid = conversions.grid_from_message(message, *map(self.value, OF_MAPS))
             self.map = MapInFrame(grid, message.header.frame_id)
             self.get_logger().info(f"map of {grid.width} x {grid.height} cells")
 
     def _on_pose(self, which: str, stamped: PoseStamped) -> None:
         # A pose may come before the map: ~/start then checks its cell.
-        check_pose(f"the {which}", stamped)
+        conversions.check_pose(f"the {which}", stamped)
         if self.map is not None:
             cell = self._cell(which, stamped, self.map)
             self.get_logger().info(f"the {which} is cell {cell}")
@@ -157,7 +146,7 @@ class TrainerNode(BaseNode):
 
     def _cell(self, which: str, pose: PoseStamped, place: MapInFrame) -> Cell:
         """Return the cell of a pose; ValueError if it is not a free cell of the map."""
-        cell = cell_from_pose(f"the {which}", pose, place.grid, place.frame)
+        cell = conversions.cell_from_pose(f"the {which}", pose, place.grid, place.frame)
         if not place.grid.is_free(cell):
             wrong = f"cell {cell} is occupied or off the map"
             raise ValueError(f"the {which}'s {wrong}; set it on a free cell")
@@ -165,7 +154,8 @@ class TrainerNode(BaseNode):
 
     # Services: each returns whether it succeeds, and a message
 
-    async def _on_start(self) -> tuple[bool, str]:
+    async def start(self) -> tuple[bool, str]:
+        """Train, or continue a training."""
         await self._imported
         if self.state == "training":
             return False, "training already; call ~/stop first"
@@ -197,27 +187,30 @@ class TrainerNode(BaseNode):
         how = self._hyper_parameters({}), self.value("seed")
         return place, TrainingRun(self.folder, scenarios, rule, *how)
 
-    def _on_stop(self) -> tuple[bool, str]:
+    def stop(self) -> tuple[bool, str]:
+        """Stop the training, which saves, and a replay."""
         replay = self.stop_replay()
         if self.state != "training":
             return True, f"no training was running{replay}"
         self._is_stopping = True
         return True, f"the training saves and stops, and ~/start continues it{replay}"
 
-    def _on_save(self) -> tuple[bool, str]:
+    def save(self) -> tuple[bool, str]:
+        """Save after the step that is under way."""
         if self.state != "training":
             return False, "no training is running; it was saved when it ended"
         self._is_saving = True
         return True, "saving after this step; ~/model_saved or an error follows"
 
-    def _on_replay(self) -> tuple[bool, str]:
+    def replay(self) -> tuple[bool, str]:
+        """Draw the recorded episodes."""
         from ddqn_planner.training.episodes import read_cells
 
         file = self.folder / "episodes.csv"
         is_of_run = self._run is not None and self._run.folder == self.folder
         place = self._run_map if is_of_run else self.map
         episodes = read_cells(file, self.value("episode_interval"))
-        return self.replay(place, file, episodes, self._draw, "train on")
+        return self.play(place, file, episodes, self._draw, "train on")
 
     def _train(self, run: TrainingRun, place: MapInFrame) -> None:
         """Train, in the worker, until the training has finished or is stopped."""
@@ -225,7 +218,7 @@ class TrainerNode(BaseNode):
         try:
             for episodes in run.steps():
                 for episode in episodes:
-                    self._reward_publisher.publish(Float32(data=episode.average_reward))
+                    self._rewards.publish(Float32(data=episode.average_reward))
                     is_due = episode.number % self.value("episode_interval") == 0
                     if is_due and self.replaying is None:
                         self._draw(place, episode.cells)
@@ -248,17 +241,18 @@ class TrainerNode(BaseNode):
         self.get_logger().info(f"the training {ends}")
 
     def _tell_saved(self, run: TrainingRun) -> None:
-        self.note_saving("the training is", run.save_error)
+        self.tell_saved("the training is", run.model, run.model_path, run.save_error)
         if not run.save_error:
             self.get_logger().info(f"step {run.saved_at} is saved in {run.checkpoint_path}")
-            self._saved_publisher.publish(String(data=str(run.model_path)))
-            self._model_publisher.publish(bytes_message("model", run.model))
 
     def _draw(self, place: MapInFrame, cells: tuple[Cell, ...]) -> None:
-        path = path_bytes(*along(cells, place.grid), self.header(place.frame), Quaternion())
+        path = conversions.path_bytes(
+            *conversions.along(cells, place.grid), self.header(place.frame), Quaternion()
+        )
         self.episodes.publish(path)
 
-    def _publish_diagnostics(self) -> None:
+    def look(self) -> None:
+        """Publish the diagnostics of a training."""
         places = {which: pose.pose.position for which, pose in self._poses.items()}
         values = {which: f"({at.x:.6g}, {at.y:.6g})" for which, at in places.items()}
         if self._run is not None:
@@ -278,13 +272,16 @@ class TrainerNode(BaseNode):
         self.error = reason
         self.get_logger().error(reason)
 
-    def note_saving(self, what: str, error: str) -> None:
-        """Log when saving begins to fail, and when it works again (no error), not at each try."""
+    def tell_saved(self, what: str, data: bytes, path: FilePath, error: str) -> None:
+        """Publish what was learned; log when saving begins to fail, and when it works again."""
+        self._publisher.publish(conversions.bytes_message(self._learned, data))
         before, self.save_error = self.save_error, error
         if error and not before:
             self.get_logger().error(error)
         if before and not error:
             self.get_logger().info(f"{what} saved again")
+        if not error:
+            self._saved.publish(String(data=str(path)))
 
     def publish_diagnostics(self, what: str, values: Mapping[str, str], missing: str = "") -> None:
         """Publish the state, what was refused and failed, and what is still missing."""
@@ -294,7 +291,7 @@ class TrainerNode(BaseNode):
         message = "; ".join(filter(None, [*problems, missing])) or self.state
         self.refusals.tell(what, level, message, {"state": self.state, **values})
 
-    def replay(
+    def play(
         self,
         place: MapInFrame | None,
         file: FilePath,
@@ -348,4 +345,4 @@ def import_training() -> None:
         torch.optim.Adam([torch.zeros(1)])  # the first optimiser imports for a second
 
 
-main = partial(spin_until_shutdown, TrainerNode, PARAMETERS)
+main = partial(runtime.spin_until_shutdown, TrainerNode, PARAMETERS)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 import threading
-import time
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +47,9 @@ class QField:
     move_rule : MoveRule
         The rule by which they are legal.
     """
+
+    grid: GridMap  # the last one with such cells, of a field that a planner keeps
+    costs: MoveCosts | None = None
 
     def __init__(
         self,
@@ -91,6 +93,10 @@ class QField:
         legal = self.legal & (actions_A11 == greedy_1HW)
         return QField(self.goal, self.q, legal, self.move_rule)
 
+    def grow(self, start: Cell, limit: int) -> bool:
+        """Return whether all that a start needs is known, after so many visits of cells more."""
+        return True
+
     def rollout_if_known(self, start: Cell, straight: bool = False) -> Plan | None:
         """Return the rollout from a start if no more of the field is needed, else None."""
         return self.rollout(start, straight)
@@ -102,7 +108,7 @@ class QField:
         start that is no cell of the map is a ValueError. A straight rollout takes, of steps
         as good as each other, those along the line to the goal: a `DistanceField` has many.
         """
-        began, policy, steps = time.perf_counter(), self.policy, MOVES.tolist()
+        policy, steps = self.policy, MOVES.tolist()
         cell = cell_inside(start, policy.shape, "the start")
         cells, visited = [cell], {cell}
         while cell != self.goal:
@@ -112,12 +118,13 @@ class QField:
                 return Plan(PlanStatus.ROLLOUT_TRAPPED, move_rule=self.move_rule)
             visited.add(cell)
             cells.append(cell)
-        ms = 1e3 * (time.perf_counter() - began)
-        return Plan(PlanStatus.SUCCEEDED, np.array(cells), move_rule=self.move_rule, rollout_ms=ms)
+        return Plan(PlanStatus.SUCCEEDED, np.array(cells), move_rule=self.move_rule)
 
 
 class DistanceField(QField):
     """The Q field that costs of moves give; it grows from its goals as far as a request needs."""
+
+    costs: MoveCosts
 
     def __init__(self, goals: Goals, grid: GridMap, costs: MoveCosts, move_rule: MoveRule) -> None:
         self.grid, self.costs, self.move_rule = grid, costs, move_rule
@@ -142,11 +149,13 @@ class DistanceField(QField):
         del self.known
         return known
 
-    def _grow(self, number: int = 0, limit: int = 2**62) -> bool:
-        """Compute all of the field, or as far as a cell needs it; return if that was enough."""
-        done = self._is_final(number)
-        if not done:
-            self.known, done = kernels.grow(self._take(), self.costs, number, limit)
+    def grow(self, start: Cell | None = None, limit: int = 2**62) -> bool:
+        """Compute all of the field, or what a start needs; return if so many visits were enough."""
+        number = 0 if start is None else self._number(start)
+        with self._lock:
+            done = self._is_final(number)
+            if not done:
+                self.known, done = kernels.grow(self._take(), self.costs, number, limit)
         return done
 
     def _is_final(self, number: int) -> bool:
@@ -163,23 +172,20 @@ class DistanceField(QField):
         finally:
             self._lock.release()
 
-    def rollout(self, start: Cell, straight: bool = False, limit: int = 2**62) -> Plan:
-        """Return the path; ROLLOUT_TRAPPED if more cells than the limit must be visited for it."""
+    def rollout(self, start: Cell, straight: bool = False) -> Plan:
+        """Return the path; there is none only if there is no way to the goal."""
         start = cell_inside(start, self.grid.occupancy.shape, "the start")
         number, toward = self._number(start), self.goal if straight else start
         with self._lock:
-            if not self._grow(number, limit):
-                return Plan(PlanStatus.ROLLOUT_TRAPPED, move_rule=self.move_rule)
+            self.grow(start)
             if self.known.state[number] != kernels.CLOSED:
                 return Plan(PlanStatus.NO_PATH, move_rule=self.move_rule)
-            began = time.perf_counter()
             path = kernels.roll_out(self.known.distance, self.costs, number, toward)
-        ms = 1e3 * (time.perf_counter() - began)
-        return Plan(PlanStatus.SUCCEEDED, path, move_rule=self.move_rule, rollout_ms=ms)
+        return Plan(PlanStatus.SUCCEEDED, path, move_rule=self.move_rule)
 
-    def take_over(self, old: DistanceField, shift: Cell, start: Cell | None = None) -> bool:
+    def take_over(self, old: DistanceField, start: Cell | None = None) -> bool:
         """Repair and take what an older field knows, or begin if quicker; False for other maps."""
-        changed = changed_cells(old.grid, self.grid, shift)
+        changed = changed_cells(old.grid, self.grid)
         if changed is None:
             return False
         # For one start, repair and new field take turns, each time with four times the limit: the
@@ -188,10 +194,9 @@ class DistanceField(QField):
         limit = most if start is None else REPAIRED
         with old._lock:
             taken = old._take()
-            moved = _moved(taken, old.grid, self.grid, shift)
-            while (repaired := kernels.take_back(moved, self.costs, changed, limit)) is None:
+            while (repaired := kernels.take_back(taken, self.costs, changed, limit)) is None:
                 limit *= 4
-                if start and limit <= most and not self._grow(self._number(start), VISITS * limit):
+                if start and limit <= most and not self.grow(start, VISITS * limit):
                     continue
                 old.known = taken
                 return True
@@ -201,7 +206,7 @@ class DistanceField(QField):
     def _layer(self, layer_of: Callable[..., NDArray[Any]]) -> NDArray[Any]:
         """Return what a kernel computes for each cell of the whole field: (..., H, W)."""
         with self._lock:
-            self._grow()
+            self.grow()
             layer = layer_of(self.known.distance, self.costs)
         return layer.reshape(*layer.shape[:-1], -1, self.costs.width)[..., 1:-1, 1:-1]
 
@@ -219,7 +224,7 @@ class DistanceField(QField):
     def value(self) -> NDArray[np.float32]:
         """(H, W) float32: the greatest Q of a legal move, and at the goal the greatest of all."""
         with self._lock:
-            self._grow()
+            self.grow()
             distance = self.known.distance.reshape(-1, self.costs.width)[1:-1, 1:-1]
             value = np.negative(distance, dtype=np.float32, casting="same_kind")
         np.copyto(value, -np.inf, where=value == 0)  # sooner than by an index; goals are 0 too
@@ -286,51 +291,25 @@ def overlap(old: GridMap, new: GridMap, shift: Cell) -> tuple[Box, Box]:
     return tuple(before), tuple(after)
 
 
-def changed_cells(old: GridMap, new: GridMap, shift: Cell) -> NDArray[np.int32] | None:
-    """Return the cells whose moves may differ, as numbers of the padded new map; None for many."""
+def changed_cells(old: GridMap, new: GridMap) -> NDArray[np.int32] | None:
+    """Return the cells whose moves may differ, as numbers of the padded map; None for many."""
     width, patches = new.width + 2, new.patches_since(old)
-    boxes = [overlap(old, new, shift)] if patches is None else [(box, box) for box in patches]
+    if shift_between(old, new) != (0, 0) or old.occupancy.shape != new.occupancy.shape:
+        return None
+    whole: Box = (slice(0, new.height), slice(0, new.width))
     found = [np.empty(0, np.int64)]
-    for before, (rows, columns) in boxes:
-        y, x = few_of(new.differs(old, (rows, columns), before))
+    for rows, columns in [whole] if patches is None else patches:
+        y, x = few_of(new.differs(old, (rows, columns), (rows, columns)))
         found.append((y + rows.start + 1) * width + x + columns.start + 1)
     if sum(map(len, found)) > CHANGED_SHARE * new.occupancy.size:
         return None
-    if shift != (0, 0) or old.occupancy.shape != new.occupancy.shape:
-        # What lay beyond the border of one map is inside the other.
-        _, (rows, columns) = boxes[0]
-        y, x = np.arange(rows.start, rows.stop + 2), np.arange(columns.start, columns.stop + 2)
-        found += [x + width * row for row in (rows.start, rows.stop + 1)]
-        found += [width * y + column for column in (columns.start, columns.stop + 1)]
     around = (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel()
     numbers = np.unique(np.concatenate(found)[:, None] + around)
     last = (new.height + 1) * width - 1
     return numbers[(numbers > width) & (numbers < last)].astype(np.int32)
 
 
-def _moved(known: Known, old: GridMap, new: GridMap, shift: Cell) -> Known:
-    """Return what is known of a field with each cell where the new map has it."""
-    if shift == (0, 0) and old.occupancy.shape == new.occupancy.shape:
-        return known
-    before, after = overlap(old, new, shift)
-    shape = new.height + 2, new.width + 2
-    distance, state = np.zeros(shape), np.zeros(shape, dtype=np.uint8)
-    for layer, source in ((distance, known.distance), (state, known.state)):
-        layer[1:-1, 1:-1][after] = source.reshape(-1, old.width + 2)[1:-1, 1:-1][before]
-    opened = np.flatnonzero(state == kernels.OPEN).astype(np.int32)
-    return Known(distance.ravel(), state.ravel(), opened)
-
-
 # The fields that a planner keeps
-
-
-class _Kept(NamedTuple):
-    """What is known of a map under a move rule: `QNetwork.move_costs`, and perhaps a field."""
-
-    grid: GridMap
-    rule: MoveRule
-    costs: MoveCosts | None
-    field: QField | None = None
 
 
 class FieldCache:
@@ -341,76 +320,63 @@ class FieldCache:
         self.nbytes = CACHE_BYTES  # the bound; the fields used last are kept
         # Used last at the end. Threads need no lock, as the list is replaced and never changed: one
         # may at worst forget what another has just kept.
-        self._kept: list[_Kept] = []
+        self._kept: list[QField] = []
+
+    def _of_rule(self, rule: MoveRule) -> list[QField]:
+        """Return what is kept for a move rule, used last first."""
+        return [field for field in reversed(self._kept) if field.move_rule is rule]
 
     def find(self, grid: GridMap, goals: Goals, rule: MoveRule) -> QField | None:
         """Return the field of a map toward the nearest of some goals if it is kept, else None."""
-        for kept in self._of_rule(rule):
-            if kept.field and kept.field.goals == goals and grid.same_cells(kept.grid):
-                self._use(_Kept(grid, rule, kept.costs, kept.field))  # the map may lie elsewhere
-                return kept.field
+        for field in self._of_rule(rule):
+            if field.goals == goals and grid.same_cells(field.grid):
+                field.grid = grid  # it may lie elsewhere
+                self._kept = [*(other for other in self._kept if other is not field), field]
+                return field
         return None
-
-    def get(self, grid: GridMap, goals: Goals, rule: MoveRule, start: Cell | None = None) -> QField:
-        """Return the field of a map toward the nearest of some goals: several, if it has costs."""
-        field = self.find(grid, goals, rule)
-        if field is None:
-            costs = self.costs(grid, rule)
-            if costs is None:
-                field = network_field(self.network, grid, goals[0], rule)
-            else:
-                field = DistanceField(goals, grid, costs, rule)
-                self._repair(field, start)
-            self._use(_Kept(grid, rule, costs, field))
-            self._forget()
-        return field
-
-    def _of_rule(self, rule: MoveRule) -> list[_Kept]:
-        """Return what is kept for a move rule, used last first."""
-        return [kept for kept in reversed(self._kept) if kept.rule is rule]
 
     def costs(self, grid: GridMap, rule: MoveRule) -> MoveCosts | None:
         """Return the costs of a map's moves, if a network gives them: see `DistanceField`."""
-        known, costs = self._of_rule(rule), None
-        for kept in known:
-            if grid.same_cells(kept.grid):
-                return kept.costs
-        for kept in known:
-            boxes = grid.patches_since(kept.grid)
-            if boxes is not None and kept.costs is not None:
-                costs = costs or kept.costs.after(grid, boxes)
-        costs = costs or self.network.move_costs(grid, rule)
-        self._use(_Kept(grid, rule, costs))
-        return costs
+        known = [field for field in self._of_rule(rule) if isinstance(field, DistanceField)]
+        for field in known:
+            if grid.same_cells(field.grid):
+                return field.costs
+        for field in known:
+            boxes = grid.patches_since(field.grid)
+            costs = None if boxes is None else field.costs.after(grid, boxes)
+            if costs is not None:
+                return costs
+        return self.network.move_costs(grid, rule)
 
-    def _repair(self, new: DistanceField, start: Cell | None) -> None:
-        """Give a new field what a field of an older map knows, if there is one."""
-        older: GridMap | None = None
-        for kept in self._of_rule(new.move_rule):
-            old = kept.field
-            if not isinstance(old, DistanceField):
-                continue
-            if kept.grid is not older:  # many are of one map
-                older, shift = kept.grid, shift_between(kept.grid, new.grid)
-            x, y = shift or (0, 0)
-            moved_goals = tuple((goal[0] + x, goal[1] + y) for goal in old.goals)
-            if shift and moved_goals == new.goals and new.take_over(old, shift, start):
-                # The place will hardly be again what it was.
-                self._kept = [other for other in self._kept if other.field is not old]
-                return
-
-    def _use(self, used: _Kept) -> None:
-        """Put what is used at the end; of maps without a field, only the last stays."""
-        others = [kept for kept in self._kept if kept.field and kept.field is not used.field]
-        self._kept = [*others, used]
-
-    def _forget(self) -> None:
-        """Forget the oldest fields beyond the bound; those of one map share its costs."""
-        size, of_costs = 0, dict[int, int]()
-        known = self._kept
-        for number, kept in enumerate(reversed(known)):
-            size += kept.field.nbytes if kept.field else 0
-            of_costs[id(kept.costs)] = kept.costs.patch.nbytes if kept.costs else 0
-            if number >= ALWAYS_KEPT and size + sum(of_costs.values()) > self.nbytes:
-                self._kept = known[-number:]
+    def get(
+        self,
+        grid: GridMap,
+        goals: Goals,
+        rule: MoveRule,
+        start: Cell | None = None,
+        costs: MoveCosts | None = None,
+    ) -> QField:
+        """Return the field of a map toward the nearest of some goals: several, if it has costs."""
+        field = self.find(grid, goals, rule)
+        if field is not None:
+            return field
+        costs = costs or self.costs(grid, rule)
+        if costs is None:
+            field = network_field(self.network, grid, goals[0], rule)
+        else:
+            field = DistanceField(goals, grid, costs, rule)
+            same_goals = (old for old in self._of_rule(rule) if old.goals == goals)
+            for old in same_goals:
+                if isinstance(old, DistanceField) and field.take_over(old, start):
+                    # The place will hardly be again what it was.
+                    self._kept = [other for other in self._kept if other is not old]
+                    break
+        field.grid = grid
+        kept, size = [*self._kept, field], 0
+        for number, each in enumerate(reversed(kept)):
+            size += each.nbytes + (each.costs.patch.nbytes if each.costs else 0)
+            if number >= ALWAYS_KEPT and size > self.nbytes:
+                kept = kept[-number:]
                 break
+        self._kept = kept
+        return field

@@ -100,7 +100,7 @@ class Plan:
     extra_cost : float, optional
         The share by which the rest of the path under way costs more than a new one, if it is kept.
     field_ms, rollout_ms : float
-        How long it took to get the Q field, and the path from it, in milliseconds.
+        How long it took a planner to get the Q field, and the path from it, in milliseconds.
     """
 
     status: PlanStatus

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,7 +15,7 @@ from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import as_cell, as_flag, as_number, listed, numbers
 from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
-from ddqn_planner.planning.field import DistanceField, FieldCache, Goals, QField
+from ddqn_planner.planning.field import FieldCache, Goals, QField
 from ddqn_planner.planning.paths import keep_or_switch, search, way_and_ends
 from ddqn_planner.planning.plan import (
     Plan,
@@ -285,12 +285,23 @@ class Planner:
             yield Plan(status, move_rule=rule)
             return
         goals = tuple(sorted({goal for goal in request.goals if grid.is_free(goal)}))
-        if len(goals) > 1 and self.fields.costs(grid, rule) is None:
+        known = self.fields.find(grid, goals, rule) if grid.is_free(start) else None
+        began, costs = time.perf_counter(), None
+        plan = known.rollout_if_known(start, request.simplified) if known else None
+        if plan is None or (not plan.path.size and request.reach >= 1):
             yield None
-            goals = self._nearest_alone(request, goals)
-        plan = yield from self._roll_out(request, goals)
+        if plan is None:
+            costs = self.fields.costs(grid, rule)
+            if costs is None and len(goals) > 1:
+                goals = self._nearest_alone(request, goals)
+            elif costs is not None and goals and grid.is_free(start):
+                field = self.fields.get(grid, goals, rule, start, costs)
+                while not field.grow(start, VISITS):
+                    yield None
+                began = time.perf_counter()
+                plan = field.rollout(start, request.simplified)
         if plan and plan.path.size:
-            yield _dressed(request, plan, (start,))
+            yield _dressed(request, plan, (start,), began)
             return
         if plan and plan.status is PlanStatus.NO_PATH and request.reach < 1:
             yield plan
@@ -300,31 +311,19 @@ class Planner:
             yield Plan(found, move_rule=rule)
             return
         way_out, goals = found
-        field = self.fields.get(grid, goals, rule, way_out[-1])
+        field = self.fields.get(grid, goals, rule, way_out[-1], costs)
+        began = time.perf_counter()
         plan = field.rollout(way_out[-1], request.simplified)
         if not plan.path.size and request.method is PlanMethod.ASTAR_FALLBACK:
             yield None
-            plan = _searched(field, way_out[-1], grid)
-        yield _dressed(request, plan, way_out) if plan.path.size else replace(plan, goal=goals[0])
-
-    def _roll_out(self, request: PlanRequest, goals: Goals) -> Generator[None, None, Plan | None]:
-        """Return the rollout from a free start if its field is known, or follows from costs."""
-        grid, start, straight = request.grid, request.start, request.simplified
-        if not grid.is_free(start):
-            yield None
-            return None
-        known = self.fields.find(grid, goals, request.move_rule)
-        plan = known.rollout_if_known(start, straight) if known else None
-        if plan is None or (not plan.path.size and request.reach >= 1):
-            yield None
-        if plan is None and goals and self.fields.costs(grid, request.move_rule):
-            field = self.fields.get(grid, goals, request.move_rule, start)
-            assert isinstance(field, DistanceField)
-            plan = field.rollout(start, straight, VISITS)
-            while plan.status is PlanStatus.ROLLOUT_TRAPPED:  # more of the field is needed
-                yield None
-                plan = field.rollout(start, straight, VISITS)
-        return plan
+            began = time.perf_counter()
+            of_field = field.legal, grid.cost_multiplier, rule, field.value
+            cells = np.array(search(way_out[-1], field.goal, *of_field))
+            plan = Plan(PlanStatus.SUCCEEDED, cells, PlanMethod.ASTAR_FALLBACK)
+        if plan.path.size:
+            yield _dressed(request, plan, way_out, began)
+        else:
+            yield replace(plan, goal=goals[0])
 
     def _nearest_alone(self, request: PlanRequest, goals: Goals) -> Goals:
         """Return the nearest of several goals, by a field toward each."""
@@ -342,18 +341,9 @@ def _as_pose(name: str, pose: Any) -> Pose:
     return x, y, yaw
 
 
-def _searched(field: QField, start: Cell, grid: GridMap) -> Plan:
-    """Return the path that a search in the order of a field finds: one exists."""
-    began = time.perf_counter()
-    of_grid = field.legal, grid.cost_multiplier, field.move_rule
-    cells = np.array(search(start, field.goal, *of_grid, field.value))
-    ms = 1e3 * (time.perf_counter() - began)
-    return Plan(PlanStatus.SUCCEEDED, cells, PlanMethod.ASTAR_FALLBACK, rollout_ms=ms)
-
-
-def _dressed(request: PlanRequest, found: Plan, way_out: tuple[Cell, ...]) -> Plan:
+def _dressed(request: PlanRequest, found: Plan, way_out: tuple[Cell, ...], began: float) -> Plan:
     """Return the plan by a path that was found: straight, or by the one under way."""
-    began, grid, rule = time.perf_counter(), request.grid, request.move_rule
+    grid, rule = request.grid, request.move_rule
     path, cost, extra_cost = found.path, None, None
     if request.simplified:
         path = straightened(path, grid, rule)
@@ -366,7 +356,7 @@ def _dressed(request: PlanRequest, found: Plan, way_out: tuple[Cell, ...]) -> Pl
             extra_cost = None  # only from the first free cell on it is the one kept
     if grid.has_costs:
         cost = cost_along(path, grid, rule) * (grid.seconds_per_cell or 1.0)
-    ms = found.rollout_ms + 1e3 * (time.perf_counter() - began)
+    ms = 1e3 * (time.perf_counter() - began)
     return Plan(found.status, path, found.method, rule, cost, goal, extra_cost, 0.0, ms)
 
 

@@ -16,7 +16,6 @@ from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.reward import move_reward
 
 Observations = NDArray[np.float32]
-Tables = tuple[NDArray[np.bool_], NDArray[np.float32], NDArray[np.int64], NDArray[np.bool_]]
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Double DQN of the paper's network, compiled: the steps and updates of `Trainer`."""
 
 from collections import namedtuple
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import fields
 from typing import Any
 
@@ -37,13 +37,13 @@ NUMBERS: Any = {
 Numbers: Any = namedtuple("Numbers", [*NUMBERS])  # type: ignore[misc]
 
 
-def player(
+def arrays_of(
     parts: tuple[Tensors, ...],
     environment: GridVectorEnvironment,
     replay: ReplayBuffer,
     total_reward: NDArray[np.float64],
-) -> Callable[..., tuple[NDArray[Any], ...]]:
-    """Return what plays on: it takes generators, counters and the last step, see `play`."""
+) -> tuple[Any, Any, Any]:
+    """Return what `play` takes of a training: its game, what it learns, and its robots."""
     e, p = environment, environment.parameters
     online, target, mean, square = parts
     gradient = {name: np.zeros_like(tensor) for name, tensor in online.items()}
@@ -55,13 +55,7 @@ def player(
     terminated, truncated = np.zeros((2, p.environments), np.bool_)
     robots = e.scenario, e.cell, e.steps, total_reward, terminated, truncated, trail
     game = e.legal, e.rewards, e.next_cell, e.goal
-    learning = numbers, kind, networks, replay.transitions
-
-    def play_on(random: Any, counters: Any, until: int) -> tuple[NDArray[Any], ...]:
-        made = play(game, learning, robots, random, counters, until)
-        return trail[:made], terminated, truncated
-
-    return play_on
+    return game, (numbers, kind, networks, replay.transitions), robots
 
 
 def networks_of(

@@ -31,7 +31,7 @@ from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.episodes import Episode, EpisodeEnd
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.propagation import PropagationLearner
-from ddqn_planner.training.shared_background import player
+from ddqn_planner.training.shared_background import arrays_of, play
 
 CHECKPOINT_KEY, DIGEST_KEY = "ddqn_planner_checkpoint", "sha256"
 
@@ -77,13 +77,12 @@ class Trainer:
         self.environment.reset()
         self._visited: list[list[int]] = [[int(cell)] for cell in self.environment.cell]
         self._total_reward = np.zeros(parameters.environments)
-        self._player: Any = None  # of the paper's network, else there is a learner
-        self._learner: Any = None
+        self._learner: Any = None  # the paper's network needs none: it learns in compiled code
         if isinstance(self.network, PropagationQNetwork):
             self._learner = PropagationLearner(self.network, self._parts, self.environment)
         else:
             robots = self.environment, self._replay, self._total_reward
-            self._player = player(self._parts, *robots)
+            self._arrays = arrays_of(self._parts, *robots)
 
     @property
     def epsilon(self) -> float:
@@ -96,7 +95,7 @@ class Trainer:
         """Train until step `until`; yield what ended, often and at each multiple of `every`."""
         while self.steps < until:
             pause = min(until, (self.steps // every + 1) * every)
-            cells, terminated, truncated = self._play(pause) if self._player else self._step()
+            cells, terminated, truncated = self._step() if self._learner else self._play(pause)
             for visited, entered in zip(self._visited, cells.T.tolist(), strict=True):
                 visited += entered
             ended = terminated | truncated
@@ -105,35 +104,29 @@ class Trainer:
     def _play(self, until: int) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
         """Make some steps in compiled code; return what `_step` returns."""
         counters = np.array([self.steps, self.updates, self._replay.added])
-        played = self._player((self._exploration, self._sampling), counters, until)
+        made = play(*self._arrays, (self._exploration, self._sampling), counters, until)
         self.steps, self.updates, self._replay.added = counters.tolist()
-        return played  # type: ignore[no-any-return]
+        *_, terminated, truncated, trail = self._arrays[-1]
+        return trail[:made], terminated, truncated
 
     def _step(self) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
         """Make a step, with torch; return the entered cells (1, N), and which episodes ended."""
-        p = self.parameters
-        scenario, cell = self.environment.scenario.copy(), self.environment.cell
-        actions = self._choose_actions()
-        reward, terminated, truncated = self.environment.move(actions)
-        next_cell = self.environment.cell
+        e, p = self.environment, self.parameters
+        scenario, cell = e.scenario.copy(), e.cell
+        actions = self._exploration.integers(len(MOVES), size=p.environments)
+        is_greedy = self._exploration.random(p.environments) >= self.epsilon
+        if is_greedy.any():
+            q_NA = self._learner.q_values(scenario, cell)
+            actions = np.where(is_greedy, q_NA.argmax(axis=1), actions)
+        reward, terminated, truncated = e.move(actions)
         discount = np.where(terminated, 0.0, p.gamma).astype(np.float32)
-        self._replay.add(Transitions(scenario, cell, actions, reward, next_cell, discount))
+        self._replay.add(Transitions(scenario, cell, actions, reward, e.cell, discount))
         before, self.steps = self.steps, self.steps + p.environments
         if self.steps > p.learning_starts:
             for _ in range(self.steps // p.update_interval - before // p.update_interval):
                 self._update()
         self._total_reward += reward
-        return next_cell[None], terminated, truncated
-
-    def _choose_actions(self) -> NDArray[np.int64]:
-        """Draw ε-greedy actions, independently for each environment."""
-        count = self.parameters.environments
-        actions = self._exploration.integers(len(MOVES), size=count)
-        greedy = self._exploration.random(count) >= self.epsilon
-        if greedy.any():
-            q_NA = self._learner.q_values(self.environment.scenario, self.environment.cell)
-            actions[greedy] = q_NA.argmax(axis=1)[greedy]
-        return actions
+        return e.cell[None], terminated, truncated
 
     def _update(self) -> None:
         """Make one Double DQN update with a batch from the replay buffer."""
@@ -173,18 +166,11 @@ class Trainer:
 
     def planner(self) -> Planner:
         """Return a planner with a copy of the network as it is now."""
-        metadata = ModelMetadata(
-            network=self.parameters.network,
-            sizes=self.network.sizes,
-            move_rule=self.move_rule,
-            gamma=self.parameters.gamma,
-            map_fingerprint=self.scenarios[0].grid.fingerprint,
-            steps=self.steps,
-            seed=self.seed,
-            package_version=package_version(),
-        )
-        tensors = {name: tensor.copy() for name, tensor in self.network.tensors.items()}
-        return Planner(type(self.network)(self.network.sizes, tensors), metadata)
+        p, network, grid = self.parameters, self.network, self.scenarios[0].grid
+        of_training = grid.fingerprint, self.steps, self.seed, package_version()
+        metadata = ModelMetadata(p.network, network.sizes, self.move_rule, p.gamma, *of_training)
+        tensors = {name: tensor.copy() for name, tensor in network.tensors.items()}
+        return Planner(type(network)(network.sizes, tensors), metadata)
 
     def model_bytes(self) -> bytes:
         """Return what a model file of now holds; a ValueError if the training diverged."""
@@ -230,9 +216,23 @@ class Trainer:
                 parameters = HyperParameters(**description["parameters"])
                 rule = MoveRule(description["move_rule"])
                 trainer = cls(scenarios, rule, parameters, description["seed"])
-                trainer._continue(description, file)
-                if metadata[DIGEST_KEY] != _digest(text, trainer._tensors()):
+                counters = description["counters"]
+                trainer.steps, trainer.updates, trainer.episodes, trainer._replay.added = counters
+                tensors = trainer._tensors()
+                shapes = {name: [*tensor.shape] for name, tensor in tensors.items()}
+                # Before any is read: a small sparse file can claim tensors of any size.
+                if {name: file.get_slice(name).get_shape() for name in file.keys()} != shapes:  # noqa: SIM118
+                    raise ValueError("its tensors have other names or shapes")
+                for name, tensor in tensors.items():
+                    tensor[...] = file.get_tensor(name)
+                if metadata[DIGEST_KEY] != _digest(text, tensors):
                     raise ValueError("its digest is another")
+            trainer._visited = description["walked"]
+            states = zip(trainer._generators, description["generators"], strict=True)
+            for generator, state in states:
+                generator.bit_generator.state = state
+            if trainer._learner:
+                trainer._learner.settle()
         except (CheckpointError, MemoryError):
             raise
         except Exception as error:  # a broken file can raise any error in the libraries
@@ -241,22 +241,6 @@ class Trainer:
                 "into another folder"
             ) from error
         return trainer
-
-    def _continue(self, description: Any, file: Any) -> None:
-        """Continue where a checkpoint was made; a ValueError if its tensors are not those."""
-        self.steps, self.updates, self.episodes, self._replay.added = description["counters"]
-        tensors = self._tensors()
-        shapes = {name: [*tensor.shape] for name, tensor in tensors.items()}
-        # Before any is read: a small sparse file can claim tensors of any size.
-        if {name: file.get_slice(name).get_shape() for name in file.keys()} != shapes:  # noqa: SIM118
-            raise ValueError("its tensors have other names or shapes")
-        for name, tensor in tensors.items():
-            tensor[...] = file.get_tensor(name)
-        if not self._player:
-            self._learner.settle()
-        self._visited = description["walked"]
-        for generator, state in zip(self._generators, description["generators"], strict=True):
-            generator.bit_generator.state = state
 
     def _tensors(self) -> dict[str, NDArray[Any]]:
         """Return the arrays of a checkpoint, which share the trainer's memory."""

@@ -28,7 +28,6 @@ from ddqn_planner import Experience, GridMap, MoveRule, Planner
 from ddqn_planner.grid import inflate
 from ddqn_planner.nodes.conversions import (
     bytes_message,
-    directions_message,
     grid_from_message,
     occupancy_message,
 )
@@ -133,7 +132,7 @@ def map_of(stamp: int, frame: str = "map", x: float = 0.0, resolution: float = 0
 
 def directions_of(stamp: int, value: int | None = EAST) -> Any:
     forbidden = None if value is None else np.full((4, 5), value, dtype=np.uint8)
-    return directions_message(forbidden, 0.5, (0.0, 0.0, 0.0), map_of(stamp).header)
+    return occupancy_message(forbidden, 0.5, (0.0, 0.0, 0.0), map_of(stamp).header)
 
 
 def update(**fields: Any) -> SimpleNamespace:

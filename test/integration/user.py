@@ -18,9 +18,8 @@ from ddqn_planner.nodes.runtime import LATCHED
 
 SOON = """
 import rclpy.node
-from ddqn_planner.nodes import driving
 
-driving.RETRY_PERIOD, create_timer = 0.2, rclpy.node.Node.create_timer
+create_timer = rclpy.node.Node.create_timer
 
 def create_fast_timer(node, period, *arguments, **options):
     return create_timer(node, min(period, 0.1), *arguments, **options)

@@ -58,9 +58,9 @@ def test_no_path_depends_on_the_past(place: Place, rule: MoveRule, data: Data) -
         limit, straight = data.draw(st.integers(0, 30)), data.draw(st.booleans())
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(kernels, "CAPACITY", data.draw(st.sampled_from((0.0, kernels.CAPACITY))))
-            plan = grown.rollout(start, straight, limit)
-            while plan.status is PlanStatus.ROLLOUT_TRAPPED:  # each call visits more cells
-                plan = grown.rollout(start, straight, limit)
+            while not grown.grow(start, limit):  # each call visits more cells
+                pass
+        plan = grown.rollout(start, straight)
         for field in (whole, fresh_field(grid, goal, rule)):
             assert plan == field.rollout(start, straight)
         assert (plan.status is PlanStatus.NO_PATH) == np.isinf(exact[start[::-1]])
@@ -265,7 +265,7 @@ def test_a_changed_map_uses_what_is_known_of_the_one_before() -> None:
     older, field = planner.q_field(grid, goal), fresh_field(changed, goal, MoveRule.ROBOT_SAFE)
     assert isinstance(older, DistanceField)
     known = np.count_nonzero(older.known.distance)
-    assert field.take_over(older, (0, 0))
+    assert field.take_over(older)
     assert np.count_nonzero(field.known.distance) > 0.9 * known
     assert np.count_nonzero(older.known.distance) == 1  # it handed over its memory
     assert field.rollout(start) == fresh_field(changed, goal, MoveRule.ROBOT_SAFE).rollout(start)
@@ -359,7 +359,7 @@ def run_until(line: int, step: Callable[[], object]) -> None:
 def test_after_too_many_changes_both_fields_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
     first, second = (GridMap(np.random.default_rng(n).random((60, 60)) < 0.2) for n in (0, 1))
-    assert fields.changed_cells(first, second, (0, 0)) is None
+    assert fields.changed_cells(first, second) is None
     goal = next(cell for cell in first.free_cells() if second.is_free(cell))
     planner = new_planner()
     kept = [planner.q_field(grid, goal) for grid in (first, second, first, second)]
