@@ -122,6 +122,14 @@ def numbers(
     return array
 
 
+def as_pose(name: str, pose: Any) -> tuple[float, float, float]:
+    """Return three finite numbers as floats."""
+    x, y, yaw = numbers(name, pose, (3,)).astype(np.float64).tolist()
+    if not all(map(math.isfinite, (x, y, yaw))):
+        raise ValueError(f"{name} is {pose!r}; give three finite numbers x, y, yaw")
+    return x, y, yaw
+
+
 def as_mask(name: str, cells: ArrayLike, shape: tuple[int, ...] | None = None) -> Occupancy:
     """Return a copy in C order, (H, W) bool."""
     remedy = "True or False (for percent, see from_occupancy_values)"

@@ -86,10 +86,8 @@ class Inflation:
         """Return what `inflate` returns."""
         body, (last_body, before, inflated) = (robot_radius, clearance_weight), self._last
         boxes = grid.patches_since(before) if any(body) and body == last_body else None
-        if boxes is None:
-            inflated = inflate(grid, *body)
-        else:
-            inflated = _inflate_near(boxes, grid, inflated, body)
+        near = None if boxes is None else _inflate_near(boxes, grid, inflated, body)
+        inflated = near or inflate(grid, *body)
         self._last = body, grid, inflated
         return inflated
 

@@ -75,9 +75,7 @@ class GridMap:
         metres = arguments.as_number(
             "resolution", self.resolution, *arguments.POSITIVE, "metres per cell, > 0"
         )
-        origin = tuple(arguments.numbers("origin", self.origin, (3,)).astype(np.float64).tolist())
-        if not all(map(math.isfinite, origin)):
-            raise ValueError(f"origin is {origin}; give three finite numbers x, y, yaw")
+        origin = arguments.as_pose("origin", self.origin)
         self._set(occupancy=occupancy, resolution=metres, origin=origin)
         if self.cost is not None:
             self._set(cost=_costs(self.cost, occupancy))
@@ -370,10 +368,6 @@ def check_grid(grid: object, name: str = "grid") -> None:
 
 def _costs(cost: ArrayLike, occupancy: Occupancy) -> NDArray[np.int8]:
     """Return a copy with 0 in occupied cells."""
-    of_free = np.array(arguments.numbers("cost", cost, occupancy.shape), order="C")
-    if of_free.dtype.kind in "iu":
-        of_free *= ~occupancy  # fifty times as fast as the assignment below
-    else:  # NaN times 0 is NaN
-        of_free[occupancy] = 0
+    of_free = np.where(occupancy, 0, arguments.numbers("cost", cost, occupancy.shape))
     arguments.numbers("cost", of_free, between=(UNKNOWN, OCCUPIED - 1))
-    return of_free.astype(np.int8, copy=False)
+    return of_free.astype(np.int8, order="C", copy=False)

@@ -203,17 +203,17 @@ class DistanceField(QField):
             self.known = repaired
         return True
 
-    def _layer(self, layer_of: Callable[..., NDArray[Any]]) -> NDArray[Any]:
-        """Return what a kernel computes for each cell of the whole field: (..., H, W)."""
+    def _layer(self, write: Callable[..., None], layer: NDArray[Any]) -> NDArray[Any]:
+        """Return what a kernel writes for each cell of the whole field: (..., H, W)."""
         with self._lock:
             self.grow()
-            layer = layer_of(self.known.distance, self.costs)
+            write(self.known.distance, layer, self.costs[:6])
         return layer.reshape(*layer.shape[:-1], -1, self.costs.width)[..., 1:-1, 1:-1]
 
     @cached_property
     def q(self) -> NDArray[np.float32]:  # type: ignore[override]
         """(8, H, W) float32: Q(s, a); -inf where no path to the goal begins with the action."""
-        return self._layer(kernels.q_of)
+        return self._layer(kernels.q_of, np.full((8, self.costs.patch.size), -np.inf, np.float32))
 
     @cached_property
     def legal(self) -> NDArray[np.bool_]:  # type: ignore[override]
@@ -236,7 +236,7 @@ class DistanceField(QField):
     @cached_property
     def policy(self) -> NDArray[np.int8]:
         """(H, W) int8: the action of a rollout in each cell; -1 without one."""
-        return self._layer(kernels.policy_of)
+        return self._layer(kernels.policy_of, np.full(self.costs.patch.size, -1, np.int8))
 
     @property
     def nbytes(self) -> int:

@@ -302,15 +302,9 @@ def _roll_out(distance: Any, cell: int, path: Any, toward: Any, costs: Any) -> i
     return number
 
 
-def policy_of(distance: Distances, costs: MoveCosts) -> NDArray[np.int8]:
-    """Return the greedy action of each cell of a whole field, -1 without one: (C,) int8."""
-    policy = np.full(distance.size, -1, np.int8)
-    _policy_of(distance, policy, costs[:6])
-    return policy
-
-
 @in_place
-def _policy_of(distance: Any, policy: Any, costs: Any) -> None:
+def policy_of(distance: Any, policy: Any, costs: Any) -> None:
+    """Write the greedy action of each cell of a whole field where there is one: (C,) int8."""
     for cell in range(costs[-1] + 1, distance.size - costs[-1] - 1):
         enough = distance[cell] * SAME
         least, action = _best(distance, cell, enough, costs)
@@ -318,15 +312,9 @@ def _policy_of(distance: Any, policy: Any, costs: Any) -> None:
             policy[cell] = action
 
 
-def q_of(distance: Distances, costs: MoveCosts) -> NDArray[np.float32]:
-    """Return minus the cost of the best path through each action: (8, C) float32."""
-    q = np.full((8, distance.size), -np.inf, np.float32)
-    _q_of(distance, q, costs[:6])
-    return q
-
-
 @in_place
-def _q_of(distance: Any, q: Any, costs: Any) -> None:
+def q_of(distance: Any, q: Any, costs: Any) -> None:
+    """Write minus the cost of the best path through each action that has one: (8, C) float32."""
     for action in range(8):
         for cell in range(costs[-1] + 1, distance.size - costs[-1] - 1):
             after = distance[cell + MOVE_Y[action] * costs[-1] + MOVE_X[action]]

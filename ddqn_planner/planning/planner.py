@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
-from ddqn_planner.grid.arguments import as_cell, as_flag, as_number, listed, numbers
+from ddqn_planner.grid.arguments import as_cell, as_flag, as_number, as_pose, listed
 from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
 from ddqn_planner.planning.field import FieldCache, Goals, QField
@@ -219,11 +219,11 @@ class Planner:
         """
         check_grid(grid)
         several = [goal] if np.ndim(goal) == 1 else goal
-        goals = tuple(_as_pose("the goal", one) for one in several)
+        goals = tuple(as_pose("the goal", one) for one in several)
         limits = 0, math.inf, "two numbers, metres and radians, 0 or more"
         metres, radians = (as_number("the tolerance", one, *limits) for one in tolerance)
         least = as_number("the bound", bound, 1, math.inf, "1 or more")
-        request = PoseRequest(grid, _as_pose("the start", start), goals, (metres, radians), least)
+        request = PoseRequest(grid, as_pose("the start", start), goals, (metres, radians), least)
         return last_step(self.pose_steps(request))
 
     def pose_steps(self, request: PoseRequest) -> Iterator[PosePlan | None]:
@@ -331,14 +331,6 @@ class Planner:
         plans = [plan for one in each if (plan := last_step(self.steps(one))).path.size]
         nearest = min(plans, key=lambda plan: plan.cost or plan.length, default=None)
         return nearest.cells[-1:] if nearest else goals[:1]
-
-
-def _as_pose(name: str, pose: Any) -> Pose:
-    """Return three finite numbers as floats; else a ValueError."""
-    x, y, yaw = numbers(name, pose, (3,)).astype(np.float64).tolist()
-    if not all(map(math.isfinite, (x, y, yaw))):
-        raise ValueError(f"{name} is {pose!r}; give three finite numbers x, y, yaw")
-    return x, y, yaw
 
 
 def _dressed(request: PlanRequest, found: Plan, way_out: tuple[Cell, ...], began: float) -> Plan:

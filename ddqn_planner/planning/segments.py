@@ -50,7 +50,7 @@ def straightened(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> Path:
     """Do the work of `simplify` for a path of one cell or more."""
     layers, least, best = _layers(grid, move_rule), np.inf, np.asarray(path)
     # Without costs, nothing between two cells costs less than a segment.
-    until = np.cumsum(_segment_costs(path, layers, 1.0, 1.0)) if grid.has_costs else np.empty(0)
+    until = np.cumsum(_segment_costs(path, layers, 1.0)) if grid.has_costs else np.empty(0)
     # From the end, other obstacles come first: the path may pass them on the better side.
     for order in (1, -1):
         cells, costs = np.array(path[::order], np.int64), np.zeros(len(path))
@@ -67,23 +67,23 @@ def straightened(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> Path:
 
 def cost_along(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> float:
     """Return what a path of segments costs, legal or not: each cell counts by its share of it."""
-    return float(_segment_costs(path, _layers(grid, move_rule), 1.0, 1.0).sum())
+    return float(_segment_costs(path, _layers(grid, move_rule), 1.0).sum())
 
 
 def legal_segments(
     path: Cells, grid: GridMap, move_rule: MoveRule | str, begin: float = 0.0
 ) -> NDArray[np.bool_]:
     """Return which segments are legal, see `simplify`, the first one from a share of it on."""
-    return _segment_costs(path, _layers(grid, move_rule), begin, 0.0)[1:] < np.inf
+    begins = np.zeros(len(path))
+    begins[1:2] = begin
+    return _segment_costs(path, _layers(grid, move_rule), begins)[1:] < np.inf
 
 
-def _segment_costs(
-    path: Cells, layers: tuple[Any, ...], begin: float, others: float
-) -> NDArray[np.float64]:
-    """Return 0 and the cost of each segment, see `_cost`, the first and the others from a share."""
+def _segment_costs(path: Cells, layers: tuple[Any, ...], begins: Any) -> NDArray[np.float64]:
+    """Return 0 and the cost of each segment, see `_cost`, which begins at a share of it."""
     # With 64 bits, whatever is computed with a cell has its type, and numba compiles once for it.
-    cells, costs = np.array(path, np.int64), np.empty(len(path))
-    _costs(cells, len(cells), begin, others, costs, layers)
+    cells, costs = np.array(path, np.int64), np.full(len(path), begins)
+    _costs(cells, costs, layers)
     return costs
 
 
@@ -145,15 +145,15 @@ def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -
 
 
 @in_place
-def _costs(path: Any, count: int, begin: float, others: float, costs: Any, layers: Any) -> None:
+def _costs(path: Any, costs: Any, layers: Any) -> None:
     """Do the work of `_segment_costs`; cells may lie outside the map, where none is legal."""
     height, width = layers[0].shape
     costs[0] = 0.0
-    for index in range(1, count):
+    for index in range(1, path.shape[0]):
         x, y, to_x, to_y = path[index - 1, 0], path[index - 1, 1], path[index, 0], path[index, 1]
-        costs[index] = np.inf
+        begin, costs[index] = costs[index], np.inf
         if 0 <= x < width and 0 <= y < height and 0 <= to_x < width and 0 <= to_y < height:
-            costs[index] = _cost(x, y, to_x, to_y, others if index > 1 else begin, layers)
+            costs[index] = _cost(x, y, to_x, to_y, begin, layers)
 
 
 @in_place
