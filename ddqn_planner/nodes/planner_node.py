@@ -20,7 +20,7 @@ from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.nav2 import GivenUp, serve_nav2
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
-from ddqn_planner.nodes.poses import Frames, StartSource, check_source
+from ddqn_planner.nodes.poses import Places, check_source
 from ddqn_planner.nodes.report import NO_REQUEST, NOT_ACTIVE, Outcome, Report, RequestError
 from ddqn_planner.nodes.requests import (
     UNCHANGED,
@@ -82,12 +82,9 @@ class PlannerNode(ManagedNode):
         # In a group of its own: triggers that come while it plans make it plan once more after.
         group = MutuallyExclusiveCallbackGroup()
         self._replan = self.create_guard_condition(self._plan_for_active_goal, group)
-        self._frames = Frames(self, lambda: float(self._settings.transform_tolerance))
         self._map = MapSource(self, self._report, self._map_worker, self._on_map)
-        self._start = StartSource(
-            self, self._frames, self._report, lambda: self._map.frame, self._on_start
-        )
-        inputs = self._map, self._start, self._frames, self._model
+        self._places = Places(self, self._report, lambda: self._map.frame, self._on_start)
+        inputs = self._map, self._places, self._model
         self._requests = Requests(self._settings, *inputs, self._worker, self._look_soon)
         self.create_subscription(PoseStamped, "goal_pose", lambda goal: self._on_goals([goal]), 10)
         self.create_subscription(PoseArray, "goal_poses", self._on_goal_poses, 10)
@@ -122,7 +119,7 @@ class PlannerNode(ManagedNode):
         self._report.refused.clear()
         self._report.note(NO_REQUEST)
         self.after_jump_back.clear()
-        for name in ("_start", "_frames", "_display", "_map", "_requests"):
+        for name in ("_places", "_display", "_map", "_requests"):
             vars(self).pop(name, None)  # not all are there, if `configure` failed
         self._model.forget()
 
@@ -154,7 +151,7 @@ class PlannerNode(ManagedNode):
             return
         if "model" in changed:
             self._model.use(*self._candidate)
-        self._start.listen()
+        self._places.listen_to_source()
         self._requests.settings = self._settings
         self._map.apply_parameters(changed)
         self._plan_for(ActiveGoal(self._active.poses))
@@ -171,7 +168,7 @@ class PlannerNode(ManagedNode):
     def _on_map(self, frame_changed: bool) -> None:
         if frame_changed:
             # What was refused for its frame may be right now.
-            self._report.accept(self._start.topic)
+            self._report.accept(self._places.topic)
         self._replan.trigger()
 
     def _on_start(self) -> None:
@@ -322,12 +319,12 @@ class PlannerNode(ManagedNode):
 
     def _look_for_news(self) -> None:
         self._requests.look_again()
-        self._start.transform()
+        self._places.transform_start()
         is_due = self._active.is_look_due(self._settings.replan_period, bool(self._map.missing))
         if self._waits_for_pose and self._active.poses:
             with suppress(RequestError):
-                for pose in (self._start.pose(), *self._active.poses):
-                    self._frames.to_map("the pose", pose, self._map.frame)
+                for pose in (self._places.start(), *self._active.poses):
+                    self._places.to_map("the pose", pose, self._map.frame)
                 self._waits_for_pose, is_due = False, True
         if is_due:
             self._replan.trigger()

@@ -22,7 +22,7 @@ from ddqn_planner.model import find_model
 from ddqn_planner.model.certificate import NO_CERTIFICATE
 from ddqn_planner.nodes.conversions import cell_from_pose, pose_of, turns
 from ddqn_planner.nodes.map_source import MapSource
-from ddqn_planner.nodes.poses import Frames, StartSource
+from ddqn_planner.nodes.poses import Places
 from ddqn_planner.nodes.report import (
     Outcome,
     Report,
@@ -210,8 +210,7 @@ class Requests:
 
     settings: SimpleNamespace
     map: MapSource
-    start: StartSource
-    frames: Frames
+    places: Places
     model: ModelSource
     worker: Worker
     look_soon: Callable[[], None]
@@ -237,10 +236,10 @@ class Requests:
         check_request(goals, planner_id, settings.planner_id)
         names = [f"goal {n}" for n in range(1, len(goals) + 1)] if several else ["the goal"]
         for name, goal in zip(names, goals, strict=True):
-            _checked(name, self.frames.check, goal, self.map.frame)
+            _checked(name, self.places.check, goal, self.map.frame)
         header, grid, planner = await self._inputs()
         frame = header.frame_id
-        asked = [start or await self._wait_for(self.start.pose), *goals]
+        asked = [start or await self._wait_for(self.places.start), *goals]
         named = zip(["the start", *names], asked, strict=True)
         places = [await self._in_map(*it, grid, frame) for it in named]
         poses, (first, second, *more) = zip(*places, strict=True)
@@ -320,7 +319,7 @@ class Requests:
             return False
         robot, cell = poses[0], cells[0]
         with suppress(RequestError):
-            start = await self._wait_for(self.start.pose)
+            start = await self._wait_for(self.places.start)
             robot, cell = await self._in_map("the start", start, grid, frame)
         if planner.pose_planner is not None:
             way, anywhere = np.array([*map(pose_of, poses)]), (np.inf, np.inf)
@@ -344,9 +343,9 @@ class Requests:
         self, name: str, stamped: PoseStamped, grid: GridMap, frame: str
     ) -> tuple[PoseStamped, Cell]:
         """Return a pose in the map's frame, whose transform is waited for, and its cell."""
-        _checked(name, self.frames.check, stamped, frame)
+        _checked(name, self.places.check, stamped, frame)
         deadline = time.monotonic() + self.settings.transform_tolerance
-        pose = await self._wait_for(lambda: self.frames.to_map(name, stamped, frame), deadline)
+        pose = await self._wait_for(lambda: self.places.to_map(name, stamped, frame), deadline)
         return pose, _checked(name, cell_from_pose, pose, grid, frame)
 
     async def _wait_for(self, get: Callable[[], T], deadline: float = 0.0) -> T:
