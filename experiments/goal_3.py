@@ -13,6 +13,7 @@ from scipy.special import softmax
 from tables import mean_and_worst, median_and_range, table
 from trainings import MOVE_RULE, PROFILES, SCENARIO, Settings, Training, in_parallel, rollouts
 
+from ddqn_planner.files import write_atomically
 from ddqn_planner.grid import (
     LENGTHS,
     Cell,
@@ -106,7 +107,7 @@ def train_supervised(training: Training) -> None:
         differentiate(network, gradient, SUPERVISED_BATCH)
         rate = SUPERVISED_LEARNING_RATE * (1 - 0.95 * number / steps)
         adam(network, gradient, mean, square, rate, number + 1)
-    trainer.save_model(path)
+    write_atomically(path, trainer.model_bytes())
 
 
 def best_moves(scenario: Scenario) -> NDArray[np.bool_]:

@@ -58,9 +58,6 @@ class TorchLearner:
             self._adam.state[weight] = state
         trainer._learner = self
 
-    def settle(self) -> None:
-        """Do nothing: this network knows no values of maps."""
-
     def _observe(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
         background, shape = self.environment.background[scenario], self.environment.shape
         return torch.from_numpy(observe(background, cell, shape))
@@ -77,9 +74,11 @@ class TorchLearner:
             target_BA = self._target(self._observe(batch.scenario, batch.next_cell))
         cells = np.concatenate([batch.cell, batch.next_cell])
         q_2BA = self._online(self._observe(np.tile(batch.scenario, 2), cells))
-        kind = self.environment.parameters.target
+        p = self.environment.parameters
         q = target_BA.numpy(), q_2BA.numpy(force=True)
-        gradient_BA = torch.from_numpy(double_dqn_gradient(kind, batch, *q))
+        gradient_BA = torch.from_numpy(double_dqn_gradient(p.target, batch, *q))
         self._online.zero_grad()
         torch.autograd.backward(q_2BA[: len(gradient_BA)], gradient_BA)
         self._adam.step()
+        if number % p.target_interval == 0:
+            self._target.load_state_dict(self._online.state_dict())

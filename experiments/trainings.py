@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from ddqn_planner.cli import HelpFormatter
-from ddqn_planner.files import write_csv
+from ddqn_planner.files import write_atomically, write_csv
 from ddqn_planner.grid import LENGTHS, MoveRule, Noise, neighbours
 from ddqn_planner.model import PaperQNetwork
 from ddqn_planner.model.shared_background import evaluate
@@ -160,7 +160,7 @@ def train(training: Training) -> None:
                 rows.append(evaluate_training(trainer, optimum))
                 write_csv(folder / "evaluations.csv", [*rows[0]], [[*row.values()] for row in rows])
                 if rows[-1]["solved"] >= best:
-                    trainer.save_model(folder / "kept.safetensors")
+                    write_atomically(folder / "kept.safetensors", trainer.model_bytes())
     if run.save_error:
         raise OSError(run.save_error)
 

@@ -70,6 +70,13 @@ def inside(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray
     return found
 
 
+def outline(corners: NDArray[np.float64], spacing: float) -> NDArray[np.float64]:
+    """Return points along the sides of a polygon, (M, 2)."""
+    sides = zip(corners, np.roll(corners, -1, axis=0), strict=True)
+    counted = ((a, b, math.ceil(math.dist(a, b) / spacing)) for a, b in sides)
+    return np.concatenate([np.linspace(a, b, count, endpoint=False) for a, b, count in counted])
+
+
 def swept_cells(corners: NDArray[np.float64], motions: Motions) -> NDArray[np.bool_]:
     """Return (P, S, S) bool: the cells that the body touches on each primitive, S // 2 the first's.
 
@@ -82,15 +89,10 @@ def swept_cells(corners: NDArray[np.float64], motions: Motions) -> NDArray[np.bo
     if reach > MAX_REACH:
         problem = f"the body sweeps {reach} cells to a side; at most {MAX_REACH} can be learned"
         raise ValueError(f"{problem}: give a coarser resolution than {motions.resolution} m")
-    edge = np.concatenate(
-        [
-            np.linspace(a, b, math.ceil(math.hypot(*(b - a)) / MARGIN), endpoint=False)
-            for a, b in zip(body, np.roll(body, -1, axis=0), strict=True)
-        ]
-    )
+    edge = outline(body, MARGIN)
     square = MARGIN * np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)])
     cells = np.arange(-reach, reach + 1.0)
-    centres = np.column_stack([axis.ravel() for axis in np.meshgrid(cells, cells)])
+    centres = np.stack(np.meshgrid(cells, cells), axis=-1).reshape(-1, 2)
     swept = np.zeros((len(motions.poses), len(cells), len(cells)), dtype=np.bool_)
     for mask, poses in zip(swept, motions.poses, strict=True):
         for x, y, yaw in closer(poses, MARGIN, far):
@@ -102,21 +104,6 @@ def swept_cells(corners: NDArray[np.float64], motions: Motions) -> NDArray[np.bo
             turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
             mask |= inside((centres - (x, y)) @ turn, body).reshape(mask.shape)
     return swept
-
-
-def rows_of(swept: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the rows of cells (P, S, S): y, first x, count <= 64 of each, and where they begin."""
-    reach = swept.shape[-1] // 2
-    steps = np.diff(np.pad(swept, ((0, 0), (0, 0), (1, 1))).astype(np.int8), axis=-1)
-    number, y, begin = np.nonzero(steps == 1)
-    _, _, end = np.nonzero(steps == -1)
-    pieces = (end - begin + 63) // 64
-    part = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    number, y, begin, end = (np.repeat(array, pieces) for array in (number, y, begin, end))
-    begin = begin + 64 * part
-    count = np.minimum(end - begin, 64)
-    first = np.searchsorted(number, np.arange(len(swept) + 1))
-    return np.column_stack([y - reach, begin - reach, count]), first
 
 
 def placed(corners: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 import safetensors.numpy
-from safetensors import SafetensorError, deserialize
+from safetensors import SafetensorError
 
 from ddqn_planner.files import as_path, write_atomically
 from ddqn_planner.grid import MoveRule
@@ -105,8 +105,8 @@ def load_model(name: str | Path) -> tuple[QNetwork, ModelMetadata]:
 def model_of(data: bytes) -> tuple[QNetwork, ModelMetadata]:
     """Return the model of which `model_bytes` made the bytes; a ValueError if they are none."""
     try:
-        parts = dict(deserialize(data))  # type: ignore[no-untyped-call]
-    except SafetensorError as error:
+        tensors = safetensors.numpy.load(data)
+    except (SafetensorError, KeyError) as error:  # or of numbers that NumPy does not have
         problem = f"cannot be read as safetensors ({error}); it is truncated or of another kind"
         raise ValueError(f"{problem}: save or copy it again") from None
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
@@ -119,18 +119,13 @@ def model_of(data: bytes) -> tuple[QNetwork, ModelMetadata]:
     except (ValueError, RecursionError) as error:
         raise ValueError(f"its metadata is wrong ({error}); train the model again") from None
     network_class, sizes = NETWORKS[description.network], description.sizes
-    shapes = network_class.shapes(sizes)
-    doubles = network_class.doubles
+    held = {name: (tensor.dtype.name, tensor.shape) for name, tensor in tensors.items()}
     expected = {
-        key: ("F64" if key in doubles else "F32", [*shape]) for key, shape in shapes.items()
+        name: ("float64" if name in network_class.doubles else "float32", shape)
+        for name, shape in network_class.shapes(sizes).items()
     }
-    held = {key: (part["dtype"], part["shape"]) for key, part in parts.items()}
-    if expected != held:
+    if held != expected:
         raise ValueError(f"holds tensors {reprlib.repr(held)}, not {expected}; train it again")
-    tensors = {
-        key: np.frombuffer(parts[key]["data"], "<f8" if kind == "F64" else "<f4").reshape(shape)
-        for key, (kind, shape) in held.items()
-    }
     if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
         raise ValueError("its weights are not all finite; train it again")
     return network_class(sizes, tensors), description

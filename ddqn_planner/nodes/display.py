@@ -42,8 +42,8 @@ class FieldDisplay:
     def __init__(self, node: Node, worker: Worker) -> None:
         self._logger, self._worker = node.get_logger(), worker
         self._shown: Outcome | None = None
-        # What is to be published anew, and what showed something when it was published last.
-        self._due, self._visible = set[str](), set[str]()
+        # Of what each topic showed when it was published last, the header; None for nothing.
+        self._published: dict[str, Header | None] = dict.fromkeys(LAYERS)
         self._look = node.create_guard_condition(self._on_look, MutuallyExclusiveCallbackGroup())
         matched = PublisherEventCallbacks(matched=lambda _: self._look.trigger())
         self._publishers = {
@@ -58,21 +58,21 @@ class FieldDisplay:
             header = Header(stamp=outcome.header.stamp, frame_id=last.header.frame_id)
             outcome = replace(last, planner=None, header=header)
         if outcome.plan.goal and (last is None or _key(outcome) != _key(last)):
-            self._shown, self._due = outcome, {*LAYERS}
+            self._shown = outcome
             self._look.trigger()
 
     async def _on_look(self) -> None:
         for name, publisher in self._publishers.items():
-            shown = self._shown
-            if shown is None or name not in self._due:
-                continue
-            has_body = isinstance(shown.plan, PosePlan)
-            has_any = shown.planner is not None and has_body == (name == "footprints")
+            if (shown := self._shown) is None:
+                return
+            if isinstance(shown.plan, PosePlan) != (name == "footprints"):
+                shown = replace(shown, planner=None)
+            visible = shown.header if shown.planner is not None else None
             # What is latched is cleared even if nobody subscribes now.
-            if not (publisher.get_subscription_count() if has_any else name in self._visible):
+            is_asked_for = visible is None or publisher.get_subscription_count() > 0
+            if visible is self._published[name] or not is_asked_for:
                 continue
-            self._due.remove(name)
-            self._visible = self._visible | {name} if has_any else self._visible - {name}
+            self._published[name] = visible
             try:
                 publisher.publish(await self._worker.call(LAYERS[name][1], shown))
             except InvalidHandle:  # cleaned up meanwhile
@@ -91,8 +91,7 @@ def _key(outcome: Outcome) -> tuple[object, ...]:
 def _field_of(outcome: Any) -> tuple[QField | None, GridMap, Header]:
     """Return the field of an outcome, which is computed, its map, and the header."""
     request, planner, goal = outcome.request, outcome.planner, outcome.plan.goal
-    is_shown = planner is not None and not isinstance(outcome.plan, PosePlan)
-    field = planner.q_field(request.grid, goal, request.move_rule) if is_shown else None
+    field = planner.q_field(request.grid, goal, request.move_rule) if planner is not None else None
     return field, request.grid, outcome.header
 
 
@@ -115,16 +114,15 @@ def policy_message(field: QField | None, grid: GridMap, header: Header) -> Marke
     return _lines("policy", arrows, (0, 1, 1, 2, 1, 3), width, header)
 
 
-def footprint_message(outcome: Outcome) -> MarkerArray:
+def footprint_message(outcome: Any) -> MarkerArray:
     """Make a message with a body's outlines along its path; without one, it deletes the last."""
-    body = outcome.planner.pose_planner if outcome.planner is not None else None
-    if body is None or not isinstance(outcome.plan, PosePlan):
+    if outcome.planner is None:
         return _lines("footprints", np.empty((0, 0)), (), BODY_LINE, outcome.header)
     x, y, yaw = outcome.plan.poses.T
     turn = np.abs(turn_between(yaw[:-1], yaw[1:]))
     passed = np.cumsum(np.hypot(np.diff(x), np.diff(y)) + turn * TURN) // APART
     at = np.append(True, np.diff(passed, prepend=0) > 0)
-    corners = body.footprint @ [1, 1j]
+    corners = outcome.planner.pose_planner.footprint @ [1, 1j]
     outlines = (x + 1j * y)[at, None] + np.exp(1j * yaw)[at, None] * corners
     sides = [corner % len(corners) for n in range(len(corners)) for corner in (n, n + 1)]
     return _lines("footprints", outlines, sides, BODY_LINE, outcome.header)

@@ -20,16 +20,14 @@ from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.nav2 import GivenUp, serve_nav2
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
-from ddqn_planner.nodes.poses import Frames, StartSource, check_source
+from ddqn_planner.nodes.poses import Places, check_source
 from ddqn_planner.nodes.report import NO_REQUEST, NOT_ACTIVE, Outcome, Report, RequestError
 from ddqn_planner.nodes.requests import (
     UNCHANGED,
     ActiveGoal,
     ModelSource,
-    PathUnderWay,
     Requests,
     read_model,
-    way_of,
 )
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker, spin_until_shutdown, unless
 from ddqn_planner.planning import Planner
@@ -84,12 +82,9 @@ class PlannerNode(ManagedNode):
         # In a group of its own: triggers that come while it plans make it plan once more after.
         group = MutuallyExclusiveCallbackGroup()
         self._replan = self.create_guard_condition(self._plan_for_active_goal, group)
-        self._frames = Frames(self, lambda: float(self._settings.transform_tolerance))
         self._map = MapSource(self, self._report, self._map_worker, self._on_map)
-        self._start = StartSource(
-            self, self._frames, self._report, lambda: self._map.frame, self._on_start
-        )
-        inputs = self._map, self._start, self._frames, self._model
+        self._places = Places(self, self._report, lambda: self._map.frame, self._on_start)
+        inputs = self._map, self._places, self._model
         self._requests = Requests(self._settings, *inputs, self._worker, self._look_soon)
         self.create_subscription(PoseStamped, "goal_pose", lambda goal: self._on_goals([goal]), 10)
         self.create_subscription(PoseArray, "goal_poses", self._on_goal_poses, 10)
@@ -111,7 +106,9 @@ class PlannerNode(ManagedNode):
     def deactivate(self) -> None:
         """Forget the active goal."""
         super().deactivate()
-        self._active, self._followed = ActiveGoal([]), PathUnderWay()
+        self._active = ActiveGoal([])
+        # Of actions whose path can be kept, and of those whose path can get better, the last ones.
+        self._followed: Outcome | None = None
         self._newest: Outcome | None = None
         self._report.change()
 
@@ -122,7 +119,7 @@ class PlannerNode(ManagedNode):
         self._report.refused.clear()
         self._report.note(NO_REQUEST)
         self.after_jump_back.clear()
-        for name in ("_start", "_frames", "_display", "_map", "_requests"):
+        for name in ("_places", "_display", "_map", "_requests"):
             vars(self).pop(name, None)  # not all are there, if `configure` failed
         self._model.forget()
 
@@ -154,11 +151,9 @@ class PlannerNode(ManagedNode):
             return
         if "model" in changed:
             self._model.use(*self._candidate)
-        self._start.listen()
+        self._places.listen_to_source()
         self._requests.settings = self._settings
         self._map.apply_parameters(changed)
-        if "path_simplification" in changed:
-            self._followed = PathUnderWay()
         self._plan_for(ActiveGoal(self._active.poses))
 
     def _on_model(self, message: UInt8MultiArray) -> None:
@@ -173,11 +168,11 @@ class PlannerNode(ManagedNode):
     def _on_map(self, frame_changed: bool) -> None:
         if frame_changed:
             # What was refused for its frame may be right now.
-            self._report.accept(self._start.topic)
+            self._report.accept(self._places.topic)
         self._replan.trigger()
 
     def _on_start(self) -> None:
-        self._plan_for(ActiveGoal(self._active.poses, self._active.path))
+        self._plan_for(ActiveGoal(self._active.poses, self._active.followed))
 
     def _plan_for(self, active: ActiveGoal) -> None:
         """Plan at once, whatever was planned: the one before may have a plan under way."""
@@ -216,7 +211,7 @@ class PlannerNode(ManagedNode):
         active, goals = self._active, self._active.poses
         if not goals:
             return
-        planning = self._requests.plan(None, goals, followed=active.path, active=active)
+        planning = self._requests.plan(None, goals, followed=active.followed, active=active)
         outcome = await self._answer(goals, planning)
         if outcome.status in (UNCHANGED.status, NOT_ACTIVE.status):
             return
@@ -227,7 +222,7 @@ class PlannerNode(ManagedNode):
         logged = goals, outcome.goal, outcome.status, outcome.plan.method
         if self._logged != logged:
             self._logged = logged
-            self._report.log(outcome)
+            self._report.log(outcome, paths=True)
 
     def _publish(self, outcome: Outcome, active: ActiveGoal) -> None:
         if active.is_news(outcome):
@@ -237,13 +232,11 @@ class PlannerNode(ManagedNode):
     async def _plan_for_action(
         self, start: PoseStamped | None, goals: list[PoseStamped], name: str, given_up: GivenUp
     ) -> tuple[Path, Outcome]:
-        form = self._settings.path_simplification
         planning = self._requests.plan(start, goals, None, name, self._followed)
         outcome = await self._answer(goals, planning, given_up)
         to_publish, path = _paths(outcome, path_bytes, path_message)
         if len(outcome.plan.path):
-            if form == self._settings.path_simplification:  # else the next path is a new one
-                self._followed = way_of(outcome)
+            self._followed = outcome
             # It gets the better path with its next request.
             self._improve_later(outcome, None)
             self._plan_publisher.publish(to_publish)
@@ -312,7 +305,6 @@ class PlannerNode(ManagedNode):
     def _on_look(self) -> None:
         is_frequent = bool(self._active.poses) and self._settings.replan_period < IDLE_PERIOD
         self._look_soon(self._waits_for_pose or is_frequent)
-        self._report.log_paths()
         if self._is_configured:
             self._look_for_news()
         if self._report.is_due():
@@ -327,12 +319,12 @@ class PlannerNode(ManagedNode):
 
     def _look_for_news(self) -> None:
         self._requests.look_again()
-        self._start.transform()
+        self._places.transform_start()
         is_due = self._active.is_look_due(self._settings.replan_period, bool(self._map.missing))
         if self._waits_for_pose and self._active.poses:
             with suppress(RequestError):
-                for pose in (self._start.pose(), *self._active.poses):
-                    self._frames.to_map("the pose", pose, self._map.frame)
+                for pose in (self._places.start(), *self._active.poses):
+                    self._places.to_map("the pose", pose, self._map.frame)
                 self._waits_for_pose, is_due = False, True
         if is_due:
             self._replan.trigger()

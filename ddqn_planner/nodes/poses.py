@@ -21,6 +21,7 @@ from ddqn_planner.nodes.runtime import STEADY, BaseNode
 READ_PERIOD, TF_DEPTH = 0.5, 1000  # seconds between two reads, and messages that come meanwhile
 SILENCE = 2.0  # seconds after which odometry that comes no more does not tell where the robot is
 REMEDY = "; or install tf2_ros (apt install ros-jazzy-tf2-ros-py), which transforms it"
+NEWEST = Time()
 TYPES = {"odom": Odometry, "initialpose": PoseWithCovarianceStamped, "goal_pose": PoseStamped}
 
 
@@ -65,8 +66,6 @@ class Frames:
 
     def _transform_at(self, stamped: PoseStamped, map_frame: str) -> TransformStamped:
         stamp, frames = Time.from_msg(stamped.header.stamp), (map_frame, stamped.header.frame_id)
-        if not stamp.nanoseconds:
-            return self._newest(*frames)
         try:
             return self._lookup(*frames, stamp)
         except ValueError:
@@ -78,28 +77,25 @@ class Frames:
 
     def origin_of(self, frame: str, map_frame: str) -> PoseStamped:
         """Return where a frame's origin is now; ValueError if TF does not know it of now."""
-        return transformed(PoseStamped(), self._newest(map_frame, frame))
+        return transformed(PoseStamped(), self._lookup(map_frame, frame))
 
-    def _newest(self, target: str, source: str) -> TransformStamped:
-        newest = self._lookup(target, source)
-        stamp = Time.from_msg(newest.header.stamp)
-        age, limit = (self._node.get_clock().now() - stamp).nanoseconds / 1e9, self._tolerance()
-        # Static transforms have the stamp 0, and are never too old.
-        if stamp.nanoseconds and abs(age) > limit:
-            when = f"{age:.3g} s old" if age > 0 else f"{-age:.3g} s in the future"
-            raise ValueError(f"the newest is {when}, more than transform_tolerance, {limit:g} s")
-        return newest
-
-    def _lookup(self, target: str, source: str, stamp: Time | None = None) -> TransformStamped:
+    def _lookup(self, target: str, source: str, stamp: Time = NEWEST) -> TransformStamped:
         """Return the transform from a frame to another at a time, by default the newest."""
         if not self.available:
             raise ValueError("tf2_ros is not installed")
         self.listen()
         self._read()
         try:
-            return self._buffer.lookup_transform(target, source, stamp or Time())
+            found = self._buffer.lookup_transform(target, source, stamp)
         except self._tf2_ros.TransformException as error:
             raise ValueError(str(error)) from None
+        of = Time.from_msg(found.header.stamp)
+        age, limit = (self._node.get_clock().now() - of).nanoseconds / 1e9, self._tolerance()
+        # Static transforms have the stamp 0, and are never too old.
+        if of.nanoseconds and not stamp.nanoseconds and abs(age) > limit:
+            when = f"{age:.3g} s old" if age > 0 else f"{-age:.3g} s in the future"
+            raise ValueError(f"the newest is {when}, more than transform_tolerance, {limit:g} s")
+        return found
 
     def listen(self) -> None:
         """Listen to TF from now on: most robots do not need it, and each message costs time."""
@@ -164,27 +160,26 @@ def listen(
     return node.create_subscription(message_type, topic, on_message, quality)
 
 
-class StartSource:
-    """Where the robot is, by ``start_source``: the last `initialpose` or `odom`, or TF."""
+class Places(Frames):
+    """Frames, and where the robot is by ``start_source``: the last `initialpose`, `odom`, or TF."""
 
+    # `on_start` is called when there is a start from which to plan at once.
     def __init__(
         self,
         node: BaseNode,
-        frames: Frames,
         refusals: Refusals,
         map_frame: Callable[[], str],
         on_start: Callable[[], None],
     ) -> None:
-        self._node, self._frames, self._refusals = node, frames, refusals
-        # What to call when there is a start from which to plan at once.
-        self._map_frame, self._on_start = map_frame, on_start
+        super().__init__(node, lambda: float(node.value("transform_tolerance")))
+        self._refusals, self._map_frame, self._on_start = refusals, map_frame, on_start
         self._pose: PoseStamped | None = None
         self._subscription: Any = None
         self.source = self.topic = ""
-        self.listen()
+        self.listen_to_source()
         node.after_jump_back.append(self._forget_odometry)
 
-    def listen(self) -> None:
+    def listen_to_source(self) -> None:
         """Listen to what the parameter names, if it is another source."""
         source = self._node.value("start_source")
         if source == self.source:
@@ -192,42 +187,42 @@ class StartSource:
         self._node.destroy_subscription(self._subscription)
         self._refusals.accept(self.topic)
         self.source, self.topic = source, "odom" if source == "odometry" else source
-        self._pose, self._began = None, time.monotonic()
+        self._pose, self._heard_from = None, time.monotonic()
         if source == "tf":
-            self._frames.listen()
+            self.listen()
         else:
             self._subscription = listen(self._node, self.topic, 10, self._refusals, self._take)
 
     def _forget_odometry(self) -> None:
         if self.source == "odometry":
-            self._pose, self._began = None, time.monotonic()
+            self._pose, self._heard_from = None, time.monotonic()
 
     def _take(self, pose: PoseStamped) -> None:
-        self._frames.check("the start", pose, self._map_frame())
+        self.check("the start", pose, self._map_frame())
         # Odometry comes all the time: it only triggers a plan that waits for the first pose.
         is_due = self._pose is None or self.source == "initialpose"
         self._pose, self._came = pose, self._node.get_clock().now()
         if is_due:
             self._on_start()
 
-    def transform(self) -> None:
+    def transform_start(self) -> None:
         """Transform the last `initialpose` as soon as TF can: it forgets the times before."""
         frame = self._map_frame()
         if self.source == "initialpose" and self._pose is not None and frame:
             with suppress(RequestError):
-                self._pose = self._frames.to_map("the start", self._pose, frame)
+                self._pose = self.to_map("the start", self._pose, frame)
 
-    def pose(self) -> PoseStamped:
+    def start(self) -> PoseStamped:
         """Return the last pose in its own frame, by TF in the map's; or raise a RequestError."""
         if self.source == "tf":
             frames = self._node.value("robot_frame"), self._map_frame()
             try:
-                return self._frames.origin_of(*frames)
+                return self.origin_of(*frames)
             except ValueError as error:
                 problem = "no transform leads from {!r} to {!r}".format(*frames)
                 remedy = "publish one, or set robot_frame or start_source"
                 reason = f"the start is unknown: {problem} ({error}); {remedy}"
-                raise RequestError("NO_START", reason, self._frames.began) from None
+                raise RequestError("NO_START", reason, self.began) from None
         topic, is_odometry = self._subscription.topic_name, self.source == "odometry"
         problem = f"nothing came on {topic} in the map's frame"
         if not is_odometry:
@@ -239,5 +234,5 @@ class StartSource:
             often = "publish it more often, set transform_tolerance"
             problem = f"nothing came on {topic} for {silent:.3g} s; {often}"
         remedy = "or set start_source, or give the request's start its frame"
-        since = self._began if is_odometry else -math.inf
+        since = self._heard_from if is_odometry else -math.inf
         raise RequestError("NO_START", f"the start is unknown; {problem}; {remedy}", since)

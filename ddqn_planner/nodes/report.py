@@ -180,7 +180,6 @@ class Report(Refusals):
     def __init__(self, node: BaseNode, on_change: Callable[[], None]) -> None:
         super().__init__(node)
         self.outcome, self._on_change = NO_REQUEST, on_change
-        self._to_be_logged: list[str] = []
         self._due = 0.0
 
     def change(self) -> None:
@@ -200,19 +199,12 @@ class Report(Refusals):
         self.outcome = outcome
         self.change()
 
-    def log(self, outcome: Outcome) -> None:
-        """Log a failure at once, and a path after its answer, which comes 1.2 times as fast."""
-        if outcome.plan.path.size:
-            self._to_be_logged.append(outcome.reason)
-        else:
-            self.log_paths()
+    def log(self, outcome: Outcome, paths: bool = False) -> None:
+        """Log why there is no path, or how it was found: that takes a sixth of a request."""
+        if not outcome.plan.path.size:
             self.node.get_logger().warning(f"no plan: {outcome.reason}")
-
-    def log_paths(self) -> None:
-        """Log the paths that were found since the last call."""
-        if self._to_be_logged:
-            self.node.get_logger().info("\n".join(self._to_be_logged))
-        self._to_be_logged.clear()
+        elif paths:
+            self.node.get_logger().info(outcome.reason)
 
     def publish(self, fatal: bool, missing: str, more: Mapping[str, str]) -> None:
         """Publish the diagnostics; `fatal` if the node cannot plan until its user helps."""

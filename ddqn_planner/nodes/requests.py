@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
@@ -22,7 +22,7 @@ from ddqn_planner.model import find_model
 from ddqn_planner.model.certificate import NO_CERTIFICATE
 from ddqn_planner.nodes.conversions import cell_from_pose, pose_of, turns
 from ddqn_planner.nodes.map_source import MapSource
-from ddqn_planner.nodes.poses import Frames, StartSource
+from ddqn_planner.nodes.poses import Places
 from ddqn_planner.nodes.report import (
     Outcome,
     Report,
@@ -46,34 +46,14 @@ UNCHANGED = Outcome("UNCHANGED", "the active goal needs no new plan")
 T = TypeVar("T")
 
 
-class PathUnderWay(NamedTuple):
-    """The last path to a goal: poses, or cells of the map that it was planned on."""
-
-    path: Any = ()
-    grid: GridMap | None = None
-    frame: str = ""
-
-    def on(self, request: Request, frame: str) -> Any:
-        """Return the path in cells of a request's map, or none if that has another place."""
-        # A path of cells is none of poses: the model may be another one.
-        fits = len(self.path) > 0 and len(self.path[0]) == len(request.start)
-        if not fits or self.grid is None or frame != self.frame:
-            return ()
-        if isinstance(request, PoseRequest):
-            return self.path
-        shift = shift_between(self.grid, request.grid)
-        cells = None if shift is None else np.asarray(self.path) + np.array(shift, np.int32)
-        return () if cells is None or not request.grid.contains((*cells[-1].tolist(),)) else cells
-
-
 class ActiveGoal:
     """Decides when to plan again, and what to publish; the table in docs/nodes.md has the rules."""
 
-    def __init__(self, poses: list[PoseStamped], path: PathUnderWay | None = None) -> None:
+    def __init__(self, poses: list[PoseStamped], followed: Outcome | None = None) -> None:
         # The last ``goal_pose``, or the last ``goal_poses``, of which the nearest one counts.
         self.poses = poses
-        # Of the paths that were published for this goal, the last one.
-        self.path = path or PathUnderWay()
+        # Of the outcomes whose paths were published for this goal, the last one.
+        self.followed = followed
         # What was planned last; None to plan whatever is asked.
         self._planned: tuple[Any, ...] | None = None
         # The frame and the status of what was published last; None to publish whatever comes.
@@ -97,27 +77,34 @@ class ActiveGoal:
         # A map that came again as it was is planned on, so that the diagnostics name the last one.
         if self._planned == planned or (is_followed and len(_rest(planner, request))):
             return False
-        self.path = PathUnderWay(request.under_way, request.grid, frame)
         self._planned, self._next_look = planned, time.monotonic() + period
         return True
 
     def is_news(self, outcome: Outcome) -> bool:
         """Return whether to publish the path of an outcome, which may be empty."""
-        way, shown = way_of(outcome), (outcome.header.frame_id, outcome.status)
-        is_new_path = len(way.path) > 0 and outcome.plan.extra_cost is None
+        has_path, shown = len(outcome.plan.path) > 0, (outcome.header.frame_id, outcome.status)
+        is_new_path = has_path and outcome.plan.extra_cost is None
         is_news, self._shown = is_new_path or shown != self._shown, shown
         if outcome.request is None:
             self._planned = None
-        elif is_news and len(way.path):
-            self.path = way
+        elif is_news and has_path:
+            self.followed = outcome
         return is_news
 
 
-def way_of(outcome: Outcome) -> PathUnderWay:
-    """Return the path of an outcome as the next request knows it: its poses, or its cells."""
-    plan, grid = outcome.plan, outcome.request.grid if outcome.request else None
-    path = plan.poses if isinstance(plan, PosePlan) else plan.path
-    return PathUnderWay(path, grid, outcome.header.frame_id)
+def path_under_way(last: Outcome | None, request: Request, frame: str) -> Any:
+    """Return the last path in cells of a request's map; none if it has another place or form."""
+    if last is None or frame != last.header.frame_id:
+        return ()
+    plan, before = last.plan, last.request  # with another model perhaps
+    if isinstance(request, PoseRequest):
+        return plan.poses if isinstance(plan, PosePlan) else ()
+    if not isinstance(before, PlanRequest) or before.simplified != request.simplified:
+        return ()
+    if (shift := shift_between(before.grid, request.grid)) is None:
+        return ()
+    cells = plan.path + np.array(shift, np.int32)
+    return cells if request.grid.contains((*cells[-1].tolist(),)) else ()
 
 
 def _rest(planner: Planner, request: Request) -> Any:
@@ -223,8 +210,7 @@ class Requests:
 
     settings: SimpleNamespace
     map: MapSource
-    start: StartSource
-    frames: Frames
+    places: Places
     model: ModelSource
     worker: Worker
     look_soon: Callable[[], None]
@@ -241,7 +227,7 @@ class Requests:
         goals: list[PoseStamped],
         tolerance: float | None = None,
         planner_id: str = "",
-        followed: PathUnderWay | None = None,
+        followed: Outcome | None = None,
         active: ActiveGoal | None = None,
     ) -> Outcome:
         """Plan from a start or where the robot is, through all goals; to one if they are active."""
@@ -250,10 +236,10 @@ class Requests:
         check_request(goals, planner_id, settings.planner_id)
         names = [f"goal {n}" for n in range(1, len(goals) + 1)] if several else ["the goal"]
         for name, goal in zip(names, goals, strict=True):
-            _checked(name, self.frames.check, goal, self.map.frame)
+            _checked(name, self.places.check, goal, self.map.frame)
         header, grid, planner = await self._inputs()
         frame = header.frame_id
-        asked = [start or await self._wait_for(self.start.pose), *goals]
+        asked = [start or await self._wait_for(self.places.start), *goals]
         named = zip(["the start", *names], asked, strict=True)
         places = [await self._in_map(*it, grid, frame) for it in named]
         poses, (first, second, *more) = zip(*places, strict=True)
@@ -269,19 +255,20 @@ class Requests:
             method=PlanMethod(settings.mode),
             tolerance=metres / grid.resolution,
             simplified=settings.path_simplification != "none",
+            switch_threshold=settings.switch_threshold,
             start_clearing_radius=_clearing_radius(settings, grid),
         )
         if planner.pose_planner is not None:
             first, second, *more = map(pose_of, poses)
             limits = metres, settings.yaw_tolerance
-            request = PoseRequest(grid, first, (second,), limits, settings.path_bound)
+            how = {"bound": settings.path_bound, "switch_threshold": settings.switch_threshold}
+            request = PoseRequest(grid, first, (second,), limits, **how)
         if active is not None:
             active.poses[:] = poses[1:]  # there they stay, though their own frame moves
             if several:
                 request, more = request.to_nearest(more), []
-        if followed is not None and not more:
-            way, threshold = followed.on(request, frame), settings.switch_threshold
-            request = replace(request, under_way=way, switch_threshold=threshold)
+        if not more:
+            request = replace(request, under_way=path_under_way(followed, request, frame))
         if active and not active.is_due(planner, request, header, settings.replan_period):
             return UNCHANGED
         plans = [await self._plan(planner, request)]
@@ -332,7 +319,7 @@ class Requests:
             return False
         robot, cell = poses[0], cells[0]
         with suppress(RequestError):
-            start = await self._wait_for(self.start.pose)
+            start = await self._wait_for(self.places.start)
             robot, cell = await self._in_map("the start", start, grid, frame)
         if planner.pose_planner is not None:
             way, anywhere = np.array([*map(pose_of, poses)]), (np.inf, np.inf)
@@ -356,9 +343,9 @@ class Requests:
         self, name: str, stamped: PoseStamped, grid: GridMap, frame: str
     ) -> tuple[PoseStamped, Cell]:
         """Return a pose in the map's frame, whose transform is waited for, and its cell."""
-        _checked(name, self.frames.check, stamped, frame)
+        _checked(name, self.places.check, stamped, frame)
         deadline = time.monotonic() + self.settings.transform_tolerance
-        pose = await self._wait_for(lambda: self.frames.to_map(name, stamped, frame), deadline)
+        pose = await self._wait_for(lambda: self.places.to_map(name, stamped, frame), deadline)
         return pose, _checked(name, cell_from_pose, pose, grid, frame)
 
     async def _wait_for(self, get: Callable[[], T], deadline: float = 0.0) -> T:

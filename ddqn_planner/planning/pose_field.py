@@ -9,8 +9,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.planning import pose_kernels as kernels
-from ddqn_planner.planning.pose_guide import Aim, heap_of, spread
-from ddqn_planner.planning.pose_kernels import Known
+from ddqn_planner.planning.pose_kernels import Aim, Known, heap_of
 from ddqn_planner.planning.pose_paths import SAME, Way
 from ddqn_planner.planning.pose_world import SHIFT, TILE, Body, State, World
 
@@ -19,7 +18,7 @@ HEAP = 2**18  # entries that a heap has room for, at least
 LOST = 1 / 2  # of the cost of the last start; if a repair takes more back, a new field is quicker
 UNGUIDED = 2**14  # states that are visited before a look at the map pays
 FINEST = 1  # the shift of the smallest tiles that it looks at
-NOWHERE = Aim(0, 0, -1, 1.0, np.empty(0, np.float32), SHIFT + 1, 0)
+NOWHERE = Aim(0, 0, -1, 1.0, np.empty((0, 0), np.float32), SHIFT + 1)
 GREEDY = 1.5  # the first round's weight is the bound to the power of this: mostly that will do
 
 
@@ -54,56 +53,51 @@ class PoseField:
         states, touched = tiles << kernels.TILE_BITS, np.zeros(tiles, np.bool_)
         self.known = Known(_untouched(states, np.float32), _untouched(states, np.uint8), touched)
         x, y, heading = self.goals.T
-        numbers = kernels.number_of(x, y, heading, world.columns)
+        numbers = kernels.number_of(x, y, heading, world)
         self.known.mark[numbers] = kernels.OPEN
         touched[numbers >> kernels.TILE_BITS] = True
         self._size, self._least = 0, math.inf
-
-    def number(self, state: State) -> int:
-        """Return the number of a state inside the map."""
-        return int(kernels.number_of(*state, self.world.columns))
 
     def reach(self, start: State, bound: float, limit: int) -> float | None:
         """Grow until the cost from a start is known within a bound, or known not to exist.
 
         Return the bound that is proved, or None if more states than the limit must be visited.
         """
-        number = self.number(start)
+        number = int(kernels.number_of(*start, self.world))
         if number != self._aim.number:
             known = self._aim if start[:2] == self._aim[:2] else NOWHERE
             self._aim = known._replace(x=start[0], y=start[1], number=number)
             self.visits = 0  # for this start
             self._order(bound**GREEDY)
-        while True:
-            proved = self._bound(number)
-            if proved <= bound * SAME or self._least == math.inf:
-                return proved
-            shift, most = self._aim.shift, limit
+        while (proved := self._proved()) > bound * SAME and self._least < math.inf:
+            if limit <= 0:
+                return None
             # Tiles of half the size take 4 times as long, and show that narrower gaps are closed.
             # Once a path is known, they hardly prove more.
-            if shift > SHIFT or (shift > FINEST and proved == math.inf):
-                until_look = (UNGUIDED << 3 * (SHIFT + 1 - shift)) - self.visits
-                most = min(limit, max(until_look, 0))
-            how = self._aim, 1.0 if self._aim.weight > 1 else 1 / bound, most, self.world, self.body
-            self._size, visits, done = kernels.grow(self.known, self._heap, self._size, *how)
+            shift = self._aim.shift - 1
+            if self.visits >= UNGUIDED << 3 * (SHIFT - shift) and (
+                shift == SHIFT or (shift >= FINEST and proved == math.inf)
+            ):
+                if proved == math.inf and not self._can_leave():
+                    return math.inf
+                self._look_at_map(shift)
+                self._order(self._aim.weight)
+                continue
+            share, most = 1.0 if self._aim.weight > 1 else 1 / bound, min(limit, UNGUIDED)
+            given = self.known, self._heap, self._size, self._aim, share, most
+            self._size, visits, done = kernels.grow(*given, self.world, self.body)
             limit, self.visits = limit - visits, self.visits + visits
             if done:
                 self._order(1.0)
-            elif limit == 0:
-                return None
             elif visits < most:  # the heap is full
                 self._order(self._aim.weight)
-            elif proved < math.inf or self._can_leave(number):
-                self._look_at_map()
-                self._order(self._aim.weight)
-            else:
-                return math.inf
+        return proved
 
-    def _bound(self, number: int) -> float:
+    def _proved(self) -> float:
         """Return how many times the least cost that of the aim may be."""
-        if self.known.mark[number] == kernels.UNREACHED:
+        if self.known.mark[self._aim.number] == kernels.UNREACHED:
             return math.inf
-        cost = float(self.known.distance[number])
+        cost = float(self.known.distance[self._aim.number])
         return cost / least if (least := min(self._least, cost)) else 1.0
 
     def _order(self, weight: float) -> None:
@@ -114,29 +108,29 @@ class PoseField:
         given = self.known, tiles, self._heap, self._aim, self.world
         self._size, self._least = kernels.order(*given)
 
-    def _can_leave(self, number: int) -> bool:
+    def _can_leave(self) -> bool:
         """Return whether primitives lead from the start to more than a few states."""
         mark, queue = _untouched(self.known.mark.size, np.uint8), np.empty(UNGUIDED, np.int64)
-        return bool(kernels.leads_to(number, mark, queue, self.world, self.body) == len(queue))
+        given = self._aim.number, mark, queue, self.world, self.body
+        return bool(kernels.leads_to(*given) == len(queue))
 
-    def _look_at_map(self) -> None:
-        """Look at the map for what is left to the start."""
-        shift, world = self._aim.shift - 1, self.world
-        side = 1 << shift
-        columns, rows = -(-world.width // side), -(-world.height // side)
-        room = world.room if shift == SHIFT else np.zeros(columns * rows, np.uint8)
-        left = np.empty((columns + 1) * (rows + 1), np.float32)
-        self._aim = self._aim._replace(left=left, shift=shift, columns=columns)
-        heap = heap_of(8 * left.size + 4)  # each corner opens its neighbours once
+    def _look_at_map(self, shift: int) -> None:
+        """Look at tiles of 2**shift cells of a side for what is left to the start."""
+        world = self.world
+        rows, columns = -(-world.height >> shift), -(-world.width >> shift)
+        room = world.room if shift == SHIFT else np.zeros((rows, columns), np.uint8)
+        left = np.empty((rows + 1, columns + 1), np.float32)
+        self._aim = self._aim._replace(left=left, shift=shift)
         x, y, _ = self.goals.T >> shift
-        is_goal = np.zeros(left.size, np.bool_)
-        is_goal[y * (columns + 1) + x] = True
+        is_goal = np.zeros(left.shape, np.bool_)
+        is_goal[y, x] = True
         box = np.array([x.min(), y.min(), x.max(), y.max()])
-        spread(self._aim, room, heap, is_goal, box, world, self.body)
+        heap = heap_of(8 * left.size + 4)  # each corner opens its neighbours once
+        kernels.look(self._aim, room, heap, is_goal, box, world, self.body)
 
     def rollout(self, start: State) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
         """Return the primitives from a start to a goal, and their costs; None without a way."""
-        number = self.number(start)
+        number = int(kernels.number_of(*start, self.world))
         if self.known.mark[number] == kernels.UNREACHED:
             return None
         most = int(self.known.distance[number] / self.body.cost.min()) + 1
@@ -152,17 +146,17 @@ class PoseField:
         reached = float(self.known.distance[self._aim.number])
         self._aim = NOWHERE if opens else self._aim._replace(number=-1)
         self.grid, self.world, self.way, touched = grid, world, None, self.known.touched
-        reach = self.body.reach + TILE
-        near = np.zeros((world.columns, world.rows), dtype=np.bool_)
-        low, high = np.unique(np.maximum(cells - reach, 0) // TILE, axis=0), 2 * reach // TILE + 1
-        for x, y in low:
-            near[x : x + high, y : y + high] = True
-        around, on_map = near.T.ravel(), (world, self.body)
-        least = kernels.least_unsupported(self.known, np.flatnonzero(around & touched), *on_map)
+        is_near, far = np.zeros(world.tile.shape, np.bool_), self.body.reach // TILE + 1
+        for x, y in np.unique(cells // TILE, axis=0).tolist():
+            is_near[max(y - far, 0) : y + far + 1, max(x - far, 0) : x + far + 1] = True
+        near = np.flatnonzero(is_near.ravel() & touched)
+        least = kernels.least_unsupported(self.known, near, world, self.body)
         if least < LOST * reached:
             self._begin(grid, world)
             return
         if least < math.inf:
-            kernels.look_again(self.known, np.flatnonzero(touched), least, False, *on_map)
+            tiles = np.flatnonzero(touched)
+            kernels.take_back(self.known, tiles, least, world, self.body)
         if opens:
-            kernels.look_again(self.known, np.flatnonzero(around), math.inf, True, *on_map)
+            mark = self.known.mark.reshape(world.tile.size, -1)
+            mark[near] = np.minimum(mark[near], kernels.OPEN)

@@ -7,12 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place
-from ddqn_planner.grid import MOVES, GridMap
-from ddqn_planner.grid.footprint import inside
+from ddqn_planner.grid import GridMap
+from ddqn_planner.grid.footprint import inside, outline
 from ddqn_planner.grid.grid_map import MULTIPLIERS
 from ddqn_planner.grid.motions import BEHIND, TURN, turn_between
 from ddqn_planner.planning.plan import PlanStatus, PosePlan
 from ddqn_planner.planning.pose_world import body_costs, occupied_for_body
+from ddqn_planner.planning.segments import BITS
 
 Float64 = NDArray[np.float64]
 Body = tuple[Float64, Float64]
@@ -35,36 +36,32 @@ class Way(NamedTuple):
     def plan(self, first: int, grid: GridMap) -> PosePlan:
         """Return the plan along the poses from one on."""
         cost, least = float(self.spent[-1] - self.spent[first]), self.least - self.spent[first]
-        bound = max(cost / least, 1.0) if cost > least * SAME else 1.0
-        way = self.poses[first:], self.cells[first:]
-        return plan_along(*way, grid, cost * (grid.seconds_per_cell or 1.0), bound)
+        return plan_along(self.poses[first:], self.cells[first:], grid, cost, least)
 
 
 def plan_along(
-    poses: Float64, cells: NDArray[np.int32], grid: GridMap, cost: float, bound: float
+    poses: Float64, cells: NDArray[np.int32], grid: GridMap, cost: float, least: float
 ) -> PosePlan:
-    """Return the plan of a path of poses that lie in cells."""
+    """Return the plan of a path of poses that lie in cells, of a cost and the least one proved."""
     poses.flags.writeable = False
+    bound = max(cost / least, 1.0) if least > 0 else math.inf
     return PosePlan(
         PlanStatus.SUCCEEDED,
         cells[np.append(True, (cells[1:] != cells[:-1]).any(axis=1))],
-        cost=cost,
+        cost=cost * (grid.seconds_per_cell or 1.0),
         goal=(int(cells[-1, 0]), int(cells[-1, 1])),
         poses=poses,
         driven=float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum()) / grid.resolution,
-        bound=bound,
+        bound=bound if cost > least * SAME else 1.0,
     )
 
 
-def points_of(corners: Float64, resolution: float) -> tuple[Float64, Float64]:
+def points_of(corners: Float64, resolution: float) -> Body:
     """Return points along the sides of a footprint, (M, 2), and inside it, in cells."""
     body = corners / resolution
-    columns, rows = (np.arange(axis.min(), axis.max(), WITHIN) for axis in body.T)
-    filled = np.column_stack([axis.ravel() for axis in np.meshgrid(columns, rows)])
-    sides = zip(body, np.roll(body, -1, axis=0), strict=True)
-    counts = [(a, b, math.ceil(math.dist(a, b) / BETWEEN)) for a, b in sides]
-    outline = [np.linspace(a, b, count, endpoint=False) for a, b, count in counts]
-    return np.concatenate(outline), filled[inside(filled, body)]
+    axes = (np.arange(axis.min(), axis.max(), WITHIN) for axis in body.T)
+    filled = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    return outline(body, BETWEEN), filled[inside(filled, body)]
 
 
 def in_cells(poses: Float64, grid: GridMap) -> Float64:
@@ -84,26 +81,18 @@ def nearest_pose(poses: Float64, robot: Any, grid: GridMap, reach: tuple[float, 
     return int(far.argmin()) if is_near.any() else -1
 
 
-def rest_of_poses(
-    way: Any, robot: Any, grid: GridMap, body: Body, reach: tuple[float, float] = REACH
-) -> Float64:
-    """Return a path from the pose nearest to a robot on; empty if it is far, or has no room."""
-    poses: Float64 = np.asarray(way, dtype=np.float64).reshape(-1, 3)
-    first = nearest_pose(poses, robot, grid, reach)
-    if first < 0:
-        return poses[:0]
-    path = in_cells(poses[first:], grid)
-    cells = cells_of(path)
+def is_free(poses: Float64, grid: GridMap, body: Body) -> bool:
+    """Return whether a body has room along a path, and leaves no cell as it forbids."""
+    path = in_cells(poses, grid)
     occupied, (outline, within) = occupied_for_body(grid).view(np.uint8), body
     # What is inside the body at a later pose has come through its outline.
     if touches(path, outline, occupied) or touches(path[:1], within, occupied):
-        return poses[:0]
-    if grid.forbidden is not None:
-        actions = {tuple(move): 1 << action for action, move in enumerate(MOVES.tolist())}
-        leaves = [actions.get(tuple(step), 0) for step in np.diff(cells, axis=0).tolist()]
-        if (grid.forbidden[cells[:-1, 1], cells[:-1, 0]] & np.array(leaves, np.uint8)).any():
-            return poses[:0]
-    return poses[first:]
+        return False
+    if grid.forbidden is None:
+        return True
+    x, y = cells_of(path).T
+    leaves = BITS[np.clip(np.diff(y), -1, 1) + 1, np.clip(np.diff(x), -1, 1) + 1]
+    return not (grid.forbidden[y[:-1], x[:-1]] & leaves).any()
 
 
 def cells_of(path: Float64) -> NDArray[np.int32]:
@@ -138,8 +127,7 @@ def touches(path: Float64, points: Float64, occupied: NDArray[np.uint8]) -> bool
             over, up = points[point, 0], points[point, 1]
             column = math.floor(x + cos * over - sin * up)
             line = math.floor(y + sin * over + cos * up)
-            if column < 0 or line < 0 or line >= occupied.shape[0] or column >= occupied.shape[1]:
-                return True
-            if occupied[line, column] != 0:
+            is_inside = 0 <= column < occupied.shape[1] and 0 <= line < occupied.shape[0]
+            if not is_inside or occupied[line, column]:
                 return True
     return False

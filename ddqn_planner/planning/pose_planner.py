@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import compress
@@ -79,65 +79,68 @@ class PosePlanner:
 
     def steps(self, request: PoseRequest) -> Iterator[PosePlan | None]:
         """Yield None before each slow step, and last the plan."""
-        began, grid = time.perf_counter(), request.grid
         with self._lock:
-            rest = self._rest_of_path(request)
-        if rest is not None:
-            yield self._keep_or_switch(request, rest)
-            return
+            plan = self._rest_of_path(request)
+        if plan is None:
+            plan = yield from self._find(request, time.perf_counter())
+        is_outside = plan.status in (PlanStatus.START_OUTSIDE_MAP, PlanStatus.GOAL_OUTSIDE_MAP)
+        has_path = len(request.under_way) > 0 and not is_outside
+        yield self._keep_or_switch(request, plan) if has_path else plan
+
+    def _find(self, request: PoseRequest, began: float) -> Generator[None, None, PosePlan]:
+        """Return a new plan, after None before each slow step."""
+        grid = request.grid
         self._check(grid)
         is_start_inside, *inside = (grid.contains(cell) for cell in request.cells)
-        if not is_start_inside or not any(inside):
-            outside = PlanStatus.START_OUTSIDE_MAP if any(inside) else PlanStatus.GOAL_OUTSIDE_MAP
-            yield PosePlan(outside)
-            return
-        yield None
+        if not any(inside):
+            return PosePlan(PlanStatus.GOAL_OUTSIDE_MAP)
+        if not is_start_inside:
+            return PosePlan(PlanStatus.START_OUTSIDE_MAP)
+        yield
         with self._lock:
             world = self._world(grid)
         starts = self._at(grid, request.start, world)
         if not len(starts):
-            yield self._keep_or_switch(request, PosePlan(PlanStatus.START_OCCUPIED))
-            return
-        ((x, y, heading),) = starts.tolist()
-        start = x, y, heading
+            return PosePlan(PlanStatus.START_OCCUPIED)
+        start: State = tuple(starts[0].tolist())
         goals = compress(request.goals, inside)
-        exact = np.concatenate([self._at(grid, goal, world) for goal in goals])
+        states = np.concatenate([self._at(grid, goal, world) for goal in goals])
         plan = PosePlan(PlanStatus.GOAL_OCCUPIED)
         for may_move in (False, True) if any(request.tolerance) else (False,):
-            states = self._around(request, start, world) if may_move else exact
+            states = self._around(request, start, world) if may_move else states
             if not len(states):
                 continue
             while (found := self._grow(request, states, start, began)) is None:
-                yield None
+                yield
             plan = found
             if plan.poses.size:
                 break
-        yield self._keep_or_switch(request, plan)
+        return plan
 
     def rest_of(
-        self, poses: Any, robot: Pose, grid: GridMap, reach: tuple[float, float] = paths.REACH
+        self, way: Any, robot: Any, grid: GridMap, reach: tuple[float, float] = paths.REACH
     ) -> NDArray[np.float64]:
         """Return a path from the pose nearest to a robot on; empty if it is far, or has no room."""
-        return paths.rest_of_poses(poses, robot, grid, self.points, reach)
+        poses: NDArray[np.float64] = np.asarray(way, dtype=np.float64).reshape(-1, 3)
+        first = paths.nearest_pose(poses, robot, grid, reach)
+        rest = poses[first:] if first >= 0 else poses[:0]
+        return rest if paths.is_free(rest, grid, self.points) else poses[:0]
 
     def _keep_or_switch(self, request: PoseRequest, plan: PosePlan) -> PosePlan:
         """Return the rest of the path under way if it hardly costs more than a plan, or that."""
-        if not len(request.under_way):
-            return plan
         has_plan, grid = plan.poses.size > 0, request.grid
         reach = paths.REACH if has_plan else BESIDE_PATH
         rest = self.rest_of(request.under_way, request.start, grid, reach)
         if not any(_meets(rest[-1:], end, grid) for end in (*plan.poses[-1:], *request.goals)):
             return plan
-        cost, least = (paths.cost_of_poses(way, grid) for way in (rest, plan.poses))
-        if has_plan and cost > (1 + request.switch_threshold) * least * SAME_COST:
+        cost, new = (paths.cost_of_poses(way, grid) for way in (rest, plan.poses))
+        if has_plan and cost > (1 + request.switch_threshold) * new * SAME_COST:
             return plan
-        share = cost / least if least else 1.0
-        new_cost, bound = plan.cost or 0.0, plan.bound
-        if not has_plan:  # nothing is proved
-            new_cost, bound = cost * (grid.seconds_per_cell or 1.0), math.inf
-        way = rest, paths.cells_of(paths.in_cells(rest, grid)), grid
-        kept = paths.plan_along(*way, new_cost * share, max(bound * share, 1.0))
+        share, least = cost / new if new else 1.0, 0.0  # without a plan nothing is proved
+        if has_plan:
+            cost = share * (plan.cost or 0.0) / (grid.seconds_per_cell or 1.0)
+            least = cost / (share * plan.bound)
+        kept = paths.plan_along(rest, paths.cells_of(paths.in_cells(rest, grid)), grid, cost, least)
         ms = plan.field_ms, plan.rollout_ms
         return replace(kept, extra_cost=share - 1, field_ms=ms[0], rollout_ms=ms[1])
 
@@ -195,13 +198,10 @@ class PosePlanner:
 
     def _world(self, grid: GridMap) -> World:
         """Return a map for kernels, from the last one where that is quicker."""
-        found = None if self._map is None else self._differences(self._map[0], grid)
-        if self._map is None or found is None:
-            world = world_of(grid)
-        else:
-            world = world_of(grid, self._map[1], found[0]) if len(found[0]) else self._map[1]
-        self._map = grid, world
-        return world
+        found = self._differences(self._map[0], grid) if self._map else None
+        older = (self._map[1], found[0]) if self._map and found else ()
+        self._map = grid, world_of(grid, *older)
+        return self._map[1]
 
     def _field(self, request: PoseRequest, states: NDArray[np.int64]) -> PoseField:
         """Return a field toward some states: as it is, repaired, or new."""

@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ddqn_planner.compiled import in_place, inlined
-from ddqn_planner.grid import MOVES, GridMap
+from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import OCCUPIED
 from ddqn_planner.grid.copies import few_of
-from ddqn_planner.grid.footprint import rows_of
 from ddqn_planner.grid.grid_map import MULTIPLIERS
 from ddqn_planner.grid.motions import HEADINGS, Motions, closer
 from ddqn_planner.planning.field import CHANGED_SHARE, overlap, shift_between
+from ddqn_planner.planning.segments import BITS
 
 SHIFT: Final = 2  # so many bits tell where in its tile a cell lies, along a side
 TILE: Final = 1 << SHIFT  # cells of a side
@@ -37,12 +37,13 @@ class Body(NamedTuple):
     end: NDArray[np.int64]  # (P,)
     offset: NDArray[np.int64]  # (P, 2)
     cost: NDArray[np.float32]  # (P,)
-    row: NDArray[np.int64]  # (R, 3): y, first x, cells: the swept cells, at most 64 in one row
+    row: NDArray[np.int64]  # (R, 2): y and x of the first of 64 swept cells in a row, or fewer
+    bits: NDArray[np.uint64]  # (R,): which of them
     first: NDArray[np.int64]  # (P + 35,): where the rows of each begin
     passed: NDArray[np.int64]  # (C, 3): x, y, bit of the action by which the origin leaves the cell
     share: NDArray[np.float32]  # (C,): which part of the cost counts in this cell
     first_passed: NDArray[np.int64]  # (P + 1,)
-    reach: int  # cells that a primitive sweeps to any side, at most
+    reach: int  # cells that a primitive sweeps to any side of its begin or end, at most
 
 
 class World(NamedTuple):
@@ -52,12 +53,10 @@ class World(NamedTuple):
     cost: NDArray[np.int8]  # (H, W)
     slowness: NDArray[np.float32]  # (H, W)
     forbidden: NDArray[np.uint8]  # (H, W)
-    tile: NDArray[np.uint8]  # (T,): whether the body can reach an occupied cell, once it is known
-    room: NDArray[np.uint8]  # (T,): whether the body may pass one of its cells, likewise
+    tile: NDArray[np.uint8]  # by tile: whether the body can reach an occupied cell, once known
+    room: NDArray[np.uint8]  # by tile: whether the body may pass one of its cells, likewise
     height: int
     width: int
-    rows: int  # of tiles
-    columns: int
 
 
 def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
@@ -65,16 +64,20 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
     start, end, headings = motions.start, motions.end, np.arange(HEADINGS + 1)
     passed = [_passed(poses) for poses in motions.poses]
     standing, core = np.ones((2, HEADINGS, *swept.shape[1:]), dtype=np.bool_)
+    either = swept.any(axis=0)
     for mask, before, after, (x, y), (cells, _) in zip(
         swept, start, end, motions.offset, passed, strict=True
     ):
         standing[before] &= mask
-        standing[after] &= np.roll(mask, (-y, -x), axis=(0, 1))
+        around_end = np.roll(mask, (-y, -x), axis=(0, 1))
+        standing[after] &= around_end
+        either |= around_end
         for over, up, _ in cells:
             core[before] &= np.roll(mask, (-up, -over), axis=(0, 1))
-    row, first = rows_of(np.concatenate([swept, standing, core, core.all(axis=0, keepdims=True)]))
-    reach = int(np.abs(np.argwhere(swept.any(axis=0)) - len(swept[0]) // 2).max())
-    around, _ = rows_of(np.ones((1, 2 * reach + TILE + 1, 2 * reach + TILE + 1), dtype=np.bool_))
+    reach = int(np.abs(np.argwhere(either) - swept.shape[1] // 2).max())
+    around = np.ones((1, 2 * reach + TILE + 1, 2 * reach + TILE + 1), dtype=np.bool_)
+    parts = [rows_of(masks) for masks in (swept, standing, core, core.all(axis=0)[None], around)]
+    row, bits, counts = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     ending = np.argsort(end, kind="stable")
     return Body(
         into=np.searchsorted(end[ending], headings),
@@ -84,13 +87,26 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
         end=end,
         offset=motions.offset,
         cost=motions.cost,
-        row=np.concatenate([row, around]),
-        first=np.append(first, len(row) + len(around)),
+        row=row,
+        bits=bits,
+        first=np.cumsum([0, *counts]),
         passed=np.concatenate([cells for cells, _ in passed]),
         share=np.concatenate([share for _, share in passed]).astype(np.float32),
         first_passed=np.cumsum([0, *(len(share) for _, share in passed)]),
         reach=reach,
     )
+
+
+def rows_of(
+    masks: NDArray[np.bool_],
+) -> tuple[NDArray[np.int64], NDArray[np.uint64], NDArray[np.int64]]:
+    """Return rows of 64 cells (R, 2): y, first x; which of them are in masks; how many of each."""
+    reach, width = masks.shape[-1] // 2, -masks.shape[-1] % 64
+    whole = np.pad(masks, ((0, 0), (0, 0), (0, width)))
+    words = np.packbits(whole, axis=-1, bitorder="little").view("<u8")
+    number, y, word = np.nonzero(words)
+    counts = np.bincount(number, minlength=len(masks))
+    return np.column_stack([y, 64 * word]) - reach, words[number, y, word], counts
 
 
 def _passed(poses: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -102,9 +118,8 @@ def _passed(poses: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.f
     cells = np.floor(middle + 0.5).astype(np.int64)
     begins = np.flatnonzero(np.r_[True, (cells[1:] != cells[:-1]).any(axis=1)])
     share = np.add.reduceat(length, begins) / length.sum()
-    cells = cells[begins]
-    leaves = [1 << MOVES.tolist().index(step) for step in np.diff(cells, axis=0).tolist()]
-    return np.column_stack([cells, [*leaves, 0]]), share
+    x, y = np.diff(cells[begins], axis=0).T
+    return np.column_stack([cells[begins], [*BITS[y + 1, x + 1], 0]]), share
 
 
 def occupied_for_body(grid: GridMap) -> NDArray[np.bool_]:
@@ -132,24 +147,21 @@ def world_of(
     """Return a map for kernels: from scratch, or from an older one that differs in cells (N, 2)."""
     occupied = occupied_for_body(grid)
     height, width = occupied.shape
-    words = (width + 2 * BORDER + 63) // 64 + 1
-    bits = np.full((height + 2 * BORDER, words), -1, np.int64) if older is None else older.bits
-    bits = bits.view(np.uint64).copy()
-    looks = np.zeros((2, -(-height // TILE), -(-width // TILE)), dtype=np.uint8)
-    (left, bottom), (right, top) = (0, 0), (width, height)
-    if older is not None and cells is not None:
+    if older is not None and cells is not None and not len(cells):
+        return older
+    if older is None or cells is None:
+        bits = np.full((height + 2 * BORDER, (width + 2 * BORDER + 63) // 64 + 1), FULL)
+        tile, room = np.zeros((2, -(-height // TILE), -(-width // TILE)), dtype=np.uint8)
+        (left, bottom), (right, top) = (0, 0), (width, height)
+    else:
+        bits, tile, room = older.bits.copy(), older.tile.copy(), older.room.copy()
         (left, bottom), (right, top) = cells.min(axis=0), cells.max(axis=0) + 1
-        looks[:] = np.reshape((older.tile, older.room), looks.shape)
-    line = np.ones((top - bottom, 64 * words), dtype=np.bool_)
+        x, y = np.maximum([left - BORDER, bottom - BORDER], 0) // TILE
+        near = slice(y, (top + BORDER) // TILE + 1), slice(x, (right + BORDER) // TILE + 1)
+        tile[near] = room[near] = 0
+    line = np.ones((top - bottom, 64 * bits.shape[1]), dtype=np.bool_)
     line[:, BORDER : BORDER + width] = occupied[bottom:top]
-    packed = np.packbits(line, axis=1, bitorder="little").view("<u8")
-    bits[BORDER + bottom : BORDER + top] = packed
-    rows, columns = (
-        slice(max(first - BORDER, 0) // TILE, (last + BORDER) // TILE + 1)
-        for first, last in ((bottom, top), (left, right))
-    )
-    looks[:, rows, columns] = 0
-    tile, room = looks.reshape(2, -1)
+    bits[BORDER + bottom : BORDER + top] = np.packbits(line, axis=1, bitorder="little").view("<u8")
     return World(
         bits,
         _layer(body_costs(grid), np.int8),
@@ -159,7 +171,6 @@ def world_of(
         room,
         height,
         width,
-        *looks.shape[1:],
     )
 
 
@@ -193,15 +204,9 @@ def touches(x: int, y: int, mask: int, world: Any, body: Any) -> bool:
         seen = world.bits[line, word] >> place
         # Two shifts, as one by 64 has no meaning.
         seen |= (world.bits[line, word + ONE] << ONE) << (LAST_BIT - place)
-        if seen & (FULL >> np.uint64(64 - body.row[number, 2])):
+        if seen & body.bits[number]:
             return True
     return False
-
-
-@inlined
-def tile_of(x: int, y: int, columns: int) -> int:
-    """Return the number of the tile in which a cell lies."""
-    return (y >> SHIFT) * columns + (x >> SHIFT)
 
 
 @inlined
@@ -213,11 +218,11 @@ def is_inside(x: int, y: int, world: Any) -> bool:
 @inlined
 def is_far(x: int, y: int, world: Any, body: Any) -> bool:
     """Return whether no occupied cell is within reach of a tile; looks at most once."""
-    tile = tile_of(x, y, world.columns)
-    if world.tile[tile] == 0:
+    row, column = y >> SHIFT, x >> SHIFT
+    if world.tile[row, column] == 0:
         x, y = (x & -TILE) + TILE // 2, (y & -TILE) + TILE // 2
-        world.tile[tile] = 2 if touches(x, y, body.first.size - 2, world, body) else 1
-    return bool(world.tile[tile] == 1)
+        world.tile[row, column] = 2 if touches(x, y, body.first.size - 2, world, body) else 1
+    return bool(world.tile[row, column] == 1)
 
 
 @inlined

@@ -84,11 +84,11 @@ class PropagationLearner:
 
     def update(self, batch: Transitions, number: int) -> None:
         """Make an update, of this number, with a gradient by hand: in half of autograd's time."""
-        count, target = len(batch.cell), self.environment.parameters.target
+        count, p = len(batch.cell), self.environment.parameters
         states = np.tile(batch.scenario, 2), np.concatenate([batch.cell, batch.next_cell])
         q_2BA, gain_2BA, activations = self._evaluate(*states)
         q = self._q_SCA[batch.scenario, batch.next_cell], q_2BA.numpy()
-        gradient_BA = torch.from_numpy(double_dqn_gradient(target, batch, *q))
+        gradient_BA = torch.from_numpy(double_dqn_gradient(p.target, batch, *q))
         *inputs, p_BA = (activation[:count] for activation in activations)
         by_gain_BA = gradient_BA * p_BA
         by_output = by_gain_BA * (1 - p_BA) * gain_2BA[:count]
@@ -102,7 +102,11 @@ class PropagationLearner:
             gradients |= _gradients(layer, by_output, input_BF)
             by_input_BF = by_output @ self._online[f"{layer}.weight"]
             by_output = torch.ops.aten.threshold_backward(by_input_BF, input_BF, 0)
-        _take_step(self._parts, gradients, number, self.environment.parameters.learning_rate)
+        _take_step(self._parts, gradients, number, p.learning_rate)
+        if number % p.target_interval == 0:
+            for name, tensor in self._target.items():
+                tensor.copy_(self._online[name])
+            self.settle()
 
 
 def _take_step(parts: Sequence[Tensors], gradients: Tensors, number: int, rate: float) -> None:

@@ -64,12 +64,9 @@ class Trainer:
         known = {**asdict(parameters), "height": height, "width": width}
         sizes = {name: known[name] for name in network_class.size_names}
         first = _initial_tensors(network_class.shapes(sizes), int(weights.generate_state(1)[0]))
-        self.network = network_class(sizes, {name: t.numpy() for name, t in first.items()})
-        target = {name: tensor.clone().numpy() for name, tensor in first.items()}
-        mean, square = (
-            {name: torch.zeros_like(tensor).numpy() for name, tensor in first.items()}
-            for _ in range(2)
-        )
+        self.network = network_class(sizes, first)
+        copies = np.copy, np.zeros_like, np.zeros_like
+        target, mean, square = ({name: copy(t) for name, t in first.items()} for copy in copies)
         # The networks θ and θ⁻, and Adam's moments of the gradient: all that an update changes.
         self._parts = self.network.tensors, target, mean, square
         self._replay = ReplayBuffer(parameters.replay_capacity)
@@ -124,21 +121,11 @@ class Trainer:
         before, self.steps = self.steps, self.steps + p.environments
         if self.steps > p.learning_starts:
             for _ in range(self.steps // p.update_interval - before // p.update_interval):
-                self._update()
+                self.updates += 1
+                batch = self._replay.sample(p.batch_size, self._sampling)
+                self._learner.update(batch, self.updates)
         self._total_reward += reward
         return e.cell[None], terminated, truncated
-
-    def _update(self) -> None:
-        """Make one Double DQN update with a batch from the replay buffer."""
-        p = self.parameters
-        batch = self._replay.sample(p.batch_size, self._sampling)
-        self.updates += 1
-        self._learner.update(batch, self.updates)
-        if self.updates % p.target_interval == 0:
-            online, target, *_ = self._parts
-            for name, tensor in target.items():
-                tensor[:] = online[name]
-            self._learner.settle()
 
     def _end_episodes(
         self, ended: NDArray[np.bool_], terminated: NDArray[np.bool_]
@@ -179,10 +166,6 @@ class Trainer:
             raise ValueError(f"the training diverged, and nothing more is saved; {remedy}")
         planner = self.planner()
         return model_bytes(planner.network, planner.metadata)
-
-    def save_model(self, path: str | Path) -> None:
-        """Write what `model_bytes` returns to a file."""
-        write_atomically(Path(path), self.model_bytes())
 
     def save_checkpoint(self, path: str | Path) -> None:
         """Write all that `load_checkpoint` needs; after an OSError, an old file is unchanged."""
@@ -259,15 +242,15 @@ class Trainer:
         return tensors | {"total_reward": self._total_reward}
 
 
-def _initial_tensors(shapes: Mapping[str, tuple[int, ...]], seed: int) -> dict[str, torch.Tensor]:
+def _initial_tensors(shapes: Mapping[str, tuple[int, ...]], seed: int) -> dict[str, Any]:
     """Draw weights and biases as torch does for its layers."""
     generator, tensors = torch.Generator().manual_seed(seed), {}
     for name, shape in shapes.items():
         layer, _, _ = name.partition(".")
         most = math.prod(shapes[f"{layer}.weight"][1:]) ** -0.5
-        tensors[name] = torch.empty(shape).uniform_(-most, most, generator=generator)
+        tensors[name] = torch.empty(shape).uniform_(-most, most, generator=generator).numpy()
         if name == "prices.bias":  # a cost multiplier below 1 has no gradient: it must begin above
-            tensors[name].fill_(1)
+            tensors[name][:] = 1
     return tensors
 
 

@@ -11,7 +11,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ddqn_planner.grid.footprint import read_footprint, rows_of, swept_cells
+from ddqn_planner.grid.footprint import read_footprint, swept_cells
 from ddqn_planner.grid.motions import Motion, make_motions, read_lattice, turn_between
 
 ARROW = "[[0.4, 0], [-0.3, 0.3], [-0.1, 0], [-0.3, -0.3]]"
@@ -116,18 +116,6 @@ def test_swept_cells_are_those_that_a_polygon_touches(footprint: str) -> None:
         mask = swept[number].ravel()
         assert not (touched & ~mask).any()
         assert not (mask & ~near).any()
-
-
-@given(st.integers(0, 2**32 - 1))
-def test_rows_are_the_swept_cells_again(seed: int) -> None:
-    swept = np.random.default_rng(seed).random((3, 9, 9)) < 0.5
-    rows, first = rows_of(np.pad(swept, ((0, 0), (0, 0), (40, 40)), constant_values=True))
-    again = np.zeros((3, 9, 89), np.bool_)
-    for number in range(3):
-        for y, x, count in rows[first[number] : first[number + 1]]:
-            assert count <= 64
-            again[number, y + 44, x + 44 : x + 44 + count] = True
-    assert np.array_equal(again[:, :, 40:49], swept)
 
 
 @pytest.mark.parametrize(

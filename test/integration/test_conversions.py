@@ -36,7 +36,7 @@ from ddqn_planner.nodes.conversions import (
     turns,
     value_message,
 )
-from ddqn_planner.nodes.poses import Frames, StartSource, transformed
+from ddqn_planner.nodes.poses import Frames, Places, transformed
 from ddqn_planner.nodes.report import Refusals, RequestError
 from ddqn_planner.planning import QField
 
@@ -243,7 +243,7 @@ NOW = 111  # seconds of the node's clock
 
 
 class Node:
-    """What `Frames`, `StartSource` and `Refusals` ask of a node."""
+    """What `Places` and `Refusals` ask of a node."""
 
     def __init__(self, source: str = "tf") -> None:
         self.after_jump_back: list[Callable[[], None]] = []
@@ -270,14 +270,14 @@ class Node:
 def listening(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Frames]:
     """Return what makes frames that know the transforms of some seconds."""
 
-    def make(*seconds: int, tolerance: float = 20.0) -> Frames:
+    def make(*seconds: int) -> Frames:
         listener = SimpleNamespace(group=SimpleNamespace())
         fields = {"TransformListener": lambda *_, **__: listener, "TransformException": KeyError}
         fields["__spec__"] = object  # it is installed
         tf2_ros = SimpleNamespace(Buffer=lambda: Buffer(*seconds), **fields)
         monkeypatch.setitem(sys.modules, "tf2_ros", tf2_ros)
         monkeypatch.setattr(Frames, "_read", lambda _: None)
-        return Frames(Node(), lambda: tolerance)
+        return Frames(Node(), lambda: 20.0)
 
     return make
 
@@ -317,16 +317,16 @@ def test_a_pose_is_transformed_by_the_transform_of_its_time_or_refused(listening
 def test_a_newest_transform_beyond_the_tolerance_is_not_used(listening: Any) -> None:
     late = {NOW - 6: "6 s old", NOW + 6: "6 s in the future"}
     for stamp, words in (late | dict.fromkeys((NOW - 2, NOW + 2, 0), "")).items():
-        frames = listening(stamp, tolerance=5.0)
+        listening(stamp)
         node = Node()
-        start = StartSource(node, frames, Refusals(node), lambda: "map", lambda: None)
-        goal_in_map = partial(frames.to_map, "the goal", pose_at(0), "map")
+        places = Places(node, Refusals(node), lambda: "map", lambda: None)
+        goal_in_map = partial(places.to_map, "the goal", pose_at(0), "map")
         if words:
             why = f"(the newest is {words}, more than transform_tolerance, 5 s)"
-            assert f"'odom' to 'map' {why}" in refusal("NO_START", start.pose)
+            assert f"'odom' to 'map' {why}" in refusal("NO_START", places.start)
             assert why in refusal("TF_ERROR", goal_in_map)
         else:
-            assert start.pose().pose.position.x == 1.0
+            assert places.start().pose.position.x == 1.0
             assert goal_in_map().header.stamp.sec == stamp
 
 
@@ -348,15 +348,16 @@ def test_a_set_start_outlives_a_jump_of_the_clock_and_odometry_does_not(
     listening: Any, source: str, stays: bool
 ) -> None:
     node, pose = Node(source), pose_at(NOW, "map")
-    start = StartSource(node, listening(), Refusals(node), lambda: "map", lambda: None)
-    start._take(pose)
-    assert start.pose() is pose
+    listening()
+    places = Places(node, Refusals(node), lambda: "map", lambda: None)
+    places._take(pose)
+    assert places.start() is pose
     for forget in node.after_jump_back:
         forget()
     if stays:
-        assert start.pose() is pose
+        assert places.start() is pose
     else:
-        assert "nothing came on odom" in refusal("NO_START", start.pose)
+        assert "nothing came on odom" in refusal("NO_START", places.start)
 
 
 def test_other_frames_are_refused_without_tf_and_the_remedy_names_it(listening: Any) -> None:

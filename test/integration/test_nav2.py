@@ -242,17 +242,12 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
         def fail(*_: Any) -> GridMap:
             raise MemoryError
 
-        # A path that is planned while its form is set is not kept.
-        planned = node._requests.plan
-
-        async def plan_and_set(*asked: Any) -> Outcome:
-            outcome = await planned(*asked)
-            node.set_parameters([Parameter("path_simplification", value="none")])
-            return outcome
-
-        node._requests.plan = plan_and_set
-        run(node._plan_for_action(ends[0], [ends[1]], "", lambda: None))
-        assert len(node._followed.path) == 0
+        # A path of another form is not kept.
+        node.set_parameters([Parameter("switch_threshold", value=1.0)])
+        for form, is_kept in (("straight", True), ("line_of_sight", True), ("none", False)):
+            node.set_parameters([Parameter("path_simplification", value=form)])
+            _, outcome = run(node._plan_for_action(ends[0], [ends[1]], "", lambda: None))
+            assert (outcome.plan.extra_cost is not None) == is_kept
 
         # A path that cannot be checked is not valid, and the node lives.
         request, validity = SimpleNamespace(path=PathMessage()), SimpleNamespace()

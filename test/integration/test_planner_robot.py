@@ -96,10 +96,10 @@ def test_a_start_on_an_obstacle_or_deep_in_one_is_told(robot: Robot, hall: np.nd
     ):
         robot.reset(**parameters)
         robot.set_map(robot.stamped_map(values))
-        robot.node.forget_log()
+        robot.clear()
         path = robot.get_plan(robot.pose((10, 4)), robot.pose((0, 0)))
         assert bool(path.poses) == reason.startswith(";")
-        robot.node.wait_for_log(reason)
+        robot.wait_for_reason(reason)
 
 
 def test_a_goal_moves_within_the_tolerance_of_the_request(robot: Robot, hall: np.ndarray) -> None:

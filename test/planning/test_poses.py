@@ -22,10 +22,10 @@ from ddqn_planner.grid.motions import Motions, make_motions, turn_between
 from ddqn_planner.planning import pose_field
 from ddqn_planner.planning.plan import PlanStatus, PosePlan
 from ddqn_planner.planning.planner import last_step
-from ddqn_planner.planning.pose_guide import way_left
+from ddqn_planner.planning.pose_kernels import way_left
 from ddqn_planner.planning.pose_paths import cost_of_poses
 from ddqn_planner.planning.pose_planner import Pose, PosePlanner, PoseRequest
-from ddqn_planner.planning.pose_world import State, world_of
+from ddqn_planner.planning.pose_world import State, rows_of, world_of
 
 CELL = 0.1
 SQUARE = (0, 0), (0, 2), (2, 2), (2, 0)
@@ -142,8 +142,8 @@ def test_what_the_map_tells_changes_no_least_path(seed: int, goals: int, monkeyp
 def test_a_core_is_what_all_motions_sweep_around_each_cell_of_the_origin(motion: str) -> None:
     body, cells = planner(motion).body, []
     for begin, end in pairwise(body.first.tolist()):
-        rows = body.row[begin:end].tolist()
-        cells.append({(x + i, y) for y, x, length in rows for i in range(length)})
+        rows = zip(body.row[begin:end].tolist(), body.bits[begin:end].tolist(), strict=True)
+        cells.append({(x + i, y) for (y, x), bits in rows for i in range(64) if bits >> i & 1})
     for heading in range(16):
         swept_around = [
             {(x - over, y - up) for x, y in cells[primitive]}
@@ -151,6 +151,17 @@ def test_a_core_is_what_all_motions_sweep_around_each_cell_of_the_origin(motion:
             for over, up, _ in body.passed[slice(*body.first_passed[primitive : primitive + 2])]
         ]
         assert cells[body.start.size + 16 + heading] == set.intersection(*swept_around)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_rows_are_the_swept_cells_again(seed: int) -> None:
+    swept = np.random.default_rng(seed).random((3, 89, 89)) < 0.1
+    rows, bits, counts = rows_of(swept)
+    again, numbers = np.zeros((3, 89, 128), np.bool_), np.repeat(np.arange(3), counts)
+    for number, (y, x), seen in zip(numbers, rows, bits.tolist(), strict=True):
+        again[number, y + 44, x + 44 : x + 108] = [seen >> i & 1 for i in range(64)]
+    assert np.array_equal(again[:, :, :89], swept)
+    assert not again[:, :, 89:].any()
 
 
 @settings(max_examples=10)
@@ -168,8 +179,8 @@ def test_what_the_map_tells_is_left_at_least(motion: str, seed: int) -> None:
     field = pose_field.PoseField(np.array([(43, 29, 0)]), grid, world, body)
     field._aim = field._aim._replace(x=x, y=y)
     best = least_costs(grid, motions, swept, (x, y, heading))
-    for _ in ("tiles of 4 cells", "tiles of 2 cells"):
-        field._look_at_map()
+    for shift in (2, 1):  # tiles of 4 cells, and of 2
+        field._look_at_map(shift)
         for row, column, _ in np.argwhere(np.isfinite(best)):
             left = way_left(column, row, field._aim)
             assert left <= best[row, column].min() + 1e-3

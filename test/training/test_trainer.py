@@ -162,7 +162,7 @@ def test_a_saved_model_plans_as_its_trainer(small: Scenario, tmp_path: Path) -> 
     other = replace(small, grid=GridMap(np.zeros((4, 5))))
     trainer = Trainer([small, other], MoveRule.UNIT, replace(QUICK, gamma=0.8), seed=3)
     train(trainer, 2)
-    trainer.save_model(tmp_path / "model.safetensors")
+    (tmp_path / "model.safetensors").write_bytes(trainer.model_bytes())
     network, found = load_model(tmp_path / "model.safetensors")
     expected = trainer.planner().q_field(small.grid, small.goal, MoveRule.UNIT).q
     assert (network.q_values(small.grid, small.goal, MoveRule.UNIT) == expected).all()
