@@ -81,7 +81,7 @@ def _zero_shot(settings: Settings) -> list[list[str]]:
         maps = GridVectorEnvironment([*training, *test], MOVE_RULE, ANY_MAP)
         solved, unmasked = np.isfinite(rollouts(planner, maps)).sum(axis=1)
         counts = f"{solved} ({unmasked}) of {len(maps.start)}"
-        rows.append([f"goal iii, {noise.value} (without action masking)", counts])
+        rows.append([f"goal iii, {noise} (without action masking)", counts])
     return rows
 
 

@@ -11,13 +11,21 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from scipy.special import softmax
 from tables import mean_and_worst, median_and_range, table
-from trainings import MOVE_RULE, PROFILES, SCENARIO, Settings, Training, in_parallel, rollouts
+from trainings import (
+    MOVE_RULE,
+    NOISE,
+    PROFILES,
+    SCENARIO,
+    Settings,
+    Training,
+    in_parallel,
+    rollouts,
+)
 
 from ddqn_planner.files import write_atomically
 from ddqn_planner.grid import (
     LENGTHS,
     Cell,
-    Noise,
     legal_moves,
     neighbours,
     path_length,
@@ -43,19 +51,19 @@ COLUMNS = (
 )
 
 
-def noisy_maps(training: int, test: int, noise: Noise) -> tuple[list[Scenario], list[Scenario]]:
+def noisy_maps(training: int, test: int, noise: str) -> tuple[list[Scenario], list[Scenario]]:
     """Draw training and test maps, all different, with new obstacles on or near goal i's path."""
     path = shortest_path(SCENARIO.grid, SCENARIO.start, SCENARIO.goal, MOVE_RULE)
     random = np.random.default_rng(NOISE_SEED)
     scenarios: dict[str, Scenario] = {}
     while len(scenarios) < training + test:
-        grid, _ = scatter_obstacles(SCENARIO.grid, path, MOVE_RULE, random, noise)
+        grid, _ = scatter_obstacles(SCENARIO.grid, path, MOVE_RULE, random, NOISE[noise])
         scenarios.setdefault(grid.fingerprint, replace(SCENARIO, grid=grid))
     drawn = list(scenarios.values())
     return drawn[:training], drawn[training:]
 
 
-def drawn_maps(settings: Settings, noise: Noise) -> tuple[list[Scenario], list[Scenario]]:
+def drawn_maps(settings: Settings, noise: str) -> tuple[list[Scenario], list[Scenario]]:
     """Return the noisy maps of the experiment."""
     return noisy_maps(*((4, 6) if settings.quick else (TRAINING_MAPS, TEST_MAPS)), noise)
 
@@ -73,7 +81,7 @@ def trainings(settings: Settings) -> list[Training]:
     """Return the trainings of each network on the training maps of each noise."""
     found = []
     for noise in settings.noise:
-        parameters_of = {f"{noise.value}/{name}": p for name, p in networks(settings).values()}
+        parameters_of = {f"{noise}/{name}": p for name, p in networks(settings).values()}
         maps, _ = drawn_maps(settings, noise)
         found += settings.trainings(parameters_of, maps, EVALUATION_INTERVAL)
     return found
@@ -133,10 +141,10 @@ def report(settings: Settings) -> str:
         training, test = drawn_maps(settings, noise)
         maps, lengths = GridVectorEnvironment([*training, *test], MOVE_RULE, PAPER), {}
         for label, (folder, parameters) in networks(settings).items():
-            name = f"{noise.value}/{folder}"
+            name = f"{noise}/{folder}"
             lengths[label] = np.array([rollouts(p, maps)[0] for p in settings.planners(name, KEPT)])
             # Obstacles on the path alone can be avoided by one fixed path.
-            if parameters.network == "paper" and noise is Noise.NEAR_PATH:
+            if parameters.network == "paper" and noise == "near_path":
                 taught = {f"{name}/supervised": replace(parameters, steps=SUPERVISED_UPDATES)}
                 jobs = settings.trainings(taught, training)
                 in_parallel(train_supervised, jobs, settings.backend)
@@ -151,7 +159,7 @@ def report(settings: Settings) -> str:
             parts = np.split(np.isfinite(of_seeds), [len(training)], axis=1)
             counts = [median_and_range(part.sum(axis=1).tolist()) for part in parts]
             ratios = [ratio[np.isfinite(ratio)] for ratio in of_seeds[:, len(training) :] / optimum]
-            rows.append([noise.value, label, *counts, mean_and_worst(ratios)[0]])
+            rows.append([noise, label, *counts, mean_and_worst(ratios)[0]])
     drawn = table(COLUMNS, rows), _draw(settings)
     return "\n\n".join(drawn)
 
@@ -165,11 +173,11 @@ def _draw(settings: Settings) -> str:
     before, legend = SCENARIO.grid.occupancy, dict[str, Any]()
     for noise, row in zip(settings.noise, panels, strict=True):
         planners = {
-            label: settings.planners(f"{noise.value}/{folder}", KEPT)[0]
+            label: settings.planners(f"{noise}/{folder}", KEPT)[0]
             for label, (folder, _) in networks(settings).items()
         }
         for axes, scenario in zip(row, drawn_maps(settings, noise)[1], strict=False):
-            draw_map(axes, scenario, noise.value)
+            draw_map(axes, scenario, noise)
             for y, x in np.argwhere(scenario.grid.occupancy & ~before):
                 cell = Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor="#E69F00", edgecolor="black")
                 axes.add_patch(cell)

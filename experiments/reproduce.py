@@ -17,10 +17,18 @@ import goal_2
 import goal_3
 import torch
 from tables import write_report
-from trainings import HIDDEN_UNITS, Settings, Training, in_parallel, make_folder, parser_of, train
+from trainings import (
+    HIDDEN_UNITS,
+    NOISE,
+    Settings,
+    Training,
+    in_parallel,
+    make_folder,
+    parser_of,
+    train,
+)
 
 from ddqn_planner.cli import exit_code
-from ddqn_planner.grid import Noise
 
 ALL_VARIANTS: Final = partial(goal_1.trainings, variants=tuple(goal_1.VARIANTS))
 # The title of each, its trainings, and the report of their results.
@@ -42,8 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = parser_of("reproduce.py", __doc__, "runs/reproduce")
     add = parser.add_argument
     add("--experiment", choices=[*EXPERIMENTS, "all"], default="all", help="one, or all")
-    noise = [noise.value for noise in Noise]
-    add("--noise", nargs="+", choices=noise, default=noise, help="new obstacles of goal iii")
+    add("--noise", nargs="+", choices=NOISE, default=[*NOISE], help="new obstacles of goal iii")
     units = "hidden layers of the paper's network for goal iii"
     add("--hidden-units", nargs="+", type=int, default=[*HIDDEN_UNITS], metavar="N", help=units)
     options = parser.parse_args(arguments)
@@ -57,7 +64,7 @@ def reproduce(options: argparse.Namespace) -> int:
         make_folder(options),
         options.seeds,
         options.quick,
-        tuple(map(Noise, dict.fromkeys(options.noise))),
+        tuple(dict.fromkeys(options.noise)),
         tuple(dict.fromkeys(options.hidden_units)),
         options.backend,
     )

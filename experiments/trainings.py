@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from ddqn_planner.cli import HelpFormatter
 from ddqn_planner.files import write_atomically, write_csv
-from ddqn_planner.grid import LENGTHS, MoveRule, Noise, neighbours
+from ddqn_planner.grid import LENGTHS, MoveRule, neighbours
 from ddqn_planner.model import PaperQNetwork
 from ddqn_planner.model.shared_background import evaluate
 from ddqn_planner.planning import Planner
@@ -29,6 +29,9 @@ SCENARIO: Final = paper_scenario()
 MOVE_RULE: Final = MoveRule.CORNER_CUTTING  # by it the paper's 22.97 is the shortest path
 BACKENDS: Final = ("loky", "ray", "dask", "sequential")  # of joblib: this machine, or a cluster
 HIDDEN_UNITS: Final = (0, 128)  # of the paper's network for goal iii; 0 for no hidden layer
+# How far from the path new obstacles lie, in cells, by two readings of section 5.3: the "free
+# positions that make up the optimal path", or their eight neighbours too.
+NOISE: Final = {"on_path": 0, "near_path": 1}
 PROFILES: Final[dict[str, HyperParameters]] = {
     # Its network, observation and Table 1, our choice where it is silent.
     "paper": HyperParameters(),
@@ -65,7 +68,7 @@ class Settings:
     out: Path  # folder of the trainings, tables, figures and the report
     seeds: int  # trainings per table row, with the seeds 0, 1, and so on
     quick: bool = False  # train too briefly to learn anything
-    noise: tuple[Noise, ...] = tuple(Noise)
+    noise: tuple[str, ...] = tuple(NOISE)
     hidden_units: tuple[int, ...] = HIDDEN_UNITS
     backend: str = "loky"
 

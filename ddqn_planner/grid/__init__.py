@@ -16,4 +16,4 @@ from ddqn_planner.grid.moves import (
     shortest_distances,
     shortest_path,
 )
-from ddqn_planner.grid.noise import Noise, scatter_obstacles
+from ddqn_planner.grid.noise import scatter_obstacles

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid.arguments import UNKNOWN, Cell, Choice, Occupancy
+from ddqn_planner.grid.arguments import UNKNOWN, Cell, Occupancy
 from ddqn_planner.grid.grid_map import GridMap
 from ddqn_planner.grid.moves import MoveRule
 
@@ -16,28 +16,22 @@ MAX_NEW_OBSTACLES = 5  # the paper adds 1 to 5
 MAX_TRIES = 1000
 
 
-class Noise(Choice):
-    """Which free cells new obstacles may occupy: two readings of section 5.3."""
-
-    ON_PATH = "on_path"
-    """Those of the path ("free positions that make up the optimal path")."""
-    NEAR_PATH = "near_path"
-    """Those of the path and their eight neighbours."""
-
-
 def scatter_obstacles(
     grid: GridMap,
     path: Sequence[Cell],
     move_rule: MoveRule,
     random: np.random.Generator,
-    noise: Noise = Noise.NEAR_PATH,
+    reach: int = 1,
 ) -> tuple[GridMap, int]:
-    """Return the map with 1 to 5 obstacles more, which leave a path, and the rejected draws."""
-    start, goal = path[0], path[-1]
-    offsets, where = ((0,), "on") if noise is Noise.ON_PATH else ((-1, 0, 1), "on or next to")
+    """Return the map with 1 to 5 obstacles more, which leave a path, and the rejected draws.
+
+    They lie on the path or up to so many cells beside it: section 5.3 can be read as 0 or 1.
+    """
+    start, goal, offsets = path[0], path[-1], range(-reach, reach + 1)
     near = {(x + dx, y + dy) for x, y in path for dx in offsets for dy in offsets}
     candidates = sorted(cell for cell in near - {start, goal} if grid.is_free(cell))
     if not candidates:
+        where = f"within {reach} cells of" if reach else "on"
         raise ValueError(f"no free cell lies {where} the path from {start} to {goal}")
     for rejected in range(MAX_TRIES):
         count = min(int(random.integers(1, MAX_NEW_OBSTACLES + 1)), len(candidates))

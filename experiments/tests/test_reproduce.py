@@ -19,7 +19,7 @@ from PIL import Image
 from reproduce import EXPERIMENTS, main
 from tables import mean_and_worst, median_and_range
 
-from ddqn_planner.grid import MOVES, Noise, path_length, shortest_distances, shortest_path
+from ddqn_planner.grid import MOVES, path_length, shortest_distances, shortest_path
 from ddqn_planner.model import ModelMetadata, load_model
 from ddqn_planner.planning import Planner
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
@@ -210,9 +210,9 @@ def test_the_q_that_the_loss_trains_adds_up_the_papers_rewards(paper: Scenario) 
     assert field.q[0, goal_y, goal_x - 2] == pytest.approx(expected, abs=1e-3)
 
 
-@pytest.mark.parametrize("noise", Noise)
+@pytest.mark.parametrize("noise", trainings.NOISE)
 def test_noisy_maps_differ_and_more_test_maps_leave_the_training_maps(
-    paper: Scenario, noise: Noise
+    paper: Scenario, noise: str
 ) -> None:
     training, test = noisy_maps(30, 30, noise)
     scenarios = [*training, *test]
@@ -223,7 +223,7 @@ def test_noisy_maps_differ_and_more_test_maps_leave_the_training_maps(
     assert (path[0], path[-1]) == (paper.start, paper.goal)
     shortest = shortest_path(paper.grid, paper.start, paper.goal, trainings.MOVE_RULE)
     assert path_length(path) > path_length(shortest)
-    if noise is Noise.ON_PATH:  # every inner cell of the path can be avoided at once
+    if noise == "on_path":  # every inner cell of the path can be avoided at once
         assert all(scenario.grid.is_free(cell) for scenario in scenarios for cell in path)
 
 

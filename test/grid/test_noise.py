@@ -7,19 +7,19 @@ from hypothesis import strategies as st
 from strategies import RULES, occupancies
 
 from ddqn_planner import GridMap, MoveRule
-from ddqn_planner.grid import UNKNOWN, Noise, legal_moves, scatter_obstacles, shortest_path
+from ddqn_planner.grid import UNKNOWN, legal_moves, scatter_obstacles, shortest_path
 from ddqn_planner.grid.noise import random_costs, random_requests, unknown_costs
 from ddqn_planner.training.environment import Scenario
 
 
-@pytest.mark.parametrize("noise", Noise)
-def test_new_obstacles_lie_as_the_noise_says_off_a_path(paper: Scenario, noise: Noise) -> None:
+@pytest.mark.parametrize("reach", [0, 1])
+def test_new_obstacles_lie_within_a_reach_of_a_path(paper: Scenario, reach: int) -> None:
     grid, rule = paper.grid, MoveRule.CORNER_CUTTING
     path = shortest_path(grid, paper.start, paper.goal, rule)
     counts, distances = set(), set()
     for seed in range(40):
-        noisy, rejected = scatter_obstacles(grid, path, rule, np.random.default_rng(seed), noise)
-        again, _ = scatter_obstacles(grid, path, rule, np.random.default_rng(seed), noise)
+        noisy, rejected = scatter_obstacles(grid, path, rule, np.random.default_rng(seed), reach)
+        again, _ = scatter_obstacles(grid, path, rule, np.random.default_rng(seed), reach)
         assert noisy.fingerprint == again.fingerprint
         assert rejected >= 0
         assert not (grid.occupancy & ~noisy.occupancy).any()
@@ -29,7 +29,7 @@ def test_new_obstacles_lie_as_the_noise_says_off_a_path(paper: Scenario, noise: 
         for y, x in new:
             distances.add(min(max(abs(x - px), abs(y - py)) for px, py in path))
     assert counts == {1, 2, 3, 4, 5}
-    assert distances == ({0} if noise is Noise.ON_PATH else {0, 1})
+    assert distances == {*range(reach + 1)}
 
 
 def test_a_path_that_leaves_no_obstacle_a_place_is_refused() -> None:
@@ -37,13 +37,13 @@ def test_a_path_that_leaves_no_obstacle_a_place_is_refused() -> None:
     # In a ring one drives counter-clockwise, so the obstacle closes the short way back.
     east, west = [0b00111000] * 5, [0b10000011] * 5
     ring = GridMap([[0] * 5, [0, 1, 1, 1, 0], [0] * 5], forbidden=[east, [0] * 5, west])
-    for grid, noise, named in (
-        *((corridor, Noise.NEAR_PATH, "left a path"), (ring, Noise.ON_PATH, "left a path")),
-        *((short, Noise.ON_PATH, "on the path"), (short, Noise.NEAR_PATH, "on or next to the")),
+    for grid, reach, named in (
+        *((corridor, 1, "left a path"), (ring, 0, "left a path")),
+        *((short, 0, "lies on the path"), (short, 1, "lies within 1 cells of the")),
     ):
         path = [(x, 0) for x in range(grid.width)]
         with pytest.raises(ValueError, match=named):
-            scatter_obstacles(grid, path, MoveRule.ROBOT_SAFE, np.random.default_rng(0), noise)
+            scatter_obstacles(grid, path, MoveRule.ROBOT_SAFE, np.random.default_rng(0), reach)
 
 
 @given(occupancies, RULES, st.integers(0, 2**32 - 1))
