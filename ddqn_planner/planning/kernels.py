@@ -284,21 +284,25 @@ def roll_out(distance: Distances, costs: MoveCosts, start: int, toward: Cell) ->
 @in_place
 def _roll_out(distance: Any, cell: int, path: Any, toward: Any, costs: Any) -> int:
     """Write a path from a cell on; return its length."""
-    width, (to_x, to_y), number = costs[-1], toward, 0
-    while cell > 0 and number < path.shape[0]:
-        path[number, 0], path[number, 1] = cell % width - 1, cell // width - 1
-        x, y = path[number, 0] - path[0, 0], path[number, 1] - path[0, 1]
+    width, (to_x, to_y), number, best = costs[-1], toward, 0, 0
+    x, y = cell % width - 1, cell // width - 1
+    from_x, from_y = x, y
+    while best >= 0 and number < path.shape[0]:
+        path[number, 0], path[number, 1] = x, y
         number += 1
         # Of steps as good as each other, the nearest to the straight line from the start.
-        enough, least, best = distance[cell] * SAME, np.inf, 0
+        enough, least, best = distance[cell] * SAME, np.inf, -1
         for action in range(8):
             after = distance[cell + MOVE_Y[action] * width + MOVE_X[action]]
             if 0 < after < enough:
-                ahead_x, ahead_y = x + MOVE_X[action], y + MOVE_Y[action]
-                aside = abs(ahead_x * (to_y - path[0, 1]) - ahead_y * (to_x - path[0, 0]))
+                ahead_x, ahead_y = x + MOVE_X[action] - from_x, y + MOVE_Y[action] - from_y
+                aside = abs(ahead_x * (to_y - from_y) - ahead_y * (to_x - from_x))
                 if aside < least and after + cost_of(cell, action, costs) <= enough:
-                    least, best = aside, MOVE_Y[action] * width + MOVE_X[action]
-        cell = cell + best if best else 0
+                    least, best = aside, action
+                    if aside == 0:
+                        break
+        x, y = x + MOVE_X[best], y + MOVE_Y[best]
+        cell += MOVE_Y[best] * width + MOVE_X[best]
     return number
 
 
