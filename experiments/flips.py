@@ -71,7 +71,7 @@ def drive(
         seen = occupancy | (noise & (np.hypot(x - robot[0], y - robot[1]) <= SIGHT))
         seen[robot[::-1]] = seen[goal[::-1]] = False
         grid = GridMap(seen, cost=inflated_costs(seen, INFLATION))
-        request = PlanRequest(grid, robot, goal, RULE, simplified=straight, under_way=path)
+        request = PlanRequest(grid, robot, (goal,), RULE, simplified=straight, under_way=path)
         plan = last_step(planner.steps(replace(request, switch_threshold=threshold)))
         if not plan.cells:  # it waits
             continue

@@ -18,7 +18,7 @@ from ddqn_planner.grid import MOVES, Cell, clearance
 from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.moves import cells_along
 from ddqn_planner.grid.noise import random_requests
-from ddqn_planner.planning.segments import _cost, _layers, cost_along, straightened
+from ddqn_planner.planning.segments import _cost, cost_along, straightened
 
 RULE = MoveRule.ROBOT_SAFE
 KINDS = ("random_10", "random_20", "rooms", "office", "dead_ends", "maze")
@@ -98,7 +98,7 @@ def measure_straight_paths(side: int, kinds: Sequence[str]) -> Iterator[bool]:
 
 def theta_star(grid: GridMap, start: Cell, goal: Cell) -> NDArray[np.int64]:
     """Return the path of Theta* (Daniel, Nash, Koenig and Felner 2010) by our rule and costs."""
-    return _theta_star(*start, *goal, MOVES, _layers(grid, RULE))
+    return _theta_star(*start, *goal, MOVES, grid.for_kernels(RULE))
 
 
 @compiled
@@ -154,7 +154,7 @@ def optimum(occupancy: Occupancy, start: Cell, goal: Cell, finer: int = FINER) -
         beside = [padded[1 + y : len(fine) + 1 + y, 1 + x : len(fine) + 1 + x] for x, y in MOVES]
         is_corner = [beside[n] & ~beside[n - 1] & ~beside[(n + 1) % 8] for n in (1, 3, 5, 7)]
         corners = np.argwhere(~fine & np.any(is_corner, axis=0))[:, ::-1]
-    return float(_optimum(np.concatenate([ends, corners]), _layers(GridMap(fine), RULE)) / finer)
+    return float(_optimum(np.concatenate([ends, corners]), GridMap(fine).for_kernels(RULE)) / finer)
 
 
 @compiled

@@ -37,7 +37,7 @@ def exact_cost(first: Cell, last: Cell, grid: GridMap, rule: MoveRule) -> float:
     length = np.abs(vector).max() if rule is MoveRule.UNIT else math.hypot(*vector)
     found = shares(first, last)
     assert sum(found.values()) == 1
-    multipliers = grid.multipliers_in(tuple(np.transpose([*found])[::-1])).tolist()
+    multipliers = grid.cost_multiplier[tuple(np.transpose([*found])[::-1])].tolist()
     mean = sum(share * Fraction(m) for share, m in zip(found.values(), multipliers, strict=True))
     return float(length * float(mean))
 

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 Box = tuple[slice, ...]  # rows and columns
 
-WHOLE: Box = (slice(None), slice(None))
 ORIGIN: Box = (slice(0, 0), slice(0, 0))
 
 SMALL = 2**22  # bytes of an array that is copied as fast, and read faster
@@ -98,12 +97,6 @@ def boxes_of(is_set: NDArray[np.bool_], apart: int = APART) -> list[Box]:
         for columns in _runs(np.any(is_set[rows], axis=0), apart)
     ]
     return boxes if len(boxes) <= FEW else boxes_of(is_set, is_set.size)
-
-
-def few_of(is_set: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the rows and columns of what is True: with few of many, sooner than `np.nonzero`."""
-    y, x = np.divmod(np.flatnonzero(is_set), is_set.shape[1])
-    return y, x
 
 
 def _runs(is_set: NDArray[np.bool_], apart: int) -> list[slice]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.grid import arguments
-from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell, Occupancy
+from ddqn_planner.grid.arguments import OCCUPIED, POSITIVE, UNKNOWN, Cell, Occupancy, as_number
 from ddqn_planner.grid.copies import ORIGIN, Box, replaced
 from ddqn_planner.grid.moves import MoveRule, flood, legal_moves
 
@@ -23,7 +23,8 @@ LAYERS = "occupancy", "cost", "forbidden", "slowness"  # what its moves depend o
 PATCHED = {"occupancy", "cost", "obstacles"}  # layers of which patches change some cells
 MAX_PATCHES = 512  # so many are known of a map, one after the other
 
-NO_DIRECTIONS = np.frombuffer(b"", np.uint8).reshape(0, 0)  # not to be written to, as those of maps
+# Directions, costs and slowness of maps without. Not to be written to, as those of maps.
+NO_LAYERS = [np.frombuffer(b"", kind).reshape(0, 0) for kind in (np.uint8, np.int8, np.float32)]
 
 # (101,): the multiplier of each cost, 0 to 100
 MULTIPLIERS = np.linspace(1, MAX_COST_MULTIPLIER, OCCUPIED + 1, dtype=np.float32)
@@ -72,31 +73,25 @@ class GridMap:
 
     def __post_init__(self) -> None:
         occupancy = arguments.as_mask("occupancy", self.occupancy)
-        metres = arguments.as_number(
-            "resolution", self.resolution, *arguments.POSITIVE, "metres per cell, > 0"
-        )
-        origin = arguments.as_pose("origin", self.origin)
+        metres = as_number("resolution", self.resolution, *POSITIVE, "metres per cell, > 0")
+        origin, shape = arguments.as_pose("origin", self.origin), occupancy.shape
         self._set(occupancy=occupancy, resolution=metres, origin=origin)
         if self.cost is not None:
             self._set(cost=_costs(self.cost, occupancy))
         if self.obstacles is not None:
-            obstacles = arguments.as_mask("obstacles", self.obstacles, occupancy.shape)
+            obstacles = arguments.as_mask("obstacles", self.obstacles, shape)
             if (obstacles & ~occupancy).any():
                 raise ValueError("obstacles lie on free cells; give some within the occupied cells")
             self._set(obstacles=obstacles)
         if self.forbidden is not None:
-            bits = arguments.numbers("forbidden", self.forbidden, occupancy.shape, between=(0, 255))
+            bits = arguments.numbers("forbidden", self.forbidden, shape, between=(0, 255))
             self._set(forbidden=bits.astype(np.uint8, order="C") if bits.any() else None)
         if self.slowness is not None:
             slowest = 1, arguments.MAX_SLOWNESS
-            slowness = arguments.numbers(
-                "slowness", self.slowness, occupancy.shape, "iuf", slowest, False
-            )
-            self._set(slowness=slowness.astype(np.float32, order="C"))
-        if self.seconds_per_cell is not None:
-            seconds = arguments.as_number(
-                "seconds_per_cell", self.seconds_per_cell, *arguments.POSITIVE, "more than 0"
-            )
+            times = arguments.numbers("slowness", self.slowness, shape, "iuf", slowest, whole=False)
+            self._set(slowness=times.astype(np.float32, order="C"))
+        if (seconds := self.seconds_per_cell) is not None:
+            seconds = as_number("seconds_per_cell", seconds, *POSITIVE, "more than 0")
             self._set(seconds_per_cell=seconds)
 
     def _set(self, **layers: Any) -> None:
@@ -131,7 +126,7 @@ class GridMap:
         use_map_costs : bool
             Whether free cells keep their values as costs; otherwise all cost the same.
         """
-        arguments.as_number("occupied_threshold", occupied_threshold, 1, OCCUPIED)
+        as_number("occupied_threshold", occupied_threshold, 1, OCCUPIED)
         array = arguments.numbers("the array of values", values, between=(-128, 127))
         if array.dtype.kind == "f":  # these may be probabilities, 1.0 for occupied
             raise ValueError(f"the values are of type {array.dtype}; give integers, percent")
@@ -186,9 +181,8 @@ class GridMap:
             cost=costs,
             obstacles=replaced(self.obstacles, box, closed),
         )
-        change = np.count_nonzero(patch) - np.count_nonzero(self.occupancy[box])
-        patched._set(_occupied=self._occupied + change)
-        if (costs is None) == (self.cost is None):
+        # To look once at a map of which most is new takes less time than to look at the patch.
+        if (costs is None) == (self.cost is None) and 2 * patch.size <= self.occupancy.size:
             patched._set(_history=(*self._history[-MAX_PATCHES:], (object(), box)))
         return patched
 
@@ -235,16 +229,11 @@ class GridMap:
     @cached_property
     def cost_multiplier(self) -> NDArray[np.float32]:
         """(H, W) float32: what a path costs per cell of its length: 1 to 5, times the slowness."""
-        return self.multipliers_in(...)
-
-    def multipliers_in(self, where: Any) -> NDArray[np.float32]:
-        """Return the cost multipliers that an index of NumPy names."""
-        slowness = None if self.slowness is None else self.slowness[where]
         if self.cost is None:
-            return np.ones(self.occupancy[where].shape, "f4") if slowness is None else slowness
+            return np.ones(self.occupancy.shape, "f4") if self.slowness is None else self.slowness
         multiplier: NDArray[np.float32]
-        multiplier = MULTIPLIERS.take(self.cost[where], mode="wrap")  # -1 finds the last one
-        return multiplier if slowness is None else multiplier * slowness
+        multiplier = MULTIPLIERS.take(self.cost, mode="wrap")  # -1 finds the last one
+        return multiplier if self.slowness is None else multiplier * self.slowness
 
     def labels(self, move_rule: MoveRule | str) -> NDArray[np.int32]:
         """Return (H, W) int32: each free cell's component, from 1 on, whatever is forbidden."""
@@ -259,10 +248,11 @@ class GridMap:
         """Return which moves are legal in each cell, see `legal_moves`: (8, H, W) bool."""
         return legal_moves(self.occupancy, move_rule, self.forbidden)
 
-    def for_moves(self, move_rule: MoveRule | str) -> tuple[Any, ...]:
-        """Return what compiled code asks whether a move is legal."""
-        forbidden = NO_DIRECTIONS if self.forbidden is None else self.forbidden
-        return self.occupancy, forbidden, MoveRule(move_rule).cuts_corners
+    def for_kernels(self, move_rule: MoveRule | str) -> tuple[Any, ...]:
+        """Return what compiled code asks of the map; empty arrays for missing layers."""
+        rule, layers = MoveRule(move_rule), (self.forbidden, self.cost, self.slowness)
+        known = [none if it is None else it for it, none in zip(layers, NO_LAYERS, strict=True)]
+        return self.occupancy, *known, rule.cuts_corners, rule is MoveRule.UNIT
 
     def reachable(
         self, cells: ArrayLike, move_rule: MoveRule | str, backward: bool = False
@@ -274,7 +264,7 @@ class GridMap:
         reached[array[:, 1], array[:, 0]] = True
         waiting, first = np.empty(reached.size, np.int64), np.flatnonzero(reached)
         waiting[: first.size] = first  # each cell waits at most once
-        flood(self.for_moves(move_rule), backward, reached, waiting, first.size)
+        flood(self.for_kernels(move_rule), backward, reached, waiting, first.size)
         return reached
 
     @cached_property
@@ -303,19 +293,19 @@ class GridMap:
         check_grid(other, "other")
         boxes = self.patches_since(other)
         if boxes is not None:
-            return not any(self.differs(other, box, box).any() for box in reversed(boxes))
+            return not any(self.differs(other, box).any() for box in reversed(boxes))
         if self._occupied != other._occupied:
             return False
         layers = ((getattr(self, name), getattr(other, name)) for name in LAYERS)
         return all(mine is its or np.array_equal(mine, its) for mine, its in layers)
 
-    def differs(self, other: GridMap, box: Box, others_box: Box) -> NDArray[np.bool_]:
-        """Return which cells of boxes of two maps with the same layers differ."""
-        differs: NDArray[np.bool_] = self.occupancy[box] != other.occupancy[others_box]
+    def differs(self, other: GridMap, box: Box) -> NDArray[np.bool_]:
+        """Return which cells of a box differ from those of a map of the same size and layers."""
+        differs: NDArray[np.bool_] = self.occupancy[box] != other.occupancy[box]
         for layer in LAYERS[1:]:
             mine, its = getattr(self, layer), getattr(other, layer)
-            if mine is not None and (mine is not its or box != others_box):
-                differs |= mine[box] != its[others_box]
+            if mine is not its:
+                differs |= mine[box] != its[box]
         return differs
 
     def contains(self, cell: Cell) -> bool:
@@ -371,6 +361,8 @@ def check_grid(grid: object, name: str = "grid") -> None:
 
 def _costs(cost: ArrayLike, occupancy: Occupancy) -> NDArray[np.int8]:
     """Return a copy with 0 in occupied cells."""
-    of_free = np.where(occupancy, 0, arguments.numbers("cost", cost, occupancy.shape))
+    given = arguments.numbers("cost", cost, occupancy.shape)
+    # Whole numbers are multiplied, which takes a tenth of the time; others may be infinite.
+    of_free = np.where(occupancy, 0, given) if given.dtype.kind == "f" else given * ~occupancy
     arguments.numbers("cost", of_free, between=(UNKNOWN, OCCUPIED - 1))
     return of_free.astype(np.int8, order="C", copy=False)

@@ -89,7 +89,7 @@ def path_length(cells: Cells, move_rule: MoveRule | str = MoveRule.ROBOT_SAFE) -
 def path_cost(grid: GridMap, cells: Cells, move_rule: MoveRule | str) -> float:
     """Return the cost of a path of moves: see `move_costs`."""
     x, y = np.asarray(cells, dtype=np.int64).reshape(-1, 2).T
-    multiplier = grid.multipliers_in((y, x)).astype(np.float64)
+    multiplier = grid.cost_multiplier[y, x].astype(np.float64)
     of_moves = _segment_lengths(cells, move_rule) * (multiplier[1:] + multiplier[:-1]) / 2
     return float(of_moves.sum())
 
@@ -162,8 +162,8 @@ def _dijkstra(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> Any:
 
 @inlined
 def is_legal(x: int, y: int, action: int, of_map: Any) -> Any:  # pragma: no cover
-    """Return whether a move between free cells is legal, see `GridMap.for_moves`."""
-    occupancy, forbidden, cuts_corners = of_map
+    """Return whether a move between free cells is legal, see `GridMap.for_kernels`."""
+    occupancy, forbidden, _, _, cuts_corners, _ = of_map
     if forbidden.size > 0 and forbidden[y, x] >> action & 1:
         return False
     to_x, to_y = x + MOVES[action, 0], y + MOVES[action, 1]

@@ -250,7 +250,7 @@ class Requests:
         request: Any = PlanRequest(
             grid,
             start=first,
-            goal=second,
+            goals=(second,),
             move_rule=move_rule(settings.move_rule, planner),
             method=PlanMethod(settings.mode),
             tolerance=metres / grid.resolution,

@@ -6,6 +6,7 @@ import math
 import threading
 from collections.abc import Callable
 from functools import cached_property
+from itertools import accumulate
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import cell_inside, numbers
-from ddqn_planner.grid.copies import Box, few_of
+from ddqn_planner.grid.copies import Box
 from ddqn_planner.grid.grid_map import LAYERS
 from ddqn_planner.model import PropagationQNetwork, QNetwork
 from ddqn_planner.model.move_costs import MoveCosts
@@ -83,8 +84,9 @@ class QField:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the field with its value and policy, bytes."""
-        return int(self.q.nbytes + self.legal.nbytes + 5 * self.q[0].size)
+        """Memory of its arrays, with those that were asked for, bytes."""
+        arrays = [array for array in vars(self).values() if isinstance(array, np.ndarray)]
+        return sum(array.nbytes for array in arrays)
 
     def unmasked(self) -> QField:
         """Return the field without action masking: a rollout is trapped by an illegal move."""
@@ -97,9 +99,9 @@ class QField:
         """Return whether all that a start needs is known, after so many visits of cells more."""
         return True
 
-    def rollout_if_known(self, start: Cell, straight: bool = False) -> Plan | None:
-        """Return the rollout from a start if no more of the field is needed, else None."""
-        return self.rollout(start, straight)
+    def is_known(self, start: Cell) -> bool:
+        """Return whether no more of the field is needed for the rollout from a start."""
+        return True
 
     def rollout(self, start: Cell, straight: bool = False) -> Plan:
         """Take greedy steps from a free cell until the goal, and return the path.
@@ -140,7 +142,8 @@ class DistanceField(QField):
         distance[roots], state[roots] = kernels.AT_GOAL, kernels.OPEN
         return Known(distance, state, roots)
 
-    def _number(self, cell: Cell) -> int:
+    def _number(self, cell: Any) -> Any:
+        """Return the number of a cell, or of each of many (arrays), on the padded map."""
         return (cell[1] + 1) * self.costs.width + cell[0] + 1
 
     def _take(self) -> Known:
@@ -153,24 +156,15 @@ class DistanceField(QField):
         """Compute all of the field, or what a start needs; return if so many visits were enough."""
         number = 0 if start is None else self._number(start)
         with self._lock:
-            done = self._is_final(number)
+            done = _is_final(self.known, number)
             if not done:
                 self.known, done = kernels.grow(self._take(), self.costs, number, limit)
         return done
 
-    def _is_final(self, number: int) -> bool:
-        """Return whether no more of the field is needed to know the distance of a cell."""
-        closed = self.known.state[number] == kernels.CLOSED
-        return bool(not self.known.opened.size or (self.known.closed_is_final and closed))
-
-    def rollout_if_known(self, start: Cell, straight: bool = False) -> Plan | None:
-        """Return the rollout from a start if no more of the field is needed, else None."""
-        if not self._lock.acquire(blocking=False):
-            return None  # another thread computes it
-        try:
-            return self.rollout(start, straight) if self._is_final(self._number(start)) else None
-        finally:
-            self._lock.release()
+    def is_known(self, start: Cell) -> bool:
+        """Return whether no more of the field is needed for the rollout from a start."""
+        known: Known | None = vars(self).get("known")  # None while another thread computes it
+        return known is not None and _is_final(known, self._number(start))
 
     def rollout(self, start: Cell, straight: bool = False) -> Plan:
         """Return the path; there is none only if there is no way to the goal."""
@@ -185,9 +179,14 @@ class DistanceField(QField):
 
     def take_over(self, old: DistanceField, start: Cell | None = None) -> bool:
         """Repair and take what an older field knows, or begin if quicker; False for other maps."""
-        changed = changed_cells(old.grid, self.grid)
-        if changed is None:
+        cells = changed_cells(old.grid, self.grid)
+        if cells is None:
             return False
+        # Moves of the cells around may differ, too, but there are none on the map's border.
+        width, last = self.costs.width, self.costs.patch.size - self.costs.width - 1
+        around = (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel()
+        changed = np.unique(self._number(cells.T)[:, None] + around).astype(np.int32)
+        changed = changed[(changed > width) & (changed < last)]
         # For one start, repair and new field take turns, each time with four times the limit: the
         # quicker one wins. The older field then begins anew, or else stays as it is.
         most = max(REPAIRED, int(REPAIRED_SHARE * self.grid.occupancy.size))
@@ -240,9 +239,14 @@ class DistanceField(QField):
 
     @property
     def nbytes(self) -> int:
-        """Memory, bytes: 9 per cell, and more once `q` and so on were made."""
-        made = [array for array in vars(self).values() if isinstance(array, np.ndarray)]
-        return 9 * int(self.costs.patch.size) + sum(int(array.nbytes) for array in made)
+        """Memory, bytes: 9 per cell for what is known, and that of its arrays."""
+        return 9 * self.costs.patch.size + super().nbytes
+
+
+def _is_final(known: Known, number: int) -> bool:
+    """Return whether no more of a field is needed to know the distance of a cell."""
+    closed = known.state[number] == kernels.CLOSED
+    return bool(not known.opened.size or (known.closed_is_final and closed))
 
 
 def network_field(network: QNetwork, grid: GridMap, goal: Cell, move_rule: MoveRule) -> QField:
@@ -281,32 +285,32 @@ def offset_between(old: GridMap, new: GridMap) -> Cell | None:
 
 def overlap(old: GridMap, new: GridMap, shift: Cell) -> tuple[Box, Box]:
     """Return the rows and columns that both maps show, in the old map and in the new one."""
-    before, after = [], []
-    for axis, by in enumerate(reversed(shift)):
-        old_size, size = old.occupancy.shape[axis], new.occupancy.shape[axis]
-        first = min(max(by, 0), size)
-        last = max(min(by + old_size, size), first)
-        before.append(slice(first - by, last - by))
-        after.append(slice(first, last))
-    return tuple(before), tuple(after)
+    sizes = zip(shift[::-1], old.occupancy.shape, new.occupancy.shape, strict=True)
+    # Where a box ends beyond an array, NumPy cuts it.
+    sides = [
+        (slice(max(-by, 0), max(new_size - by, 0)), slice(max(by, 0), max(old_size + by, 0)))
+        for by, old_size, new_size in sizes
+    ]
+    before, after = zip(*sides, strict=True)
+    return before, after
 
 
-def changed_cells(old: GridMap, new: GridMap) -> NDArray[np.int32] | None:
-    """Return the cells whose moves may differ, as numbers of the padded map; None for many."""
-    width, patches = new.width + 2, new.patches_since(old)
+def changed_cells(
+    old: GridMap, new: GridMap, differs: Callable[[Box], Any] | None = None
+) -> NDArray[np.int64] | None:
+    """Return the cells (N, 2) in which maps of one place differ; None for others, or for many."""
     if shift_between(old, new) != (0, 0) or old.occupancy.shape != new.occupancy.shape:
         return None
     whole: Box = (slice(0, new.height), slice(0, new.width))
-    found = [np.empty(0, np.int64)]
-    for rows, columns in [whole] if patches is None else patches:
-        y, x = few_of(new.differs(old, (rows, columns), (rows, columns)))
-        found.append((y + rows.start + 1) * width + x + columns.start + 1)
-    if sum(map(len, found)) > CHANGED_SHARE * new.occupancy.size:
-        return None
-    around = (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel()
-    numbers = np.unique(np.concatenate(found)[:, None] + around)
-    last = (new.height + 1) * width - 1
-    return numbers[(numbers > width) & (numbers < last)].astype(np.int32)
+    found, patches = [np.empty((0, 2), np.int64)], new.patches_since(old)
+    for box in [whole] if patches is None else patches:
+        rows, columns = box
+        number = np.flatnonzero(new.differs(old, box) if differs is None else differs(box))
+        # With few of many, sooner than `np.nonzero`.
+        y, x = np.divmod(number, columns.stop - columns.start)
+        found.append(np.column_stack([x + columns.start, y + rows.start]))
+    cells = np.concatenate(found)
+    return cells if len(cells) <= CHANGED_SHARE * new.occupancy.size else None
 
 
 # The fields that a planner keeps
@@ -322,14 +326,16 @@ class FieldCache:
         # may at worst forget what another has just kept.
         self._kept: list[QField] = []
 
-    def _of_rule(self, rule: MoveRule) -> list[QField]:
-        """Return what is kept for a move rule, used last first."""
-        return [field for field in reversed(self._kept) if field.move_rule is rule]
+    def _of_rule(self, rule: MoveRule) -> list[DistanceField]:
+        """Return the fields of distances that are kept for a move rule, used last first."""
+        fields = [field for field in self._kept[::-1] if isinstance(field, DistanceField)]
+        return [field for field in fields if field.move_rule is rule]
 
     def find(self, grid: GridMap, goals: Goals, rule: MoveRule) -> QField | None:
         """Return the field of a map toward the nearest of some goals if it is kept, else None."""
-        for field in self._of_rule(rule):
-            if field.goals == goals and grid.same_cells(field.grid):
+        for field in self._kept:
+            same_goals = field.goals == goals and field.move_rule is rule
+            if same_goals and grid.same_cells(field.grid):
                 field.grid = grid  # it may lie elsewhere
                 self._kept = [*(other for other in self._kept if other is not field), field]
                 return field
@@ -337,14 +343,11 @@ class FieldCache:
 
     def costs(self, grid: GridMap, rule: MoveRule) -> MoveCosts | None:
         """Return the costs of a map's moves, if a network gives them: see `DistanceField`."""
-        known = [field for field in self._of_rule(rule) if isinstance(field, DistanceField)]
-        for field in known:
+        for field in self._of_rule(rule):
             if grid.same_cells(field.grid):
                 return field.costs
-        for field in known:
             boxes = grid.patches_since(field.grid)
-            costs = None if boxes is None else field.costs.after(grid, boxes)
-            if costs is not None:
+            if boxes is not None and (costs := field.costs.after(grid, boxes)) is not None:
                 return costs
         return self.network.move_costs(grid, rule)
 
@@ -357,26 +360,21 @@ class FieldCache:
         costs: MoveCosts | None = None,
     ) -> QField:
         """Return the field of a map toward the nearest of some goals: several, if it has costs."""
-        field = self.find(grid, goals, rule)
-        if field is not None:
-            return field
-        costs = costs or self.costs(grid, rule)
+        known = self.find(grid, goals, rule)
+        if known is not None:
+            return known
+        costs, replaced = costs or self.costs(grid, rule), None
         if costs is None:
             field = network_field(self.network, grid, goals[0], rule)
+            field.grid = grid
         else:
             field = DistanceField(goals, grid, costs, rule)
-            same_goals = (old for old in self._of_rule(rule) if old.goals == goals)
-            for old in same_goals:
-                if isinstance(old, DistanceField) and field.take_over(old, start):
-                    # The place will hardly be again what it was.
-                    self._kept = [other for other in self._kept if other is not old]
+            for old in self._of_rule(rule):
+                if old.goals == goals and field.take_over(old, start):
+                    replaced = old  # the place will hardly be again what it was
                     break
-        field.grid = grid
-        kept, size = [*self._kept, field], 0
-        for number, each in enumerate(reversed(kept)):
-            size += each.nbytes + (each.costs.patch.nbytes if each.costs else 0)
-            if number >= ALWAYS_KEPT and size > self.nbytes:
-                kept = kept[-number:]
-                break
-        self._kept = kept
+        kept = [*(other for other in self._kept if other is not replaced), field]
+        sizes = [each.nbytes + (each.costs.patch.nbytes if each.costs else 0) for each in kept]
+        number = sum(size <= self.nbytes for size in accumulate(reversed(sizes)))
+        self._kept = kept[-max(number, ALWAYS_KEPT) :]
         return field

@@ -17,6 +17,7 @@ from ddqn_planner.planning.segments import (
     Path,
     cost_along,
     legal_segments,
+    multiplier_at,
     straightened,
 )
 
@@ -43,8 +44,8 @@ def search(
         (x, y), end = end, np.zeros(shape, dtype=np.bool_)
         end[y, x] = True
     value = np.zeros(shape, np.float32) if value is None else value
-    costs = grid.cost_multiplier, move_rule.lengths
-    entered_by, found = _search(start, end, value, costs, grid.for_moves(move_rule))
+    lengths, layers = move_rule.lengths, grid.for_kernels(move_rule)
+    entered_by, found = _search(start, end, value, lengths, layers)
     if found < 0:
         return ()
     cells = [(found % grid.width, found // grid.width)]
@@ -57,10 +58,10 @@ def search(
 
 @compiled
 def _search(
-    start: Cell, ends: Any, value: Any, costs: Any, of_map: Any
+    start: Cell, ends: Any, value: Any, lengths: Any, layers: Any
 ) -> tuple[NDArray[np.int8], int]:
     """Return the action by which each cell was entered, (H, W) int8, and the end's number or -1."""
-    (multiplier, lengths), (height, width) = costs, ends.shape
+    height, width = ends.shape
     entered_by = np.full(ends.shape, -1, dtype=np.int8)
     visited = np.zeros(ends.shape, dtype=np.bool_)
     # Of each move: its order, the cost of the path with it, the cell it leads to, the action.
@@ -78,9 +79,9 @@ def _search(
             to_x, to_y = x + MOVES[action, 0], y + MOVES[action, 1]
             if not (0 <= to_x < width and 0 <= to_y < height) or visited[to_y, to_x]:
                 continue
-            if not of_map[0][to_y, to_x] and is_legal(x, y, action, of_map):
-                mean_multiplier = (np.float64(multiplier[y, x]) + multiplier[to_y, to_x]) / 2
-                through = cost + lengths[action] * mean_multiplier
+            if not layers[0][to_y, to_x] and is_legal(x, y, action, layers):
+                both = multiplier_at(x, y, layers) + multiplier_at(to_x, to_y, layers)
+                through = cost + lengths[action] * both / 2
                 order = through - value[to_y, to_x]
                 if np.isnan(order):
                     order = np.inf
@@ -96,7 +97,7 @@ def way_and_ends(request: PlanRequest, goals: Goals) -> tuple[tuple[Cell, ...], 
     grid, start, rule = request.grid, request.start, request.move_rule
     candidates = [(np.array(goals), len(goals))] if goals else []
     if request.reach >= 1:
-        candidates.append((_near(~grid.occupancy, request.goal, request.reach), 1))
+        candidates.append((_near(~grid.occupancy, request.goals[0], request.reach), 1))
     for ends, number in candidates:
         joined_to_ends = grid.reachable(ends, rule, backward=True)
         way_out = (start,) if grid.is_free(start) else find_way_out(request, joined_to_ends)
@@ -122,7 +123,7 @@ def obstacles_in_the_way(grid: GridMap, start: Cell, clearing_radius: float) -> 
 
 def find_way_out(request: PlanRequest, ends: NDArray[np.bool_]) -> tuple[Cell, ...]:
     """Return the shortest way from a start that is not free to one of some free cells, or ()."""
-    grid, rule, (goal_x, goal_y) = request.grid, request.move_rule, request.goal
+    grid, rule, (goal_x, goal_y) = request.grid, request.move_rule, request.goals[0]
     obstacles = obstacles_in_the_way(grid, request.start, request.start_clearing_radius)
     leaving = GridMap(~ends & (obstacles | ~grid.occupancy), forbidden=grid.forbidden)
     y, x = np.ogrid[: grid.height, : grid.width]

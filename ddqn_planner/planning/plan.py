@@ -43,14 +43,13 @@ class PlanRequest:
 
     grid: GridMap
     start: Cell
-    goal: Cell
+    goals: tuple[Cell, ...]  # the nearest one counts; with a tolerance there is but one
     move_rule: MoveRule
     method: PlanMethod = PlanMethod.GREEDY
     tolerance: float = 0.0
     simplified: bool = False
     under_way: Cells = field(default=(), compare=False)  # what the robot follows
     switch_threshold: float = 0.0  # the share by which the rest of it may cost more than a new path
-    others: tuple[Cell, ...] = ()  # goals that do as well: the nearest one counts; no tolerance
     start_clearing_radius: float = 0.0
 
     @property
@@ -59,22 +58,17 @@ class PlanRequest:
         return self.tolerance * ROUNDING
 
     @property
-    def goals(self) -> tuple[Cell, ...]:
-        """The goal and the others, in their order."""
-        return self.goal, *self.others
-
-    @property
     def cells(self) -> tuple[Cell, ...]:
         """Those of the start and the goals."""
         return self.start, *self.goals
 
     def to_nearest(self, others: Sequence[Cell]) -> PlanRequest:
         """Return the request for a path to the nearest of several goals, none of which moves."""
-        return replace(self, tolerance=0.0, others=tuple(others))
+        return replace(self, tolerance=0.0, goals=(*self.goals, *others))
 
     def after(self, leg: Plan, goal: Cell) -> PlanRequest:
         """Return the request for the next leg."""
-        return replace(self, start=leg.cells[-1], goal=goal)
+        return replace(self, start=leg.cells[-1], goals=(goal,))
 
 
 @dataclass(frozen=True, eq=False)

@@ -173,11 +173,11 @@ class Planner:
         plans: list[Plan] = []
         how = move_rule, method, tolerance, simplified, start_clearing_radius
         for goal in _cells_of_goals(goals):
-            plans.append(self.plan(grid, start, goal, *how))
-            if plans[-1].status is not PlanStatus.SUCCEEDED:
-                return replace(plans[-1], goal=goal)
-            assert plans[-1].goal is not None
-            start = plans[-1].goal
+            plan = self.plan(grid, start, goal, *how)
+            if plan.status is not PlanStatus.SUCCEEDED or plan.goal is None:
+                return replace(plan, goal=goal)
+            plans.append(plan)
+            start = plan.goal
         return joined(plans)
 
     def plan_poses(
@@ -242,12 +242,11 @@ class Planner:
         request = PlanRequest(
             grid,
             as_cell(start, "the start"),
-            goals[0],
+            tuple(goals),
             self._rule(move_rule),
             PlanMethod(method),
             as_number("the tolerance", tolerance, *limits),
             as_flag("simplified", simplified),
-            others=tuple(goals[1:]),
             start_clearing_radius=as_number("start_clearing_radius", radius, *limits),
         )
         return last_step(self.steps(request))
@@ -262,8 +261,8 @@ class Planner:
             yield plan
             began = time.perf_counter()
 
-    def _refusal(self, request: PlanRequest) -> PlanStatus | None:
-        """Return why there is no path, where one look at start and goals says so."""
+    def _refusal(self, request: PlanRequest, free: Goals) -> PlanStatus | None:
+        """Return why there is no path, where one look at start and free goals says so."""
         grid = request.grid
         if not grid.contains(request.start):
             return PlanStatus.START_OUTSIDE_MAP
@@ -271,7 +270,7 @@ class Planner:
             return PlanStatus.GOAL_OUTSIDE_MAP
         if grid.is_obstacle(request.start) and request.start_clearing_radius == 0:
             return PlanStatus.START_OCCUPIED
-        if not any(grid.is_free(goal) for goal in request.goals) and request.reach < 1:
+        if not free and request.reach < 1:
             return PlanStatus.GOAL_OCCUPIED
         if not self.network.supports((grid.height, grid.width)):
             return PlanStatus.MAP_SIZE_UNSUPPORTED
@@ -280,17 +279,16 @@ class Planner:
     def _find(self, request: PlanRequest) -> Iterator[Plan | None]:
         """Do the work of `steps`, without the time that the field takes."""
         grid, start, rule = request.grid, request.start, request.move_rule
-        status = self._refusal(request)
+        goals = tuple(sorted({goal for goal in request.goals if grid.is_free(goal)}))
+        status = self._refusal(request, goals)
         if status is not None:
             yield Plan(status, move_rule=rule)
             return
-        goals = tuple(sorted({goal for goal in request.goals if grid.is_free(goal)}))
-        known = self.fields.find(grid, goals, rule) if grid.is_free(start) else None
-        began, costs = time.perf_counter(), None
-        plan = known.rollout_if_known(start, request.simplified) if known else None
-        if plan is None or (not plan.path.size and request.reach >= 1):
+        # A field that is known answers at once; else it is computed, or grown as far as the start.
+        field = self.fields.find(grid, goals, rule) if grid.is_free(start) else None
+        costs = None
+        if field is None or not field.is_known(start):
             yield None
-        if plan is None:
             costs = self.fields.costs(grid, rule)
             if costs is None and len(goals) > 1:
                 goals = self._nearest_alone(request, goals)
@@ -298,27 +296,29 @@ class Planner:
                 field = self.fields.get(grid, goals, rule, start, costs)
                 while not field.grow(start, VISITS):
                     yield None
-                began = time.perf_counter()
-                plan = field.rollout(start, request.simplified)
-        if plan and plan.path.size:
-            yield _dressed(request, plan, (start,), began)
-            return
-        if plan and plan.status is PlanStatus.NO_PATH and request.reach < 1:
-            yield plan
-            return
-        found = way_and_ends(request, goals)
-        if isinstance(found, PlanStatus):
-            yield Plan(found, move_rule=rule)
-            return
-        way_out, goals = found
-        field = self.fields.get(grid, goals, rule, way_out[-1], costs)
+        way_out: tuple[Cell, ...] = (start,)
         began = time.perf_counter()
-        plan = field.rollout(way_out[-1], request.simplified)
-        if not plan.path.size and request.method is PlanMethod.ASTAR_FALLBACK:
-            yield None
+        plan = field.rollout(start, request.simplified) if field is not None else None
+        if plan is None or not plan.path.size:
+            if plan is not None and request.reach >= 1:
+                yield None
+            elif plan is not None and plan.status is PlanStatus.NO_PATH:
+                yield plan
+                return
+            # A look at the whole map finds a way out and goals in reach, or why there are none.
+            found = way_and_ends(request, goals)
+            if isinstance(found, PlanStatus):
+                yield Plan(found, move_rule=rule)
+                return
+            way_out, goals = found
+            field = self.fields.get(grid, goals, rule, way_out[-1], costs)
             began = time.perf_counter()
-            cells = np.array(search(way_out[-1], field.goal, grid, rule, field.value))
-            plan = Plan(PlanStatus.SUCCEEDED, cells, PlanMethod.ASTAR_FALLBACK)
+            plan = field.rollout(way_out[-1], request.simplified)
+            if not plan.path.size and request.method is PlanMethod.ASTAR_FALLBACK:
+                yield None
+                began = time.perf_counter()
+                cells = np.array(search(way_out[-1], field.goal, grid, rule, field.value))
+                plan = Plan(PlanStatus.SUCCEEDED, cells, PlanMethod.ASTAR_FALLBACK)
         if plan.path.size:
             yield _dressed(request, plan, way_out, began)
         else:
@@ -326,7 +326,7 @@ class Planner:
 
     def _nearest_alone(self, request: PlanRequest, goals: Goals) -> Goals:
         """Return the nearest of several goals, by a field toward each."""
-        each = [replace(request, goal=goal, others=(), under_way=()) for goal in goals]
+        each = [replace(request, goals=(goal,), under_way=()) for goal in goals]
         plans = [plan for one in each if (plan := last_step(self.steps(one))).path.size]
         nearest = min(plans, key=lambda plan: plan.cost or plan.length, default=None)
         return nearest.cells[-1:] if nearest else goals[:1]

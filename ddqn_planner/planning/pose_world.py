@@ -8,10 +8,10 @@ from numpy.typing import DTypeLike, NDArray
 from ddqn_planner.compiled import in_place, inlined
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import OCCUPIED
-from ddqn_planner.grid.copies import few_of
+from ddqn_planner.grid.copies import Box
 from ddqn_planner.grid.grid_map import MULTIPLIERS
 from ddqn_planner.grid.motions import HEADINGS, Motions, closer
-from ddqn_planner.planning.field import CHANGED_SHARE, overlap, shift_between
+from ddqn_planner.planning.field import changed_cells
 from ddqn_planner.planning.segments import BITS
 
 SHIFT: Final = 2  # so many bits tell where in its tile a cell lies, along a side
@@ -131,7 +131,8 @@ def body_costs(grid: GridMap) -> NDArray[np.int8] | None:
     """Return what cells cost, if they do: the most where only a disc's body is too near."""
     if grid.cost is None or grid.obstacles is None:
         return grid.cost
-    return np.where(grid.occupancy, np.int8(OCCUPIED), grid.cost)
+    costs: NDArray[np.int8] = grid.cost + np.int8(OCCUPIED) * grid.occupancy  # there it is 0
+    return costs
 
 
 def _layer(layer: NDArray[Any] | None, dtype: DTypeLike) -> NDArray[Any]:
@@ -180,19 +181,12 @@ def differences(old: GridMap, new: GridMap) -> tuple[NDArray[np.int64], bool] | 
     None if the maps cannot be compared, or differ in too much.
     """
     before, after = occupied_for_body(old), occupied_for_body(new)
-    if shift_between(old, new) != (0, 0) or before.shape != after.shape:
-        return None
-    patches = new.patches_since(old)
-    boxes = [overlap(old, new, (0, 0))[1]] if patches is None else patches
-    found, opens = [np.empty((0, 2), np.int64)], False
-    for rows, columns in boxes:
-        box = rows, columns
-        differs = (before[box] != after[box]) | (new.differs(old, box, box) & ~after[box])
-        opens = opens or bool((differs & ~after[box]).any())
-        y, x = few_of(differs)
-        found.append(np.column_stack([x + columns.start, y + rows.start]))
-    cells = np.concatenate(found)
-    return None if len(cells) > CHANGED_SHARE * new.occupancy.size else (cells, opens)
+
+    def differs(box: Box) -> Any:
+        return (before[box] != after[box]) | (new.differs(old, box) & ~after[box])
+
+    cells = changed_cells(old, new, differs)
+    return None if cells is None else (cells, not after[cells[:, 1], cells[:, 0]].all())
 
 
 @inlined

@@ -14,8 +14,6 @@ from ddqn_planner.grid.grid_map import MULTIPLIERS, check_grid
 Path: TypeAlias = NDArray[np.int32]  # (N, 2): cells, joined by moves or by segments
 LONG: Final = 400  # cells: a longer path is pulled once, as twice saves less than 0.1 %
 SAME_COST: Final = 1 + 1e-9  # a path may cost so much more, and still as much: sums are rounded
-# Not to be written to, as those of maps.
-NO_LAYERS = [np.frombuffer(b"", kind).reshape(0, 0) for kind in (np.uint8, np.int8, np.float32)]
 BITS = np.zeros((3, 3), np.uint8)  # the action by which a step is taken, in a set of them
 BITS[MOVES[:, 1] + 1, MOVES[:, 0] + 1] = 1 << np.arange(8)
 
@@ -48,7 +46,7 @@ def simplify(cells: Cells, grid: GridMap, move_rule: MoveRule | str) -> tuple[Ce
 
 def straightened(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> Path:
     """Do the work of `simplify` for a path of one cell or more."""
-    layers, least, best = _layers(grid, move_rule), np.inf, np.asarray(path)
+    layers, least, best = grid.for_kernels(move_rule), np.inf, np.asarray(path)
     # Without costs, nothing between two cells costs less than a segment.
     until = np.cumsum(_segment_costs(path, layers, 1.0)) if grid.has_costs else np.empty(0)
     # From the end, other obstacles come first: the path may pass them on the better side.
@@ -67,7 +65,7 @@ def straightened(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> Path:
 
 def cost_along(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> float:
     """Return what a path of segments costs, legal or not: each cell counts by its share of it."""
-    return float(_segment_costs(path, _layers(grid, move_rule), 1.0).sum())
+    return float(_segment_costs(path, grid.for_kernels(move_rule), 1.0).sum())
 
 
 def legal_segments(
@@ -76,7 +74,7 @@ def legal_segments(
     """Return which segments are legal, see `simplify`, the first one from a share of it on."""
     begins = np.zeros(len(path))
     begins[1:2] = begin
-    return _segment_costs(path, _layers(grid, move_rule), begins)[1:] < np.inf
+    return _segment_costs(path, grid.for_kernels(move_rule), begins)[1:] < np.inf
 
 
 def _segment_costs(path: Cells, layers: tuple[Any, ...], begins: Any) -> NDArray[np.float64]:
@@ -85,13 +83,6 @@ def _segment_costs(path: Cells, layers: tuple[Any, ...], begins: Any) -> NDArray
     cells, costs = np.array(path, np.int64), np.full(len(path), begins)
     _costs(cells, costs, layers)
     return costs
-
-
-def _layers(grid: GridMap, move_rule: MoveRule | str) -> tuple[Any, ...]:
-    """Return what decides of a segment; empty arrays for missing layers, so that one code does."""
-    rule, layers = MoveRule(move_rule), (grid.forbidden, grid.cost, grid.slowness)
-    known = [none if it is None else it for it, none in zip(layers, NO_LAYERS, strict=True)]
-    return grid.occupancy, *known, rule.cuts_corners, rule is MoveRule.UNIT
 
 
 @inlined
@@ -103,6 +94,14 @@ def _length(width: int, height: int, is_unit: bool) -> float:
 
 
 @inlined
+def multiplier_at(x: int, y: int, layers: Any) -> Any:
+    """Return the cost multiplier of a cell, see `GridMap.cost_multiplier`."""
+    _, _, cost, slowness, _, _ = layers
+    multiplier = np.float64(MULTIPLIERS[cost[y, x]]) if cost.size else 1.0
+    return multiplier * slowness[y, x] if slowness.size else multiplier
+
+
+@inlined
 def _is_free(x: int, y: int, occupancy: Any) -> bool:
     """Return whether a cell lies on the map and is free."""
     return 0 <= x < occupancy.shape[1] and 0 <= y < occupancy.shape[0] and not occupancy[y, x]
@@ -111,7 +110,7 @@ def _is_free(x: int, y: int, occupancy: Any) -> bool:
 @inlined
 def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -> float:
     """Return the cost of a segment, infinity if it is not legal from a share of it on."""
-    occupancy, forbidden, cost, slowness, cuts_corners, is_unit = layers
+    occupancy, forbidden, _, _, cuts_corners, is_unit = layers
     dx, dy = last_x - x, last_y - y
     step_x, step_y = (dx > 0) - (dx < 0), (dy > 0) - (dy < 0)
     width, height = abs(dx), abs(dy)
@@ -134,8 +133,7 @@ def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -
         if at_column == at_row and until < whole and not cuts_corners:
             blocked |= occupancy[y, x + step_x] | occupancy[y + step_y, x]
         legal = until <= ignored or not blocked
-        multiplier = np.float64(MULTIPLIERS[cost[y, x]]) if cost.size else 1.0
-        total += (until - at) * (multiplier * slowness[y, x] if slowness.size else multiplier)
+        total += (until - at) * multiplier_at(x, y, layers)
         at = until
         if at_column == until:
             x, at_column = x + step_x, at_column + 2 * height

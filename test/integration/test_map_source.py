@@ -580,7 +580,7 @@ def test_the_plan_goes_round_and_its_time_is_told(times: ExpectedTimes) -> None:
     planner = Planner.load("any_map")
     timed = times.apply(GRID)
     plan = planner.plan(timed, (22, 20), (98, 20))
-    request = PlanRequest(timed, (22, 20), (98, 20), MoveRule.ROBOT_SAFE)
+    request = PlanRequest(timed, (22, 20), ((98, 20),), MoveRule.ROBOT_SAFE)
     told = times.describe(Outcome("SUCCEEDED", "", planner, request, plan))
     seconds = float(told["expected time (s)"])
     low, high = map(float, told["expected time, 90 % interval (s)"].split(" to "))

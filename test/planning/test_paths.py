@@ -186,7 +186,9 @@ def test_what_is_kept_is_cheap(place: Place, rule: MoveRule, threshold: float, d
     robot = data.draw(st.sampled_from([*filter(after.is_free, under_way), *after.free_cells()]))
     new = shortest_path(after, robot, goal, rule)
     assume(new)
-    request = PlanRequest(after, robot, goal, rule, under_way=under_way, switch_threshold=threshold)
+    request = PlanRequest(
+        after, robot, (goal,), rule, under_way=under_way, switch_threshold=threshold
+    )
     path, extra_cost = keep_or_switch(request, np.array(new, dtype=np.int32))
     assert (tuple(path[0]), tuple(path[-1])) == (robot, goal)
     assert legal_segments(path, after, rule).all()
@@ -210,7 +212,9 @@ def test_a_path_pulled_straight_through_an_opening_is_a_new_one() -> None:
     walled[4, 4] = False
     opened, new = GridMap(walled), np.array([start, goal], dtype=np.int32)
     for simplified in (True, False):
-        request = PlanRequest(opened, start, goal, rule, simplified=simplified, under_way=under_way)
+        request = PlanRequest(
+            opened, start, (goal,), rule, simplified=simplified, under_way=under_way
+        )
         path, extra_cost = keep_or_switch(request, new)
         assert path.tolist() == new.tolist()
         assert extra_cost is None
@@ -491,7 +495,7 @@ def test_a_path_is_kept_on_a_way_out(blocked: list[Cell], is_kept: bool, begin: 
     occupancy[2, 3] = is_kept  # so that there the way out leads north
     under_way = [(0, 2), (1, 2), (2, 2), (2, 3), *((x, 4) for x in range(3, 12))]
     options = {"under_way": under_way, "switch_threshold": 1.0, "start_clearing_radius": 0.5}
-    ends = (2, 2), (11, 4)
+    ends = (2, 2), ((11, 4),)
     request = PlanRequest(GridMap(occupancy), *ends, MoveRule.ROBOT_SAFE, **options)
     plan = last_step(ANY_MAP.steps(request))
     assert plan.cells == (*begin, *under_way[6:])

@@ -35,9 +35,11 @@ def known_field(planner: Planner, grid: GridMap, goal: Cell, rule: MoveRule) -> 
     return planner.fields.find(grid, (goal,), rule)
 
 
-def is_answered_at_once(planner: Planner, *request: Any, **more: Any) -> bool:
+def is_answered_at_once(
+    planner: Planner, grid: GridMap, start: Cell, goal: Cell, *how: Any, **more: Any
+) -> bool:
     """Whether no step of a request is slow: no field is computed, and nothing is searched for."""
-    return next(planner.steps(PlanRequest(*request, **more))) is not None
+    return next(planner.steps(PlanRequest(grid, start, (goal,), *how, **more))) is not None
 
 
 def check_legal(cells: tuple[Cell, ...], grid: GridMap, rule: MoveRule) -> None:
@@ -140,7 +142,7 @@ def test_a_plan_tells_how_long_field_and_rollout_took(monkeypatch: pytest.Monkey
     assert again.field_ms < 50 <= plan.field_ms
     assert plan.rollout_ms > 0
     # The time between two steps does not count.
-    steps, began = planner.steps(PlanRequest(grid, (0, 0), (3, 3), "unit")), time.perf_counter()
+    steps, began = planner.steps(PlanRequest(grid, (0, 0), ((3, 3),), "unit")), time.perf_counter()
     assert next(steps) is None
     time.sleep(0.2)
     found, waited = last_step(steps), 1e3 * (time.perf_counter() - began)
@@ -156,14 +158,14 @@ def test_a_field_grows_in_steps_and_others_are_answered(monkeypatch: pytest.Monk
     closed[20] = True
     monkeypatch.setattr("ddqn_planner.planning.planner.VISITS", 20)
     planner = Planner.load("any_map")
-    steps = planner.steps(PlanRequest(grid, (0, 0), (0, 39), MoveRule.ROBOT_SAFE))
+    steps = planner.steps(PlanRequest(grid, (0, 0), ((0, 39),), MoveRule.ROBOT_SAFE))
     waited = 0
     for plan in steps:
         waited += plan is None
         assert planner.plan(grid, (waited % 40, 0), (5, 5)).status is PlanStatus.SUCCEEDED
     assert waited > 10
     assert plan == whole
-    given_up = planner.steps(PlanRequest(grid, (0, 0), (1, 39), MoveRule.ROBOT_SAFE))
+    given_up = planner.steps(PlanRequest(grid, (0, 0), ((1, 39),), MoveRule.ROBOT_SAFE))
     assert next(given_up) is next(given_up) is None
     given_up.close()  # type: ignore[attr-defined]
     assert planner.plan(grid, (0, 0), (1, 39)).status is PlanStatus.SUCCEEDED
@@ -372,10 +374,10 @@ def test_a_network_without_costs_plans_to_each_goal() -> None:
 def test_a_robot_between_two_docks_keeps_to_one_of_them(has_costs: bool) -> None:
     planner = ANY_MAP if has_costs else turning_planner(21)
     grid, left, right = GridMap(np.zeros((21, 21))), (0, 10), (20, 10)
-    request = PlanRequest(grid, (9, 10), left, MoveRule.ROBOT_SAFE, PlanMethod.ASTAR_FALLBACK)
-    first = last_step(planner.steps(replace(request, others=(right,))))
+    request = PlanRequest(grid, (9, 10), (left,), MoveRule.ROBOT_SAFE, PlanMethod.ASTAR_FALLBACK)
+    first = last_step(planner.steps(replace(request, goals=(left, right))))
     assert first.goal == left
-    request = replace(request, start=(11, 10), others=(right,), under_way=first.path)
+    request = replace(request, start=(11, 10), goals=(left, right), under_way=first.path)
     kept = last_step(planner.steps(replace(request, switch_threshold=0.5)))
     assert (kept.goal, kept.length) == (left, 11)
     assert kept.extra_cost == pytest.approx(11 / 9 - 1)
