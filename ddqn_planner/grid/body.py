@@ -67,8 +67,8 @@ def inflate(grid: GridMap, robot_radius: float, clearance_weight: float = 0.0) -
     occupancy = grid.occupancy | (metres < robot_radius * (1 - ROUNDING))
     cost = grid.cost
     if clearance_weight > 0:
-        beyond = np.maximum(metres - robot_radius, 0.0)
-        share = clearance_weight / (1 + beyond / CLEARANCE_SCALE) ** 3
+        fall = 1 + np.maximum(metres - robot_radius, 0.0) / CLEARANCE_SCALE
+        share = clearance_weight / (fall * fall * fall)  # ** 3 takes 20 times as long
         cost = np.rint((OCCUPIED - 1) * share).astype(np.int8)
         if grid.cost is not None:
             cost = np.where(grid.cost == UNKNOWN, UNKNOWN, np.maximum(cost, grid.cost))

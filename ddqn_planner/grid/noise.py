@@ -49,10 +49,9 @@ def random_requests(
     occupancy: Occupancy, move_rule: MoveRule, count: int, random: np.random.Generator
 ) -> list[tuple[Cell, Cell]]:
     """Draw starts, uniform over the cells with a move, and goals, uniform over those in reach."""
-    cells = np.flatnonzero(~occupancy)
-    label_of_cell = GridMap(occupancy).labels(move_rule).ravel()[cells]
-    order = np.argsort(label_of_cell, kind="stable")
-    cells, label_of_cell = cells[order], label_of_cell[order]
+    labels = GridMap(occupancy).labels(move_rule).ravel()
+    cells = np.argsort(labels, kind="stable")[np.count_nonzero(occupancy) :]
+    label_of_cell = labels[cells]
     sizes = np.bincount(label_of_cell)
     first_of_label = np.cumsum(sizes) - sizes
     candidates = np.flatnonzero(sizes[label_of_cell] > 1)
