@@ -82,11 +82,11 @@ class MoveCosts(NamedTuple):
             least = float(2 * self.low[min(lowest, OCCUPIED) + 1])
             costs = costs._replace(value=value, least=least)
         if grid.forbidden is not None:
-            forbidden = np.pad(grid.forbidden, 1).ravel()
+            forbidden = _with_border(grid.forbidden, 0).ravel()
             patch, table = _with_directions(patch, self.table, forbidden)
             costs = costs._replace(patch=patch, table=table)
         if grid.slowness is not None:
-            multiplier = np.pad(grid.cost_multiplier, 1, constant_values=1).ravel()
+            multiplier = _with_border(grid.cost_multiplier, 1).ravel()
             greatest = self.table.max(where=np.isfinite(self.table), initial=1)
             highest, least = float(greatest * multiplier.max()), float(grid.cost_multiplier.min())
             costs = costs._replace(multiplier=multiplier, highest=highest, least=least)
@@ -121,12 +121,19 @@ def cell_values(occupancy: NDArray[np.bool_], cost: NDArray[np.int8]) -> NDArray
     """Return the value of each cell, see `VALUES`: (C,) uint8."""
     # The cost of an occupied cell is 0.
     values = cost.view(np.uint8) + np.uint8(-UNKNOWN) + occupancy * np.uint8(OCCUPIED)
-    return np.pad(values, 1, constant_values=VALUES - 1).ravel()
+    return _with_border(values, VALUES - 1).ravel()
+
+
+def _with_border(inside: NDArray[Any], value: int) -> NDArray[Any]:
+    """Return an array with one more cell of a value on each side: `np.pad` takes 50 µs longer."""
+    array = np.full((inside.shape[0] + 2, inside.shape[1] + 2), value, inside.dtype)
+    array[1:-1, 1:-1] = inside
+    return array
 
 
 def patch_numbers(occupancy: NDArray[np.bool_]) -> NDArray[np.uint16]:
     """Return each cell's patch: (C,) uint16, with bit 3 y + x where its cell (x, y) is occupied."""
-    occupied = np.pad(occupancy, 1, constant_values=True).view(np.uint8)
+    occupied = _with_border(occupancy, 1).view(np.uint8)
     numbers = np.full(occupied.shape, OUTSIDE, np.uint16)
     _patch_numbers(occupied, numbers)
     return numbers.ravel()
