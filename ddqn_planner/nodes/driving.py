@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -16,8 +17,7 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
 
-from ddqn_planner.experience import drives
-from ddqn_planner.experience.drives import DriveEnd, DriveFolder, DriveRecorder
+from ddqn_planner.experience.drives import DriveEnd, DriveFolder, DriveRecorder, read_drives
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import occupancy_message, path_bytes
 from ddqn_planner.nodes.poses import Frames, listen
@@ -33,7 +33,7 @@ SLOWEST = 10.0  # the slowness that ``~/slowness`` shows as 100
 WRONG = np.log(1.5)  # of the nominal speed, compared with that of drives
 MORE_PLACES = 1.1  # times as many as the last time
 NOT_RECORDING = "no drives are being recorded; call ~/start first"
-NO_MAP = "no map was received yet; start a map server"
+NO_MAP = "no map was received yet; start a map server, or set map_file"
 
 
 class MapInFrame(NamedTuple):
@@ -44,7 +44,7 @@ class MapInFrame(NamedTuple):
 
 
 class DrivingRobot:
-    """Divides what it hears of the robot of a namespace into drives, while the node records."""
+    """Divides what it hears of the robot of a namespace into drives."""
 
     def __init__(
         self, node: TrainerNode, frames: Frames, name: str, on_drive: Callable[..., Any]
@@ -71,8 +71,7 @@ class DrivingRobot:
             return
         if not seconds:
             raise ValueError("the robot's pose has no stamp; give it the time")
-        if self._node.state == "recording":
-            self.recorder.add(seconds, *position)
+        self.recorder.add(seconds, *position)
 
     def _look_up(self) -> None:
         if (place := self._node.map) is None:
@@ -82,7 +81,7 @@ class DrivingRobot:
             try:
                 pose = self._frames.origin_of(frame, place.frame)
             except ValueError as error:
-                raise ValueError(f"{error}; publish a transform, or set robot_frame") from None
+                raise ValueError(f"{error}, or set robot_frame") from None
             self._on_pose(pose)
 
     def _on_goal(self, goal: PoseStamped) -> None:
@@ -109,7 +108,7 @@ class DrivingRobot:
         # What failed before the node listened failed elsewhere.
         before = aborted if self._aborted is None else self._aborted
         self._aborted = before | aborted
-        if self._node.state == "recording" and aborted - before:
+        if aborted - before:
             self.recorder.abort()
 
     def told(self) -> dict[str, str]:
@@ -126,8 +125,9 @@ class Driving:
 
     def __init__(self, node: TrainerNode) -> None:
         self._node = node
-        self._folder: DriveFolder | None = None
-        self._last_drive, self._is_disk_full = "", False
+        self._folder: DriveFolder | None = None  # while drives are recorded
+        self._values = {"last drive": ""}  # what the diagnostics say of them
+        self._is_disk_full = False
         self._shown: GridMap | None = None
         self._slowness = node.create_publisher(OccupancyGrid, "~/slowness", LATCHED)
         frames, names = Frames(node), node.value("robots") or [""]
@@ -138,24 +138,22 @@ class Driving:
         self._learning = node.create_timer(1.0, self._learn_prior, group, clock=STEADY)
         self.start()
 
-    def _recording(self) -> DriveFolder | None:
-        return self._folder if self._node.state == "recording" else None
-
     def _on_drive(
         self, by_robot: str, outcome: DriveEnd, seconds: Float64, positions: Float64
     ) -> None:
-        place, folder = self._node.map, self._recording()
+        place, folder = self._node.map, self._folder
         if place is None or folder is None:
             return
         try:
             drive = folder.add(outcome, seconds, positions, place.grid)
         except Exception as error:  # the node must survive
-            self._node.refusals.refuse("output_folder", explained(error))
+            self._node.fail("a drive taught nothing", error)
             return
-        self._last_drive = f"{drive.number}{by_robot}: {drive.metres:.1f} m, {outcome.value}"
-        self._node.get_logger().info(f"drive {self._last_drive}")
+        last = f"{drive.number}{by_robot}: {drive.metres:.1f} m, {outcome.value}"
+        self._values["last drive"] = last
+        self._node.get_logger().info(f"drive {last}")
         if self._node.replaying is None:
-            self._draw(place, positions)
+            self.draw(place, positions)
         self._tell_saved(folder)
 
     def _save(self, folder: DriveFolder) -> None:
@@ -171,12 +169,18 @@ class Driving:
         if self._is_speed_wrong and not was_wrong:
             wrong = f"the robot drives {speed:.3g} m/s in the open, nominal_speed is {given:g}"
             self._node.get_logger().warning(f"{wrong}; set it before you learn anew")
+        self._values |= {
+            "drives": str(folder.drives),
+            "learned speed (m/s)": f"{speed:.3f}",
+            "places": str(len(slow.places)),
+            "folder": str(folder.folder),
+        }
         data, path = folder.experience.to_bytes(), folder.experience_path
-        self._node.tell_saved("the drives are", data, path, folder.save_error)
+        self._node.tell_saved(data, path, folder.save_error)
 
     async def _learn_prior(self) -> None:
         """Train the prior, and again once drives have shown a tenth more places."""
-        place, folder = self._node.map, self._recording()
+        place, folder = self._node.map, self._folder
         if place is None or folder is None:
             return
         evidence, before = folder.experience.evidence, self._places_of_prior
@@ -194,21 +198,15 @@ class Driving:
             self._node.get_logger().warning(f"the map foretells nothing: {explained(error)}")
             return
         evidence = folder.experience.evidence
-        if folder is self._recording() and len(evidence.places) >= known:  # else it was forgotten
+        if folder is self._folder and len(evidence.places) >= known:  # else it was forgotten
             folder.experience.prior = prior
             self._save(folder)
 
-    def _draw(self, place: MapInFrame, positions: Float64) -> None:
-        yaw = np.arctan2(*np.diff(positions, axis=0).T[::-1])
-        yaw = np.append(yaw, yaw[-1] if len(yaw) else 0.0)
-        self._node.episodes.publish(path_bytes(positions, yaw, self._node.header(place.frame)))
-
     def _show_slowness(self) -> None:
-        place, folder = self._node.map, self._recording()
-        if place is None or folder is None:
+        place, folder = self._node.map, self._folder
+        if place is None or folder is None or self._shown is (grid := place.grid):
             return
-        grid = place.grid
-        if self._shown is grid or not self._slowness.get_subscription_count():
+        if not self._slowness.get_subscription_count():
             return
         self._shown = grid
         slowness = folder.experience.slowness(grid)
@@ -217,55 +215,49 @@ class Driving:
         header = self._node.header(place.frame)
         self._slowness.publish(occupancy_message(percent, grid.resolution, grid.origin, header))
 
-    # Services
+    # Services, and what the node asks of whatever it learns from
 
     def start(self) -> tuple[bool, str]:
         """Record drives, which begin anew."""
-        if self._recording():
+        if self._folder is not None:
             return False, "drives are being recorded already; call ~/stop first"
         names = "nominal_speed", "robot_width", "experience"
         try:
             folder = DriveFolder(self._node.folder, *map(self._node.value, names))
         except Exception as error:  # the node must survive
             self._node.state, self._is_disk_full = "failed", isinstance(error, OSError)
-            self._node.refusals.refuse("output_folder", explained(error))
-            return False, explained(error)
-        self._folder, self._node.state = folder, "recording"
+            return self._node.fail("the recording cannot start", error)
+        self._folder, self._node.state, self._node.error = folder, "recording", ""
         for robot in self._robots:
             robot.recorder.forget()
-        self._node.refusals.accept("output_folder")
         self._node.get_logger().info(f"recording drives in {folder.folder}")
         self._save(folder)
         return True, f"recording in {folder.folder} after drive {folder.drives}"
 
     def stop(self) -> tuple[bool, str]:
         """Record the drive that is under way, save, and record no more."""
-        replay = self._node.stop_replay()
-        folder = self._recording()
-        if folder is None:
+        if (folder := self._folder) is None:
             self._node.state = "stopped"
-            return True, f"no drives were being recorded{replay}"
+            return True, "no drives were being recorded"
         for robot in self._robots:
             robot.recorder.end(DriveEnd.STOPPED)
         self._save(folder)
         if folder.save_error:
             return False, folder.save_error
         folder.close()
-        self._node.state = "stopped"
-        return True, f"stopped after drive {folder.drives}; ~/start continues{replay}"
+        self._folder, self._node.state = None, "stopped"
+        return True, f"stopped after drive {folder.drives}; ~/start continues"
 
     def save(self) -> tuple[bool, str]:
         """Save now."""
-        folder = self._recording()
-        if folder is None:
+        if (folder := self._folder) is None:
             return False, NOT_RECORDING
         self._save(folder)
         return not folder.save_error, folder.save_error or f"saved in {folder.folder}"
 
     def forget(self) -> tuple[bool, str]:
         """Forget what was learned."""
-        folder = self._recording()
-        if folder is None:
+        if (folder := self._folder) is None:
             return False, NOT_RECORDING
         try:
             kept = folder.forget()
@@ -277,32 +269,27 @@ class Driving:
         done = f"forgot all but the drives. {kept} has what was known: {undo}"
         return not folder.save_error, folder.save_error or done
 
-    def replay(self) -> tuple[bool, str]:
-        """Draw the recorded drives."""
-        file = self._node.folder / drives.RECORD
-        ways = (drive.positions[::5] for drive in drives.read_drives(file))  # else it takes long
-        return self._node.play(self._node.map, file, ways, self._draw, "drive on")
+    def recorded(self, file: Path) -> tuple[MapInFrame | None, Iterator[Float64]]:
+        """Return the drives of a file, and the map that they are on."""
+        # Of all poses a replay would take long.
+        return self._node.map, (drive.positions[::5] for drive in read_drives(file))
 
-    def look(self) -> None:
-        """Try again what failed for a full disk, and show what is learned, each second."""
-        folder = self._recording()
-        if folder is not None and folder.save_error:
-            self._save(folder)
+    def draw(self, place: MapInFrame, positions: Float64) -> None:
+        """Publish a drive."""
+        yaw = np.arctan2(*np.diff(positions, axis=0).T[::-1])
+        yaw = np.append(yaw, yaw[-1] if len(yaw) else 0.0)
+        self._node.episodes.publish(path_bytes(positions, yaw, self._node.header(place.frame)))
+
+    def look(self) -> dict[str, str]:
+        """Try again what failed for a full disk, show what is learned, and tell of it."""
+        if self._folder is not None and self._folder.save_error:
+            self._save(self._folder)
         elif self._node.state == "failed" and self._is_disk_full:
             self.start()
         self._show_slowness()
-        values = {"last drive": self._last_drive}
         for robot in self._robots:
-            values |= robot.told()
-        if self._folder is not None:
-            values |= {
-                "drives": str(self._folder.drives),
-                "learned speed (m/s)": f"{self._folder.experience.learned_speed:.3f}",
-                "places": str(len(self._folder.experience.evidence.places)),
-                "folder": str(self._folder.folder),
-            }
-        missing = f"{NO_MAP}, or set map_file" if self._node.map is None else ""
-        self._node.publish_diagnostics("driving", values, missing=missing)
+            self._values |= robot.told()
+        return self._values
 
 
 def explained(error: Exception) -> str:

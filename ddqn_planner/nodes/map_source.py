@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from nav_msgs.msg import OccupancyGrid
@@ -40,6 +40,15 @@ REMEDY = "let the map's publisher send the full map"
 CHANGED_SHARE = 0.02  # of cells: with more, experience is spread anew over the map, slowly
 
 
+# A map server publishes them for each of its maps, with the map's stamp: then the next map waits
+# for its own, which may come seconds after it, or never if the map server is killed.
+class Directions(NamedTuple):
+    """A message of forbidden directions: its header, and their map, unless it forbids nothing."""
+
+    header: Header
+    grid: GridMap | None
+
+
 @dataclass
 class Received:
     """A map, and the header and the time of its last message: its own, or that of an update."""
@@ -47,32 +56,37 @@ class Received:
     message: OccupancyGrid
     header: Header
     came: float
+    directions: Directions | None = None  # those with which it is in use
 
 
 class MapSource:
-    """The map to plan on; `on_map` is called, with whether the frame is new, when anything is."""
+    """The map to plan on; `on_map` is called when anything about it is new."""
 
     def __init__(
-        self, node: BaseNode, report: Report, worker: Worker, on_map: Callable[[bool], None]
+        self, node: BaseNode, report: Report, worker: Worker, on_map: Callable[[], None]
     ) -> None:
         self._node, self._report, self._worker, self._on_map = node, report, worker, on_map
         self.times = ExpectedTimes(node, report, worker, self.change)
         # The map in use and the last one. If that is another one, it waits for its directions.
         self._used: Received | None = None
         self._newest: Received | None = None
+        self._grid: GridMap  # of the one in use, with directions
+        self._directions: Directions | None = None  # the last ones
         self._began = time.monotonic()
-        self._described = ""
         self._updates = self._applied_updates = 0
         self._inflate = Inflation()
         self._ready: Future | None = None
         # Before the subscription of the map: directions that come with a map are taken first.
-        node.create_subscription(OccupancyGrid, DIRECTIONS, self._take_directions, LATCHED)
-        self._directions = Directions(node)
+        before = node.create_subscription(OccupancyGrid, DIRECTIONS, self._take_directions, LATCHED)
+        self._directions_topic = before.topic_name
         self._topic = node.create_subscription(OccupancyGrid, "map", self._take, LATCHED).topic_name
-        self._updates_topic = f"{self._topic}_updates"
+        updates = f"{self._topic}_updates"
         if OccupancyGridUpdate is not None:
-            kind, topic = OccupancyGridUpdate, self._updates_topic
-            node.create_subscription(kind, topic, self._take_update, UPDATES_QUALITY)
+            kind = OccupancyGridUpdate
+            node.create_subscription(kind, updates, self._take_update, UPDATES_QUALITY)
+        else:
+            missing = "is not read: map_msgs is not installed; apt install ros-jazzy-map-msgs, or"
+            node.get_logger().info(f"{updates} {missing} {REMEDY}")
         node.get_logger().info(f"waiting for a map on {self._topic}")
 
     @property
@@ -109,8 +123,9 @@ class MapSource:
         """Return what the diagnostics say of the map."""
         description = {}
         if self._used is not None:
-            description["map"] = self._described
-            description["map stamp (s)"] = seconds(self._used.header.stamp)
+            grid, stamp = self._grid, seconds(self._used.header.stamp)
+            size = f"{grid.width} x {grid.height} cells of {grid.resolution:.6g} m"
+            description = {"map": f"{size} in frame {self.frame!r}", "map stamp (s)": stamp}
         if self._updates:
             description["map updates applied"] = str(self._applied_updates)
             description["map updates refused"] = str(self._updates - self._applied_updates)
@@ -123,9 +138,8 @@ class MapSource:
             radius, weight = map(self._node.value, BODY_PARAMETERS)
             # ROS accepts a value that is above the range by a millionth.
             of_body = self._grid, radius, min(weight, 1.0)
-            ready = self._ready = self._worker.call(
-                lambda: self.times.apply(self._inflate(*of_body))
-            )
+            ready = self._worker.call(lambda: self.times.apply(self._inflate(*of_body)))
+            self._ready = ready
         return ready
 
     def apply_parameters(self, changed: set[str]) -> None:
@@ -135,16 +149,24 @@ class MapSource:
         if "experience" in changed:
             self.times.read()
 
+    def change(self) -> None:
+        """Plan on what is new."""
+        self._ready = None
+        self._report.change()
+        self._on_map()
+
     def _take(self, message: OccupancyGrid) -> None:
         try:
-            grid = self._changed_map(message)
-            grid = grid or grid_from_message(message, *map(self._node.value, MAP_PARAMETERS))
+            grid = self._changed_map(message) or self._read(message)
         except (ValueError, MemoryError) as error:
             self._report.refuse("map", str(error) or repr(error))
             return
         self._newest = Received(message, message.header, time.monotonic())
         self._report.accept("map_updates")
         self._use(grid, self._newest)
+
+    def _read(self, message: OccupancyGrid) -> GridMap:
+        return grid_from_message(message, *map(self._node.value, MAP_PARAMETERS))
 
     def _changed_map(self, message: OccupancyGrid) -> GridMap | None:
         """Return the map in use with what a message of the same place has else; None for others."""
@@ -153,10 +175,8 @@ class MapSource:
             return None
         if _place(message) != _place(last.message):
             return None
-        grid, shape = self._grid, self._grid.occupancy.shape
-        both = message.data, last.message.data
-        new, old = (np.frombuffer(data, np.int8).reshape(shape) for data in both)
-        for box in boxes_of(new != old):
+        grid, new = self._grid, _values(message)
+        for box in boxes_of(new != _values(last.message)):
             grid = self._patched(grid, new[box], box[1].start, box[0].start)
         return grid
 
@@ -164,51 +184,6 @@ class MapSource:
         rules = map(self._node.value, MAP_PARAMETERS)
         patch = grid_from_values(values, 1.0, (0.0, 0.0, 0.0), *rules)
         return grid.with_patch(patch.occupancy, x, y, patch.cost, patch.obstacles)
-
-    def _take_directions(self, message: OccupancyGrid) -> None:
-        with self._report.taking(DIRECTIONS):
-            self._directions.take(message)
-            self._read_again()
-
-    def _read_again(self) -> None:
-        """Plan on the newest map if its directions have come, else on the one in use."""
-        for received in filter(None, (self._newest, self._used)):
-            grid = grid_from_message(received.message, *map(self._node.value, MAP_PARAMETERS))
-            if self._use(grid, received):
-                break
-
-    def _use(self, grid: GridMap, received: Received) -> bool:
-        """Plan on a map from now on; return whether its directions let it."""
-        try:
-            self._grid = self._directions.on(grid, received.message.header)
-        except ValueError as error:
-            if self._directions.used is None:  # no map before it had any
-                self._used = None
-            if received is self._newest:  # without a log: they may be on their way
-                self._report.refuse("map", str(error), log=False)
-            return False
-        frame_changed, self._used = received.header.frame_id != self.frame, received
-        if received is self._newest:
-            self._report.accept("map")
-        info = received.message.info
-        described = (
-            f"{info.width} x {info.height} cells of {info.resolution:.6g} m in frame {self.frame!r}"
-        )
-        if described != self._described:
-            self._described = described
-            self._node.get_logger().info(f"map of {described}")
-        if OccupancyGridUpdate is None and self._node.count_publishers(self._updates_topic):
-            missing = "is not read: map_msgs is not installed; apt install ros-jazzy-map-msgs, or"
-            warning = f"{self._updates_topic} {missing} {REMEDY}"
-            self._node.get_logger().warning(warning, once=True)
-        self.change(frame_changed)
-        return True
-
-    def change(self, frame_changed: bool = False) -> None:
-        """Plan on what is new."""
-        self._ready = None
-        self._report.change()
-        self._on_map(frame_changed)
 
     def _take_update(self, update: Any) -> None:
         """Plan on the map with other values in a box from now on, or refuse the update."""
@@ -220,18 +195,89 @@ class MapSource:
             if newest is self._used:
                 self._grid = self._patched(self._grid, values, update.x, update.y)
             # In place, for the day when a parameter changes and the map is read anew.
-            info, (height, width) = newest.message.info, values.shape
-            whole = np.frombuffer(newest.message.data, np.int8).reshape(info.height, info.width)
+            whole, (height, width) = _values(newest.message), values.shape
             whole[update.y : update.y + height, update.x : update.x + width] = values
             newest.header, newest.came = update.header, time.monotonic()
             self._applied_updates += 1
             if newest is self._used:
                 self.change()
 
+    def _take_directions(self, message: OccupancyGrid) -> None:
+        with self._report.taking(DIRECTIONS):
+            grid = None
+            if message.info.width or message.info.height or message.data:
+                grid = grid_from_message(message)
+                grid = grid.with_layers(forbidden=_values(message).view(np.uint8))
+            self._directions = Directions(message.header, grid)
+            self._read_again()
+
+    def _read_again(self) -> None:
+        """Plan on the newest map if its directions have come, else on the one in use."""
+        for received in filter(None, (self._newest, self._used)):
+            if self._use(self._read(received.message), received):
+                break
+
+    def _use(self, grid: GridMap, received: Received) -> bool:
+        """Plan on a map from now on; return whether its directions let it."""
+        try:
+            grid, directions = self._directed(grid, received.message.header)
+        except ValueError as error:
+            if self._used is not None and self._used.directions is None:
+                self._used = None  # there are directions now
+            if received is self._newest:  # without a log: they may be on their way
+                self._report.refuse("map", str(error), log=False)
+            return False
+        self._used, self._grid, received.directions = received, grid, directions
+        if received is self._newest:
+            self._report.accept("map")
+        self.change()
+        return True
+
+    def _directed(self, grid: GridMap, header: Header) -> tuple[GridMap, Directions | None]:
+        """Return a map with the last directions, in the region they share, or with its own.
+
+        A ValueError says that they have not come, or do not fit.
+        """
+        # A map server creates this publisher first: whoever receives its map sees it already.
+        published = self._node.count_publishers(self._directions_topic) > 0
+        used = self._used
+        before = used.directions if used is not None else None
+        known = [each for each in (self._directions, before) if each is not None]
+        own = [each for each in known if each.header.stamp == header.stamp]
+        late = f"were not received on {self._directions_topic} yet"
+        if not known and (published or self._node.value("require_directions")):
+            remedy = "let a map server publish them, or set require_directions to false"
+            raise ValueError(f"the map's directions {late}; {remedy}")
+        if not known:
+            return grid, None
+        is_paired = used and before and used.message.header.stamp == before.header.stamp
+        if is_paired and published and not own:
+            what = f"the map's directions, with its stamp, {seconds(header.stamp)}"
+            raise ValueError(f"{what}, {late}; if they do not come, load the map again")
+        its, directions = found = (own or known)[0]
+        if directions is None or directions.forbidden is None:
+            return grid, found
+        offset = offset_between(directions, grid)
+        if its.frame_id != header.frame_id or offset is None:
+            raise ValueError(
+                f"the directions on {self._directions_topic} are not for this map: they have the "
+                f"frame {its.frame_id!r} and {directions.resolution:.6g} m per cell, the map "
+                f"{header.frame_id!r} and {grid.resolution:.6g} m; give both one frame, and "
+                "cells that lie on each other"
+            )
+        theirs, ours = overlap(directions, grid, offset)
+        forbidden = np.zeros(grid.occupancy.shape, dtype=np.uint8)
+        forbidden[ours] = directions.forbidden[theirs]
+        return replace(grid, forbidden=forbidden), found
+
 
 def _place(message: OccupancyGrid) -> tuple[Any, ...]:
     info, size = message.info, len(message.data)
     return message.header.frame_id, info.width, info.height, info.resolution, info.origin, size
+
+
+def _values(message: OccupancyGrid) -> NDArray[np.int8]:
+    return np.frombuffer(message.data, np.int8).reshape(message.info.height, message.info.width)
 
 
 def updated_values(message: OccupancyGrid, update: Any) -> NDArray[np.int8]:
@@ -251,60 +297,6 @@ def updated_values(message: OccupancyGrid, update: Any) -> NDArray[np.int8]:
     if len(update.data) != width * height:
         raise ValueError(f"the update has {len(update.data)} values; {box} need {width * height}")
     return np.frombuffer(update.data, np.int8).reshape(height, width)
-
-
-# A map server publishes them for each of its maps, with the map's stamp: then the next map waits
-# for its own, which may come seconds after it, or never if the map server is killed.
-class Directions:
-    """Forbidden directions: the last ones hold for each map, in the region they share."""
-
-    def __init__(self, node: BaseNode) -> None:
-        self._node, self._topic = node, node.resolve_topic_name(DIRECTIONS)
-        # The last ones, and those of the map in use; without a map where nothing is forbidden.
-        self._last: tuple[Header, GridMap | None] | None = None
-        self.used: tuple[Header, GridMap | None] | None = None
-        self._are_paired = False
-
-    def take(self, message: OccupancyGrid) -> None:
-        """Take a message; ValueError if it is malformed, and those before it stay."""
-        directions = None
-        if message.info.width or message.info.height or message.data:
-            place = grid_from_message(message)
-            forbidden = np.frombuffer(message.data, np.uint8).reshape(place.occupancy.shape)
-            directions = place.with_layers(forbidden=forbidden)
-        self._last = message.header, directions
-
-    def on(self, grid: GridMap, header: Header) -> GridMap:
-        """Return a map with its directions; ValueError if they have not come or do not fit it."""
-        # A map server creates this publisher first: whoever receives its map sees it already.
-        published = self._node.count_publishers(self._topic) > 0
-        known = [found for found in (self._last, self.used) if found is not None]
-        own = [found for found in known if found[0].stamp == header.stamp]
-        late = f"were not received on {self._topic} yet"
-        if not known and (published or self._node.value("require_directions")):
-            remedy = "let a map server publish them, or set require_directions to false"
-            raise ValueError(f"the map's directions {late}; {remedy}")
-        if self._are_paired and published and not own:
-            what = f"the map's directions, with its stamp, {seconds(header.stamp)}"
-            raise ValueError(f"{what}, {late}; if they do not come, load the map again")
-        if not known:
-            return grid
-        of_map, directions = found = (own or known)[0]
-        if directions is not None and directions.forbidden is not None:
-            offset = offset_between(directions, grid)
-            if of_map.frame_id != header.frame_id or offset is None:
-                raise ValueError(
-                    f"the directions on {self._topic} are not for this map: they have the frame "
-                    f"{of_map.frame_id!r} and {directions.resolution:.6g} m per cell, the map "
-                    f"{header.frame_id!r} and {grid.resolution:.6g} m; give both one frame, and "
-                    "cells that lie on each other"
-                )
-            theirs, ours = overlap(directions, grid, offset)
-            forbidden = np.zeros(grid.occupancy.shape, dtype=np.uint8)
-            forbidden[ours] = directions.forbidden[theirs]
-            grid = replace(grid, forbidden=forbidden)
-        self.used, self._are_paired = found, bool(own)
-        return grid
 
 
 class ExpectedTimes:
@@ -371,14 +363,15 @@ class ExpectedTimes:
     def describe(self, outcome: Outcome) -> dict[str, str]:
         """Return how long a plan takes, unless its map is old or untimed, or no memory is left."""
         now, request, path = self._spread_on, outcome.request, outcome.plan.path
-        told: dict[str, str] = {}
-        is_timed = request is not None and request.grid.slowness is not None and len(path) > 0
-        if self._experience and now and request and is_timed and is_like(request.grid, now):
-            with suppress(MemoryError):
-                seconds, low, high = self._experience.expected_time(now, path)
-                told["expected time (s)"] = f"{seconds:.1f}"
-                told["expected time, 90 % interval (s)"] = f"{low:.1f} to {high:.1f}"
-        return told
+        if not (self._experience and now and request and request.grid.slowness is not None):
+            return {}
+        if not len(path) or not is_like(request.grid, now):
+            return {}
+        with suppress(MemoryError):
+            seconds, low, high = self._experience.expected_time(now, path)
+            interval = {"expected time, 90 % interval (s)": f"{low:.1f} to {high:.1f}"}
+            return {"expected time (s)": f"{seconds:.1f}", **interval}
+        return {}
 
 
 def is_like(grid: GridMap, other: GridMap) -> bool:

@@ -22,13 +22,7 @@ from ddqn_planner.nodes.nav2 import GivenUp, serve_nav2
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.poses import Places, check_source
 from ddqn_planner.nodes.report import NO_REQUEST, NOT_ACTIVE, Outcome, Report, RequestError
-from ddqn_planner.nodes.requests import (
-    UNCHANGED,
-    ActiveGoal,
-    ModelSource,
-    Requests,
-    read_model,
-)
+from ddqn_planner.nodes.requests import UNCHANGED, ActiveGoal, ModelSource, Requests, read_model
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker, spin_until_shutdown, unless
 from ddqn_planner.planning import Planner
 from ddqn_planner.planning.plan import PosePlan
@@ -62,7 +56,7 @@ class PlannerNode(ManagedNode):
 
     def _forget(self) -> None:
         """Have no map and no goal, and refuse requests."""
-        self._is_configured = self._waits_for_pose = False
+        self._is_configured = False
         # What requests are answered, also those under way; None while the node is active.
         self._refusal: Outcome | None = NOT_ACTIVE
         self._logged: tuple[object, ...] = ()
@@ -82,7 +76,7 @@ class PlannerNode(ManagedNode):
         # In a group of its own: triggers that come while it plans make it plan once more after.
         group = MutuallyExclusiveCallbackGroup()
         self._replan = self.create_guard_condition(self._plan_for_active_goal, group)
-        self._map = MapSource(self, self._report, self._map_worker, self._on_map)
+        self._map = MapSource(self, self._report, self._map_worker, self._replan.trigger)
         self._places = Places(self, self._report, lambda: self._map.frame, self._on_start)
         inputs = self._map, self._places, self._model
         self._requests = Requests(self._settings, *inputs, self._worker, self._look_soon)
@@ -106,7 +100,7 @@ class PlannerNode(ManagedNode):
     def deactivate(self) -> None:
         """Forget the active goal."""
         super().deactivate()
-        self._active = ActiveGoal([])
+        self._active = ActiveGoal([], 0.0)
         # Of actions whose path can be kept, and of those whose path can get better, the last ones.
         self._followed: Outcome | None = None
         self._newest: Outcome | None = None
@@ -154,37 +148,30 @@ class PlannerNode(ManagedNode):
         self._places.listen_to_source()
         self._requests.settings = self._settings
         self._map.apply_parameters(changed)
-        self._plan_for(ActiveGoal(self._active.poses))
+        self._plan_for(self._active.poses)
 
     def _on_model(self, message: UInt8MultiArray) -> None:
         with self._report.taking("trainer/model"):
             data = bytes_of("model", message)
             if message.layout != self._model.layout:  # its digest says whether it is in use
                 self._model.use(Planner(*model_of(data)), "trainer/model", message.layout)
-                self._plan_for(ActiveGoal(self._active.poses))
+                self._plan_for(self._active.poses)
 
     # Map, start and goal
 
-    def _on_map(self, frame_changed: bool) -> None:
-        if frame_changed:
-            # What was refused for its frame may be right now.
-            self._report.accept(self._places.topic)
-        self._replan.trigger()
-
     def _on_start(self) -> None:
-        self._plan_for(ActiveGoal(self._active.poses, self._active.followed))
+        self._plan_for(self._active.poses, self._active.followed)
 
-    def _plan_for(self, active: ActiveGoal) -> None:
-        """Plan at once, whatever was planned: the one before may have a plan under way."""
-        self._active = active
+    def _plan_for(self, goals: list[PoseStamped], followed: Outcome | None = None) -> None:
+        """Plan at once, whatever was planned: the goal before may have a plan under way."""
+        self._active = ActiveGoal(goals, self._settings.replan_period, followed)
         self._replan.trigger()
 
     def _on_goal_poses(self, message: PoseArray) -> None:
-        goals = [PoseStamped(header=message.header, pose=pose) for pose in message.poses]
-        if goals:
-            self._on_goals(goals)
-        else:
+        if not message.poses:
             self._report.refuse("goal_poses", "the array has no pose; give one or more")
+            return
+        self._on_goals([PoseStamped(header=message.header, pose=pose) for pose in message.poses])
 
     def _on_goals(self, goals: list[PoseStamped]) -> None:
         if self._refusal is not None:
@@ -192,7 +179,7 @@ class PlannerNode(ManagedNode):
             self._report.log(self._refusal)
             return
         self._report.accept("goal_poses")
-        self._plan_for(ActiveGoal(goals))
+        self._plan_for(goals)
 
     # Planning
 
@@ -211,13 +198,11 @@ class PlannerNode(ManagedNode):
         active, goals = self._active, self._active.poses
         if not goals:
             return
-        planning = self._requests.plan(None, goals, followed=active.followed, active=active)
-        outcome = await self._answer(goals, planning)
+        outcome = await self._answer(goals, self._requests.plan(None, goals, active=active))
         if outcome.status in (UNCHANGED.status, NOT_ACTIVE.status):
             return
         self._publish(outcome, active)
         self._improve_later(outcome, active)
-        self._waits_for_pose = outcome.status in ("NO_START", "TF_ERROR")
         # Not the reason: its places and lengths may differ.
         logged = goals, outcome.goal, outcome.status, outcome.plan.method
         if self._logged != logged:
@@ -304,9 +289,12 @@ class PlannerNode(ManagedNode):
 
     def _on_look(self) -> None:
         is_frequent = bool(self._active.poses) and self._settings.replan_period < IDLE_PERIOD
-        self._look_soon(self._waits_for_pose or is_frequent)
+        self._look_soon(is_frequent or self._active.lacks_pose)
         if self._is_configured:
-            self._look_for_news()
+            self._requests.look_again()
+            self._places.transform_start()
+            if self._active.is_look_due(bool(self._map.missing)) or self._has_pose_now():
+                self._replan.trigger()
         if self._report.is_due():
             missing = [self._refusal.reason] if self._refusal is not None else []
             missing += [self._map.missing] if self._is_configured else []
@@ -317,17 +305,14 @@ class PlannerNode(ManagedNode):
                 values |= self._map.describe()
             self._report.publish(fatal, "; ".join(filter(None, missing)), values)
 
-    def _look_for_news(self) -> None:
-        self._requests.look_again()
-        self._places.transform_start()
-        is_due = self._active.is_look_due(self._settings.replan_period, bool(self._map.missing))
-        if self._waits_for_pose and self._active.poses:
-            with suppress(RequestError):
+    def _has_pose_now(self) -> bool:
+        """Return whether the pose has come for which the active goal waits."""
+        with suppress(RequestError):
+            if self._active.lacks_pose:
                 for pose in (self._places.start(), *self._active.poses):
                     self._places.to_map("the pose", pose, self._map.frame)
-                self._waits_for_pose, is_due = False, True
-        if is_due:
-            self._replan.trigger()
+                return True
+        return False
 
 
 def _paths(outcome: Outcome, *makers: Callable[..., Any]) -> list[Any]:

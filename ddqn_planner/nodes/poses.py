@@ -59,9 +59,7 @@ class Frames:
         try:
             return transformed(stamped, self._transform_at(stamped, map_frame))
         except ValueError as error:
-            what = f"frame is {frame!r}, and no transform leads from it to the map's, {map_frame!r}"
-            remedy = "publish one, or give the pose in the map's frame"
-            reason = f"{name}'s {what} ({error}); {remedy}"
+            reason = f"{name}'s frame is {frame!r}, and {error}, or give it in the map's frame"
             raise RequestError("TF_ERROR", reason, self.began) from None
 
     def _transform_at(self, stamped: PoseStamped, map_frame: str) -> TransformStamped:
@@ -81,20 +79,25 @@ class Frames:
 
     def _lookup(self, target: str, source: str, stamp: Time = NEWEST) -> TransformStamped:
         """Return the transform from a frame to another at a time, by default the newest."""
+
+        def none(why: object) -> ValueError:
+            leads = f"no transform leads from {source!r} to {target!r}"
+            return ValueError(f"{leads} ({why}); publish one")
+
         if not self.available:
-            raise ValueError("tf2_ros is not installed")
+            raise none("tf2_ros is not installed")
         self.listen()
         self._read()
         try:
             found = self._buffer.lookup_transform(target, source, stamp)
         except self._tf2_ros.TransformException as error:
-            raise ValueError(str(error)) from None
+            raise none(error) from None
         of = Time.from_msg(found.header.stamp)
         age, limit = (self._node.get_clock().now() - of).nanoseconds / 1e9, self._tolerance()
         # Static transforms have the stamp 0, and are never too old.
         if of.nanoseconds and not stamp.nanoseconds and abs(age) > limit:
             when = f"{age:.3g} s old" if age > 0 else f"{-age:.3g} s in the future"
-            raise ValueError(f"the newest is {when}, more than transform_tolerance, {limit:g} s")
+            raise none(f"the newest is {when}, more than transform_tolerance, {limit:g} s")
         return found
 
     def listen(self) -> None:
@@ -175,32 +178,32 @@ class Places(Frames):
         self._refusals, self._map_frame, self._on_start = refusals, map_frame, on_start
         self._pose: PoseStamped | None = None
         self._subscription: Any = None
-        self.source = self.topic = ""
+        self.topic = ""
         self.listen_to_source()
         node.after_jump_back.append(self._forget_odometry)
 
     def listen_to_source(self) -> None:
         """Listen to what the parameter names, if it is another source."""
         source = self._node.value("start_source")
-        if source == self.source:
+        topic = "odom" if source == "odometry" else source
+        if topic == self.topic:
             return
         self._node.destroy_subscription(self._subscription)
         self._refusals.accept(self.topic)
-        self.source, self.topic = source, "odom" if source == "odometry" else source
-        self._pose, self._heard_from = None, time.monotonic()
-        if source == "tf":
+        self.topic, self._pose, self._heard_from = topic, None, time.monotonic()
+        if topic == "tf":
             self.listen()
         else:
-            self._subscription = listen(self._node, self.topic, 10, self._refusals, self._take)
+            self._subscription = listen(self._node, topic, 10, self._refusals, self._take)
 
     def _forget_odometry(self) -> None:
-        if self.source == "odometry":
+        if self.topic == "odom":
             self._pose, self._heard_from = None, time.monotonic()
 
     def _take(self, pose: PoseStamped) -> None:
         self.check("the start", pose, self._map_frame())
         # Odometry comes all the time: it only triggers a plan that waits for the first pose.
-        is_due = self._pose is None or self.source == "initialpose"
+        is_due = self._pose is None or self.topic == "initialpose"
         self._pose, self._came = pose, self._node.get_clock().now()
         if is_due:
             self._on_start()
@@ -208,31 +211,29 @@ class Places(Frames):
     def transform_start(self) -> None:
         """Transform the last `initialpose` as soon as TF can: it forgets the times before."""
         frame = self._map_frame()
-        if self.source == "initialpose" and self._pose is not None and frame:
+        if self.topic == "initialpose" and self._pose is not None and frame:
             with suppress(RequestError):
                 self._pose = self.to_map("the start", self._pose, frame)
 
     def start(self) -> PoseStamped:
         """Return the last pose in its own frame, by TF in the map's; or raise a RequestError."""
-        if self.source == "tf":
-            frames = self._node.value("robot_frame"), self._map_frame()
+        if self.topic == "tf":
             try:
-                return self.origin_of(*frames)
+                return self.origin_of(self._node.value("robot_frame"), self._map_frame())
             except ValueError as error:
-                problem = "no transform leads from {!r} to {!r}".format(*frames)
-                remedy = "publish one, or set robot_frame or start_source"
-                reason = f"the start is unknown: {problem} ({error}); {remedy}"
+                reason = f"the start is unknown: {error}, or set robot_frame or start_source"
                 raise RequestError("NO_START", reason, self.began) from None
-        topic, is_odometry = self._subscription.topic_name, self.source == "odometry"
-        problem = f"nothing came on {topic} in the map's frame"
-        if not is_odometry:
-            problem = f"set it on {topic} (in RViz: 2D Pose Estimate)"
+        topic, since = self._subscription.topic_name, -math.inf
+        problem = f"set it on {topic} (in RViz: 2D Pose Estimate)"
+        if self._pose is not None and self.topic == "initialpose":
+            return self._pose
+        if self.topic == "odom":
+            problem, since = f"nothing came on {topic} in the map's frame", self._heard_from
         if self._pose is not None:  # its stamp may be that of another clock
             silent = (self._node.get_clock().now() - self._came).nanoseconds / 1e9
-            if not is_odometry or silent <= max(self._node.value("transform_tolerance"), SILENCE):
+            if silent <= max(self._node.value("transform_tolerance"), SILENCE):
                 return self._pose
             often = "publish it more often, set transform_tolerance"
             problem = f"nothing came on {topic} for {silent:.3g} s; {often}"
         remedy = "or set start_source, or give the request's start its frame"
-        since = self._heard_from if is_odometry else -math.inf
         raise RequestError("NO_START", f"the start is unknown; {problem}; {remedy}", since)

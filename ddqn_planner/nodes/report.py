@@ -55,7 +55,7 @@ class Outcome:
     request: Request | None = None
     plan: Plan = field(default_factory=lambda: Plan(PlanStatus.NO_PATH))
     goal: PoseStamped | None = None  # in the map's frame
-    map_stamp: str = ""  # seconds
+    map_header: Header | None = None  # of the map that it was planned on
     is_dense: bool = False  # whether its path has a pose at least every cell
     header: Header = field(default_factory=Header)  # of its path
 
@@ -209,6 +209,7 @@ class Report(Refusals):
     def publish(self, fatal: bool, missing: str, more: Mapping[str, str]) -> None:
         """Publish the diagnostics; `fatal` if the node cannot plan until its user helps."""
         outcome, plan, problems = self.outcome, self.outcome.plan, self.problems()
+        of_map = outcome.map_header
         if missing and missing != outcome.reason:
             problems.append(missing)
         good = not problems and (plan.path.size or outcome.status == "NO_REQUEST")
@@ -221,7 +222,7 @@ class Report(Refusals):
             "path length (cells)": f"{plan.length:.3f}",
             "field time (ms)": f"{plan.field_ms:.3f}",
             "rollout time (ms)": f"{plan.rollout_ms:.3f}",
-            "planned on the map of (s)": outcome.map_stamp,
+            "planned on the map of (s)": seconds(of_map.stamp) if of_map else "",
             **more,
             **{f"refused {what}": reason for what, reason in self.refused.items()},
         }

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from types import SimpleNamespace
 from typing import Any, TypeVar
 
@@ -24,13 +25,13 @@ from ddqn_planner.nodes.conversions import cell_from_pose, pose_of, turns
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.poses import Places
 from ddqn_planner.nodes.report import (
+    NO_REQUEST,
     Outcome,
     Report,
     Request,
     RequestError,
     reached,
     reason_of,
-    seconds,
 )
 from ddqn_planner.nodes.runtime import BaseNode, Worker
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus
@@ -49,47 +50,53 @@ T = TypeVar("T")
 class ActiveGoal:
     """Decides when to plan again, and what to publish; the table in docs/nodes.md has the rules."""
 
-    def __init__(self, poses: list[PoseStamped], followed: Outcome | None = None) -> None:
+    def __init__(
+        self, poses: list[PoseStamped], period: float, followed: Outcome | None = None
+    ) -> None:
         # The last ``goal_pose``, or the last ``goal_poses``, of which the nearest one counts.
         self.poses = poses
-        # Of the outcomes whose paths were published for this goal, the last one.
-        self.followed = followed
-        # What was planned last; None to plan whatever is asked.
-        self._planned: tuple[Any, ...] | None = None
-        # The frame and the status of what was published last; None to publish whatever comes.
-        self._shown: tuple[str, str] | None = None
-        self._looks, self._next_look = False, 0.0
+        # Of this goal's outcomes, the last whose path was published, and the last of all.
+        self.followed, self._last = followed, NO_REQUEST
+        self._period, self._next_look = period, 0.0  # seconds
 
-    def is_look_due(self, replan_period: float, lacks_map: bool) -> bool:
+    @property
+    def lacks_pose(self) -> bool:
+        """Whether it waits for TF or odometry."""
+        return bool(self.poses) and self._last.status in ("NO_START", "TF_ERROR")
+
+    def is_look_due(self, lacks_map: bool) -> bool:
         """Return whether it is time to look if something changed; the next plan does then."""
-        stopped = lacks_map and self._planned is not None  # a costmap: its path is taken back
-        is_due = bool(self.poses) and (stopped or time.monotonic() >= self._next_look)
-        if is_due:
-            self._looks, self._next_look = True, time.monotonic() + replan_period
-        return is_due
+        stopped = lacks_map and self._last.request is not None  # a costmap: its path is taken back
+        return bool(self.poses) and (stopped or time.monotonic() >= self._next_look)
 
-    def is_due(self, planner: Planner, request: Request, header: Header, period: float) -> bool:
+    def is_due(self, planner: Planner, request: Request, header: Header) -> bool:
         """Return whether there is a reason to plan."""
-        start = request.cells[0], *(round(yaw / HEADING) for yaw in request.start[2:])
-        planned, frame = (request.grid, start, header), header.frame_id
-        looks, self._looks = self._looks or period == 0, False
-        is_followed = self._shown == (frame, PlanStatus.SUCCEEDED.name) and not looks
+        last, now = self._last, time.monotonic()
+        if looks := self._period == 0 or now >= self._next_look:
+            self._next_look = now + self._period
         # A map that came again as it was is planned on, so that the diagnostics name the last one.
-        if self._planned == planned or (is_followed and len(_rest(planner, request))):
+        known = last.request and _inputs_of(last.request, last.map_header)
+        if known == _inputs_of(request, header):
             return False
-        self._planned, self._next_look = planned, time.monotonic() + period
-        return True
+        shown = last.status, last.header.frame_id
+        is_followed = shown == (PlanStatus.SUCCEEDED.name, header.frame_id)
+        return looks or not is_followed or not len(_rest(planner, request))
 
     def is_news(self, outcome: Outcome) -> bool:
         """Return whether to publish the path of an outcome, which may be empty."""
-        has_path, shown = len(outcome.plan.path) > 0, (outcome.header.frame_id, outcome.status)
-        is_new_path = has_path and outcome.plan.extra_cost is None
-        is_news, self._shown = is_new_path or shown != self._shown, shown
-        if outcome.request is None:
-            self._planned = None
-        elif is_news and has_path:
+        shown, new = ((it.status, it.header.frame_id) for it in (self._last, outcome))
+        self._last, self._next_look = outcome, time.monotonic() + self._period
+        has_path = len(outcome.plan.path) > 0
+        is_news = shown != new or (has_path and outcome.plan.extra_cost is None)
+        if is_news and has_path:
             self.followed = outcome
         return is_news
+
+
+def _inputs_of(request: Request, header: Header | None) -> tuple[Any, ...]:
+    """Return what a plan for the active goal depends on: map, place, and heading of the robot."""
+    yaws = request.start[2:]  # of a body
+    return request.grid, header, request.cells[0], *(round(yaw / HEADING) for yaw in yaws)
 
 
 def path_under_way(last: Outcome | None, request: Request, frame: str) -> Any:
@@ -234,14 +241,12 @@ class Requests:
         # As they are now, like the map and the model, whatever changes while it waits.
         settings, several = self.settings, len(goals) > 1
         check_request(goals, planner_id, settings.planner_id)
-        names = [f"goal {n}" for n in range(1, len(goals) + 1)] if several else ["the goal"]
-        for name, goal in zip(names, goals, strict=True):
-            _checked(name, self.places.check, goal, self.map.frame)
         header, grid, planner = await self._inputs()
-        frame = header.frame_id
-        asked = [start or await self._wait_for(self.places.start), *goals]
-        named = zip(["the start", *names], asked, strict=True)
-        places = [await self._in_map(*it, grid, frame) for it in named]
+        names = [f"goal {n}" for n in range(1, len(goals) + 1)] if several else ["the goal"]
+        in_map = partial(self._in_map, grid, header.frame_id)
+        ends = [await in_map(*named) for named in zip(names, goals, strict=True)]
+        start = start or await self._wait_for(self.places.start)
+        places = [await in_map("the start", start), *ends]
         poses, (first, second, *more) = zip(*places, strict=True)
         metres: float = settings.tolerance if tolerance is None else tolerance
         if not 0 <= metres < math.inf:
@@ -265,11 +270,13 @@ class Requests:
             request = PoseRequest(grid, first, (second,), limits, **how)
         if active is not None:
             active.poses[:] = poses[1:]  # there they stay, though their own frame moves
+            followed = active.followed
             if several:
                 request, more = request.to_nearest(more), []
         if not more:
-            request = replace(request, under_way=path_under_way(followed, request, frame))
-        if active and not active.is_due(planner, request, header, settings.replan_period):
+            under_way = path_under_way(followed, request, header.frame_id)
+            request = replace(request, under_way=under_way)
+        if active is not None and not active.is_due(planner, request, header):
             return UNCHANGED
         plans = [await self._plan(planner, request)]
         for goal in more:
@@ -282,9 +289,8 @@ class Requests:
         reason = reason_of(request, plan, before, goal, settings.robot_radius)
         if more and not len(plan.path):
             reason = f"goal {number} of {len(goals)}: {reason}"
-        stamp = seconds(header.stamp)
         is_dense = settings.path_simplification == "straight"
-        return Outcome(plan.status.name, reason, planner, request, plan, goal, stamp, is_dense)
+        return Outcome(plan.status.name, reason, planner, request, plan, goal, header, is_dense)
 
     async def improve(self, outcome: Any) -> Outcome:
         """Return the outcome of a request for poses with a path of the least cost."""
@@ -314,13 +320,13 @@ class Requests:
         if planner.pose_planner is None:
             # What a straight path passes between its turns is known, between its poses not.
             poses = turns(poses)
-        cells = [_checked("the path", cell_from_pose, pose, grid, frame) for pose in poses]
+        cells = [cell_from_pose("the path", pose, grid, frame) for pose in poses]
         if not cells:
             return False
         robot, cell = poses[0], cells[0]
         with suppress(RequestError):
             start = await self._wait_for(self.places.start)
-            robot, cell = await self._in_map("the start", start, grid, frame)
+            robot, cell = await self._in_map(grid, frame, "the start", start)
         if planner.pose_planner is not None:
             way, anywhere = np.array([*map(pose_of, poses)]), (np.inf, np.inf)
             return len(planner.pose_planner.rest_of(way, pose_of(robot), grid, anywhere)) > 0
@@ -340,13 +346,20 @@ class Requests:
         return header, await ready, planner
 
     async def _in_map(
-        self, name: str, stamped: PoseStamped, grid: GridMap, frame: str
+        self, grid: GridMap, frame: str, name: str, stamped: PoseStamped
     ) -> tuple[PoseStamped, Cell]:
         """Return a pose in the map's frame, whose transform is waited for, and its cell."""
-        _checked(name, self.places.check, stamped, frame)
         deadline = time.monotonic() + self.settings.transform_tolerance
-        pose = await self._wait_for(lambda: self.places.to_map(name, stamped, frame), deadline)
-        return pose, _checked(name, cell_from_pose, pose, grid, frame)
+        try:
+            self.places.check(name, stamped, frame)
+            to_map = partial(self.places.to_map, name, stamped, frame)
+            pose = await self._wait_for(to_map, deadline)
+            return pose, cell_from_pose(name, pose, grid, frame)
+        except RequestError:
+            raise
+        except ValueError as error:
+            status = "INVALID_START" if name == "the start" else "INVALID_GOAL"
+            raise RequestError(status, str(error)) from None
 
     async def _wait_for(self, get: Callable[[], T], deadline: float = 0.0) -> T:
         """Return what a function returns, as soon as it raises no RequestError that may pass."""
@@ -367,15 +380,6 @@ def check_request(goals: list[PoseStamped], planner_id: str, known_id: str) -> N
     if planner_id not in ("", known_id):
         remedy = f"give {known_id!r} or '' as the planner_id, or set the parameter 'planner_id'"
         raise RequestError("INVALID_PLANNER", f"there is no planner {planner_id!r}; {remedy}")
-
-
-def _checked(name: str, check: Callable[..., T], *arguments: object) -> T:
-    """Return what a check returns; its ValueError becomes a RequestError, as INVALID_START."""
-    try:
-        return check(name, *arguments)
-    except ValueError as error:
-        status = f"INVALID_{name.removeprefix('the ').split()[0].upper()}"
-        raise RequestError(status, str(error)) from None
 
 
 def _clearing_radius(settings: SimpleNamespace, grid: GridMap) -> float:

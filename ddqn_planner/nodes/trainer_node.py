@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import fields
 from functools import partial
@@ -26,6 +26,7 @@ from ddqn_planner.nodes.poses import check_source, listen
 from ddqn_planner.nodes.report import Refusals
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Declared, Worker
 from ddqn_planner.resources import find_map
+from ddqn_planner.training.episodes import read_cells
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
 if TYPE_CHECKING:
@@ -80,23 +81,26 @@ class TrainerNode(BaseNode):
         self._is_stopping = self._is_saving = False
         self._read_map_file()
         self.create_subscription(OccupancyGrid, "map", self._on_map, LATCHED)
-        self._driving: Driving | None = None
-        is_driving = self.value("learn_from") == "driving"
-        self._learned = "experience" if is_driving else "model"
+        self._is_driving = self.value("learn_from") == "driving"
+        self._learned = "experience" if self._is_driving else "model"
         self._saved = self.create_publisher(String, f"~/{self._learned}_saved", LATCHED)
         self._publisher = self.create_publisher(UInt8MultiArray, f"~/{self._learned}", LATCHED)
-        if is_driving:
-            self._driving = Driving(self)
-        else:
+        # What learns, and has these services: this node, or what it hears of robots.
+        driving = Driving(self) if self._is_driving else None
+        self._learner: Any = driving or self
+        if driving is None:
             self._rewards = self.create_publisher(Float32, "~/average_reward", 100)
             for which, topic in (("start", "initialpose"), ("goal", "goal_pose")):
                 listen(self, topic, 10, self.refusals, partial(self._on_pose, which))
             # While the node answers already; only ~/start waits for it.
             self._imported = self.worker.call(import_training)
-        learner, group = self._driving or self, ReentrantCallbackGroup()
-        for name in ("start", "stop", "save", "replay", *["forget"] * is_driving):
-            self.create_trigger(f"~/{name}", getattr(learner, name), callback_group=group)
-        self.create_timer(1.0, learner.look, clock=STEADY)
+        services = {"start": self._learner.start, "save": self._learner.save}
+        services |= {"stop": self._on_stop, "replay": self._on_replay}
+        services |= {"forget": driving.forget} if driving is not None else {}
+        group = ReentrantCallbackGroup()
+        for name, handler in services.items():
+            self.create_trigger(f"~/{name}", handler, callback_group=group)
+        self.create_timer(1.0, self._on_look, clock=STEADY)
 
     @property
     def folder(self) -> FilePath:
@@ -152,7 +156,79 @@ class TrainerNode(BaseNode):
             raise ValueError(f"the {which}'s {wrong}; set it on a free cell")
         return cell
 
-    # Services: each returns whether it succeeds, and a message
+    # Whatever it learns from
+
+    def fail(self, what: str, error: Exception) -> tuple[bool, str]:
+        """Log an error, and keep it for the diagnostics; return the answer of a service."""
+        before, self.error = self.error, f"{what}: {explained(error)}"
+        if self.error != before:  # it may try again each second
+            self.get_logger().error(self.error)
+        return False, explained(error)
+
+    def tell_saved(self, data: bytes, path: FilePath, error: str) -> None:
+        """Publish what was learned; log when saving begins to fail, and when it works again."""
+        self._publisher.publish(conversions.bytes_message(self._learned, data))
+        before, self.save_error = self.save_error, error
+        if error and not before:
+            self.get_logger().error(error)
+        if before and not error:
+            self.get_logger().info(f"the {self._learned} is saved again")
+        if not error:
+            self._saved.publish(String(data=str(path)))
+
+    def _on_look(self) -> None:
+        """Publish the state, what was refused and failed, and what is still missing."""
+        values = self._learner.look()
+        problems = [*self.refusals.problems(), *filter(None, [self.save_error, self.error])]
+        level = DiagnosticStatus.ERROR if problems else DiagnosticStatus.OK
+        if self._is_driving and self.map is None:
+            problems.append(NO_MAP)
+            level = max(level, DiagnosticStatus.WARN)
+        what = "driving" if self._is_driving else "training"
+        values = {"state": self.state, **values}
+        self.refusals.tell(what, level, "; ".join(problems) or self.state, values)
+
+    def _on_stop(self) -> tuple[bool, str]:
+        """Stop what the node does."""
+        was_stopped, said = self._learner.stop()
+        return was_stopped, f"{said}; the replay was stopped" if self._stop_replay() else said
+
+    def _on_replay(self) -> tuple[bool, str]:
+        """Draw the first place of each recorded episode, its first two, and so on."""
+        file, draw = self.folder / "episodes.csv", self._learner.draw
+        place, episodes = self._learner.recorded(file)
+        if place is None:
+            return False, NO_MAP
+        frames = (places[: n + 1] for places in episodes for n in range(len(places)))
+
+        def step() -> None:
+            try:
+                draw(place, next(frames))
+            except (StopIteration, OSError):
+                self._stop_replay()
+
+        try:
+            draw(place, next(frames))
+        except StopIteration:
+            return False, f"{file} holds no episode to replay yet; let it learn on"
+        except OSError as error:
+            return False, f"no recorded episodes ({error}); call ~/start first"
+        self._stop_replay()
+        self.replaying = self.create_timer(self.value("replay_period"), step, clock=STEADY)
+        return True, "replaying the recorded episodes on ~/episode"
+
+    def _stop_replay(self) -> bool:
+        """Stop a replay, and return whether there was one."""
+        timer, self.replaying = self.replaying, None
+        return timer is not None and self.destroy_timer(timer)
+
+    def destroy_node(self) -> None:
+        """Save what was learned, and destroy the node."""
+        self._learner.stop()
+        self.worker.close()  # torch, half imported, may fail when the process ends
+        super().destroy_node()
+
+    # A training in simulation: what `Driving` has, too
 
     async def start(self) -> tuple[bool, str]:
         """Train, or continue a training."""
@@ -162,8 +238,7 @@ class TrainerNode(BaseNode):
         try:
             place, run = self._open_run()
         except Exception as error:  # the node must survive any error
-            self.fail(f"the training cannot start: {explained(error)}")
-            return False, explained(error)
+            return self.fail("the training cannot start", error)
         self.state, self.error, self.save_error = "training", "", ""
         self._is_stopping = self._is_saving = False
         self.refusals.refused.clear()
@@ -175,7 +250,7 @@ class TrainerNode(BaseNode):
     def _open_run(self) -> tuple[MapInFrame, TrainingRun]:
         place = self.map
         if place is None:
-            raise ValueError(f"{NO_MAP}, or set map_file")
+            raise ValueError(NO_MAP)
         if self._poses.keys() < {"start", "goal"}:
             remedy = "publish initialpose and goal_pose, or set map_file to a map with both"
             raise ValueError(f"the start or the goal is unknown; {remedy}")
@@ -188,12 +263,11 @@ class TrainerNode(BaseNode):
         return place, TrainingRun(self.folder, scenarios, rule, *how)
 
     def stop(self) -> tuple[bool, str]:
-        """Stop the training, which saves, and a replay."""
-        replay = self.stop_replay()
+        """Stop the training, which saves."""
         if self.state != "training":
-            return True, f"no training was running{replay}"
+            return True, "no training was running"
         self._is_stopping = True
-        return True, f"the training saves and stops, and ~/start continues it{replay}"
+        return True, "the training saves and stops, and ~/start continues it"
 
     def save(self) -> tuple[bool, str]:
         """Save after the step that is under way."""
@@ -201,16 +275,6 @@ class TrainerNode(BaseNode):
             return False, "no training is running; it was saved when it ended"
         self._is_saving = True
         return True, "saving after this step; ~/model_saved or an error follows"
-
-    def replay(self) -> tuple[bool, str]:
-        """Draw the recorded episodes."""
-        from ddqn_planner.training.episodes import read_cells
-
-        file = self.folder / "episodes.csv"
-        is_of_run = self._run is not None and self._run.folder == self.folder
-        place = self._run_map if is_of_run else self.map
-        episodes = read_cells(file, self.value("episode_interval"))
-        return self.play(place, file, episodes, self._draw, "train on")
 
     def _train(self, run: TrainingRun, place: MapInFrame) -> None:
         """Train, in the worker, until the training has finished or is stopped."""
@@ -221,7 +285,7 @@ class TrainerNode(BaseNode):
                     self._rewards.publish(Float32(data=episode.average_reward))
                     is_due = episode.number % self.value("episode_interval") == 0
                     if is_due and self.replaying is None:
-                        self._draw(place, episode.cells)
+                        self.draw(place, episode.cells)
                 if self._is_stopping or self._is_saving:
                     self._is_saving = False
                     run.try_to_save()
@@ -234,25 +298,30 @@ class TrainerNode(BaseNode):
             ends = "stopped" if self._is_stopping else "finished"
         except Exception as error:  # the node must survive any error
             ends = "failed"
-            self.fail(f"the training failed: {error!r}; ~/start continues from its checkpoint")
+            self.fail("the training failed, and ~/start continues from its checkpoint", error)
         finally:
             run.close()
         self.state = ends
         self.get_logger().info(f"the training {ends}")
 
     def _tell_saved(self, run: TrainingRun) -> None:
-        self.tell_saved("the training is", run.model, run.model_path, run.save_error)
+        self.tell_saved(run.model, run.model_path, run.save_error)
         if not run.save_error:
             self.get_logger().info(f"step {run.saved_at} is saved in {run.checkpoint_path}")
 
-    def _draw(self, place: MapInFrame, cells: tuple[Cell, ...]) -> None:
-        path = conversions.path_bytes(
-            *conversions.along(cells, place.grid), self.header(place.frame), Quaternion()
-        )
-        self.episodes.publish(path)
+    def recorded(self, file: FilePath) -> tuple[MapInFrame | None, Iterator[tuple[Cell, ...]]]:
+        """Return the episodes of a file, and the map that they are on."""
+        is_of_run = self._run is not None and self._run.folder == file.parent
+        place = self._run_map if is_of_run else self.map
+        return place, read_cells(file, self.value("episode_interval"))
 
-    def look(self) -> None:
-        """Publish the diagnostics of a training."""
+    def draw(self, place: MapInFrame, cells: tuple[Cell, ...]) -> None:
+        """Publish an episode."""
+        way, header = conversions.along(cells, place.grid), self.header(place.frame)
+        self.episodes.publish(conversions.path_bytes(*way, header, Quaternion()))
+
+    def look(self) -> dict[str, str]:
+        """Return what the diagnostics say of it, each second."""
         places = {which: pose.pose.position for which, pose in self._poses.items()}
         values = {which: f"({at.x:.6g}, {at.y:.6g})" for which, at in places.items()}
         if self._run is not None:
@@ -263,78 +332,7 @@ class TrainerNode(BaseNode):
                 "epsilon": f"{trainer.epsilon:.3f}",
                 "folder": str(self._run.folder),
             }
-        self.publish_diagnostics("training", values)
-
-    # What learning from driving shares
-
-    def fail(self, reason: str) -> None:
-        """Log an error, and keep it for the diagnostics."""
-        self.error = reason
-        self.get_logger().error(reason)
-
-    def tell_saved(self, what: str, data: bytes, path: FilePath, error: str) -> None:
-        """Publish what was learned; log when saving begins to fail, and when it works again."""
-        self._publisher.publish(conversions.bytes_message(self._learned, data))
-        before, self.save_error = self.save_error, error
-        if error and not before:
-            self.get_logger().error(error)
-        if before and not error:
-            self.get_logger().info(f"{what} saved again")
-        if not error:
-            self._saved.publish(String(data=str(path)))
-
-    def publish_diagnostics(self, what: str, values: Mapping[str, str], missing: str = "") -> None:
-        """Publish the state, what was refused and failed, and what is still missing."""
-        problems = [*self.refusals.problems(), *filter(None, [self.save_error, self.error])]
-        good = DiagnosticStatus.WARN if missing else DiagnosticStatus.OK
-        level = DiagnosticStatus.ERROR if problems else good
-        message = "; ".join(filter(None, [*problems, missing])) or self.state
-        self.refusals.tell(what, level, message, {"state": self.state, **values})
-
-    def play(
-        self,
-        place: MapInFrame | None,
-        file: FilePath,
-        episodes: Iterator[Any],
-        draw: Callable[[MapInFrame, Any], None],
-        remedy: str,
-    ) -> tuple[bool, str]:
-        """Draw the first place of each episode, its first two, and so on; see `create_trigger`."""
-        if place is None:
-            return False, f"{NO_MAP} first"
-        frames = (places[: n + 1] for places in episodes for n in range(len(places)))
-
-        def step() -> None:
-            try:
-                draw(place, next(frames))
-            except (StopIteration, OSError):
-                self.stop_replay()
-
-        try:
-            draw(place, next(frames))
-        except StopIteration:
-            return False, f"{file} holds no episode to replay yet; {remedy}"
-        except OSError as error:
-            return False, f"no recorded episodes ({error}); call ~/start first"
-        self.stop_replay()
-        self.replaying = self.create_timer(self.value("replay_period"), step, clock=STEADY)
-        return True, "replaying the recorded episodes on ~/episode"
-
-    def stop_replay(self) -> str:
-        """Stop a replay, and say so; return nothing if there was none."""
-        timer, self.replaying = self.replaying, None
-        if timer is None:
-            return ""
-        self.destroy_timer(timer)
-        return "; the replay was stopped"
-
-    def destroy_node(self) -> None:
-        """Save what was learned, and destroy the node."""
-        if self._driving is not None:
-            self._driving.stop()
-        self._is_stopping = True
-        self.worker.close()  # torch, half imported, may fail when the process ends
-        super().destroy_node()
+        return values
 
 
 def import_training() -> None:

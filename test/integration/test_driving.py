@@ -306,7 +306,7 @@ def test_nothing_is_lost_while_the_disk_is_full(site: Site, trainer: Any) -> Non
         site.state(state="recording", message="cannot save to .*; make room")
         assert site.outcomes == ["arrived"]
         site.call("stop", succeeds=False)  # it would lose the drive
-    trainer.wait_for_log("the drives are saved again")
+    trainer.wait_for_log("the experience is saved again")
     assert trainer.log.count("make room") == 1
     warning = r"drives 0\.1\d* m/s in the open, nominal_speed is 0\.5"
     assert len(re.findall(warning, trainer.log)) == 1
