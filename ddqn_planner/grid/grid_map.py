@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -201,14 +201,11 @@ class GridMap:
 
     def with_layers(self, **layers: Any) -> GridMap:
         """Return the same map with other layers, which are neither checked nor copied."""
-        stale = {"cost_multiplier", "fingerprint"}
-        if layers.keys() & PATCHED:
-            stale |= {"_history", "_occupied"}
-        else:
-            layers["_history"] = self._history  # which may not be there yet
-        kept = {name: value for name, value in vars(self).items() if name not in stale}
+        kept = {field.name: getattr(self, field.name) for field in fields(self)}
+        if not layers.keys() & PATCHED:
+            kept["_history"] = self._history
         changed = object.__new__(GridMap)
-        changed._set(**{**kept, **layers})
+        changed._set(**kept | layers)
         return changed
 
     @property
