@@ -147,26 +147,24 @@ def units_of(motions: Motions) -> tuple[NDArray[np.int64], NDArray[np.int64], li
     """Return the unit of each primitive, its quarter turns, (P,), and the poses of each unit."""
     turns_P, numbers = motions.start // QUARTER, []
     units: list[Float64] = []
-    known: dict[tuple[int, int, int], list[int]] = {}
-    for start, end, turns, poses in zip(
-        motions.start.tolist(), motions.end.tolist(), turns_P.tolist(), motions.poses, strict=True
-    ):
+    for turns, poses in zip(turns_P.tolist(), motions.poses, strict=True):
         x, y, yaw = poses.T
         for _ in range(turns):
             x, y = y, -x
         back = np.column_stack([x, y, yaw - turns * math.pi / 2])
-        ends = (start - QUARTER * turns, (end - QUARTER * turns) % HEADINGS)
-        alike = known.setdefault((*ends, len(back)), [])
-        for unit in alike:
-            off = units[unit] - back
-            if max(np.abs(off[:, :2]).max(), np.abs(turn_between(0, off[:, 2])).max()) < SAME:
-                break
-        else:
-            unit = len(units)
-            alike.append(unit)
+        alike = (unit for unit, other in enumerate(units) if _is_same(back, other))
+        numbers.append(next(alike, len(units)))
+        if numbers[-1] == len(units):
             units.append(back)
-        numbers.append(unit)
     return np.array(numbers), turns_P, units
+
+
+def _is_same(poses: Float64, others: Float64) -> bool:
+    """Return whether poses are the same as others, but for rounding and whole turns."""
+    if len(poses) != len(others):
+        return False
+    x, y, yaw = (poses - others).T
+    return bool(np.abs([x, y, turn_between(0, yaw)]).max() < SAME)
 
 
 def _motions_of(tensors: Mapping[str, Any]) -> Motions:
