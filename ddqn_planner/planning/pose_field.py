@@ -9,7 +9,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.planning import pose_kernels as kernels
-from ddqn_planner.planning.pose_kernels import Aim, Known, heap_of
+from ddqn_planner.planning.pose_kernels import Aim, Known, Search, heap_of
 from ddqn_planner.planning.pose_paths import SAME, Way
 from ddqn_planner.planning.pose_world import SHIFT, TILE, Body, State, World
 
@@ -56,6 +56,7 @@ class PoseField:
         numbers = kernels.number_of(x, y, heading, world)
         self.known.mark[numbers] = kernels.OPEN
         touched[numbers >> kernels.TILE_BITS] = True
+        self._aim, self._heap = self._aim._replace(number=-1), heap_of(0)
         self._size, self._least = 0, math.inf
 
     def reach(self, start: State, bound: float, limit: int) -> float | None:
@@ -84,29 +85,36 @@ class PoseField:
                 self._order(self._aim.weight)
                 continue
             share, most = 1.0 if self._aim.weight > 1 else 1 / bound, min(limit, UNGUIDED)
-            given = self.known, self._heap, self._size, self._aim, share, most
-            self._size, visits, done = kernels.grow(*given, self.world, self.body)
+            given = self._search, self._size, bound * self._least, share, most
+            self._size, visits, done = kernels.grow(*given)
             limit, self.visits = limit - visits, self.visits + visits
-            if done:
-                self._order(1.0)
-            elif visits < most:  # the heap is full
-                self._order(self._aim.weight)
+            if self._proved() > bound * SAME and visits < most:  # or else the heap is full
+                self._order(1.0 if done else self._aim.weight)
         return proved
 
+    @property
+    def _search(self) -> Search:
+        return Search(self.known, self._heap, self._aim, self.world, self.body)
+
+    def _cost(self) -> float:
+        """Return the least cost that was found from the start, infinite before."""
+        number = self._aim.number
+        is_known = number >= 0 and self.known.mark[number] != kernels.UNREACHED
+        return float(self.known.distance[number]) if is_known else math.inf
+
     def _proved(self) -> float:
-        """Return how many times the least cost that of the aim may be."""
-        if self.known.mark[self._aim.number] == kernels.UNREACHED:
-            return math.inf
-        cost = float(self.known.distance[self._aim.number])
-        return cost / least if (least := min(self._least, cost)) else 1.0
+        """Return how many times the least cost that of the start may be."""
+        cost, least = self._cost(), self._least
+        if cost <= least:
+            return 1.0 if cost < math.inf else math.inf
+        return cost / least if least > 0 else math.inf
 
     def _order(self, weight: float) -> None:
         """Begin a round: what is open or waits is ordered toward the start."""
         tiles = np.flatnonzero(self.known.touched)
         self._heap = heap_of((len(tiles) << kernels.TILE_BITS) + HEAP)
         self._aim = self._aim._replace(weight=weight)
-        given = self.known, tiles, self._heap, self._aim, self.world
-        self._size, self._least = kernels.order(*given)
+        self._size, self._least = kernels.order(self._search, tiles)
 
     def _can_leave(self) -> bool:
         """Return whether primitives lead from the start to more than a few states."""
@@ -126,7 +134,7 @@ class PoseField:
         is_goal[y, x] = True
         box = np.array([x.min(), y.min(), x.max(), y.max()])
         heap = heap_of(8 * left.size + 4)  # each corner opens its neighbours once
-        kernels.look(self._aim, room, heap, is_goal, box, world, self.body)
+        kernels.look(self._search._replace(heap=heap), room, is_goal, box)
 
     def rollout(self, start: State) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
         """Return the primitives from a start to a goal, and their costs; None without a way."""
@@ -135,28 +143,28 @@ class PoseField:
             return None
         most = int(self.known.distance[number] / self.body.cost.min()) + 1
         primitives, costs = np.empty(most, np.int64), np.empty(most)
-        inputs = self.known, number, primitives, costs, self.world, self.body
-        count = kernels.follow(*inputs)
+        count = kernels.follow(self._search, number, primitives, costs)
         return primitives[:count], costs[:count]
 
     def repair(self, grid: GridMap, world: World, cells: NDArray[np.int64], opens: bool) -> None:
         """Hold for a map that differs in some cells (N, 2); begin anew where that is quicker."""
-        # What costs less than all that lost its support is supported still. `opens` tells whether
-        # a way may have got cheaper: what is left to the start, too.
-        reached = float(self.known.distance[self._aim.number])
-        self._aim = NOWHERE if opens else self._aim._replace(number=-1)
-        self.grid, self.world, self.way, touched = grid, world, None, self.known.touched
-        is_near, far = np.zeros(world.tile.shape, np.bool_), self.body.reach // TILE + 1
+        # `opens` tells whether a way may have got cheaper: what is left to the start, too. If not,
+        # what is open is in order still, and nothing costs less than was known to be the least.
+        self.grid, self.world, self.way, self.visits = grid, world, None, 0
+        touched, is_near = self.known.touched, np.zeros(world.tile.shape, np.bool_)
+        far = self.body.reach // TILE + 1
         for x, y in np.unique(cells // TILE, axis=0).tolist():
             is_near[max(y - far, 0) : y + far + 1, max(x - far, 0) : x + far + 1] = True
-        near = np.flatnonzero(is_near.ravel() & touched)
-        least = kernels.least_unsupported(self.known, near, world, self.body)
-        if least < LOST * reached:
+        near, tiles = np.flatnonzero(is_near.ravel() & touched), np.flatnonzero(touched)
+        cost = self._cost()
+        self._least = min(self._least, cost)
+        if opens or self._size + (len(tiles) << kernels.TILE_BITS) > self._heap.keys.size:
+            self._aim = NOWHERE if opens else self._aim._replace(number=-1)
+            self._heap, self._size = heap_of(len(tiles) << kernels.TILE_BITS), 0
+        kept = LOST * cost if cost < math.inf else 0.0
+        lost, self._size = kernels.take_back(self._search, self._size, near, tiles, kept)
+        if lost < kept:
             self._begin(grid, world)
-            return
-        if least < math.inf:
-            tiles = np.flatnonzero(touched)
-            kernels.take_back(self.known, tiles, least, world, self.body)
-        if opens:
+        elif opens:
             mark = self.known.mark.reshape(world.tile.size, -1)
             mark[near] = np.minimum(mark[near], kernels.OPEN)

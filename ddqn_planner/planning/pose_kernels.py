@@ -124,6 +124,16 @@ def pop(heap: Heap, size: int) -> int:
 # The growth toward a start
 
 
+class Search(NamedTuple):
+    """All that a field grows with, or is repaired with."""
+
+    known: Known
+    heap: Heap
+    aim: Aim
+    world: World
+    body: Body
+
+
 @inlined
 def way_left(x: int, y: int, aim: Any) -> float:
     """Return what is left from a cell to the start at least, in cells."""
@@ -140,39 +150,33 @@ def way_left(x: int, y: int, aim: Any) -> float:
 
 
 @in_place
-def order(
-    known: Known, tiles: NDArray[np.int64], heap: Heap, aim: Aim, world: World
-) -> tuple[int, float]:
+def order(search: Search, tiles: NDArray[np.int64]) -> tuple[int, float]:
     """Make a heap of all states in some tiles that are open or wait, ordered toward a start."""
     # Returns how many there are, and a lower bound of what may still be found for the start.
-    size, least = 0, np.inf
+    known, aim, size, least = search.known, search.aim, 0, np.inf
     for tile in tiles:
         for number in range(tile << TILE_BITS, (tile + 1) << TILE_BITS):
             if OPEN <= known.mark[number] <= WAITING:
                 known.mark[number] = OPEN
-                x, y, _ = place_of(number, world)
+                x, y, _ = place_of(number, search.world)
                 here, far = known.distance[number], way_left(x, y, aim)
-                size = push(np.float32(here + aim.weight * far), number, heap, size)
+                size = push(np.float32(here + aim.weight * far), number, search.heap, size)
                 least = min(least, here + far)
     return size, least
 
 
 @in_place
 def grow(
-    known: Known,
-    heap: Heap,
-    size: int,
-    aim: Aim,
-    share: float,
-    limit: int,
-    world: World,
-    body: Body,
+    search: Search, size: int, enough: float, share: float, limit: int
 ) -> tuple[int, int, bool]:
-    """Close states in their order until it reaches a share of a start's cost; see `PoseField`."""
+    """Close states until a start's cost is enough, or a share of it comes next; see `PoseField`."""
     # Returns the heap's size, the visits, and whether it is done.
+    known, heap, aim, world, body = search
     distance, mark, target = known.distance, known.mark, aim.number
     keys, most, visits = heap.keys, heap.keys.size - body.start.size, 0
-    while size > 0 and (mark[target] == UNREACHED or keys[0] < share * distance[target]):
+    while size > 0 and (
+        mark[target] == UNREACHED or max(enough, keys[0] / share) < distance[target]
+    ):
         if visits == limit or size > most:
             return size, visits, False
         number = heap.numbers[0]
@@ -208,35 +212,34 @@ def grow(
 
 
 @inlined
-def next_best(number: int, limit: Any, known: Known, world: World, body: Body) -> tuple[Any, int]:
+def next_best(
+    number: int, limit: Any, most: Any, known: Known, world: World, body: Body
+) -> tuple[Any, int]:
     """Return the least cost by way of a state of less than a limit, and the primitive there."""
+    # Only what costs at most so much counts; -1 if there is none.
     x, y, heading = place_of(number, world)
-    best, chosen = np.float32(np.inf), -1
+    best, chosen = most, -1
     for primitive in range(body.out[heading], body.out[heading + 1]):
         end = after(x, y, primitive, world, body)
         if end < 0 or known.mark[end] == UNREACHED or known.distance[end] >= limit:
             continue
         beyond = known.distance[end]
-        if beyond + body.cost[primitive] < best and is_possible(x, y, primitive, world, body):
+        if beyond + body.cost[primitive] <= best and is_possible(x, y, primitive, world, body):
             found = beyond + cost_of(x, y, primitive, world, body)
-            if found < best:
+            if found <= best:
                 best, chosen = found, primitive
     return best, chosen
 
 
 @in_place
 def follow(
-    known: Known,
-    number: int,
-    primitives: NDArray[np.int64],
-    costs: NDArray[np.float64],
-    world: World,
-    body: Body,
+    search: Search, number: int, primitives: NDArray[np.int64], costs: NDArray[np.float64]
 ) -> int:
     """Write the greedy primitives from a state to the goal, and their costs; return their count."""
-    count = 0
+    known, world, body, count = search.known, search.world, search.body, 0
     while known.distance[number] > 0 and count < primitives.size:
-        _, chosen = next_best(number, known.distance[number], known, world, body)
+        here, most = known.distance[number], np.float32(np.inf)
+        _, chosen = next_best(number, here, most, known, world, body)
         x, y, _ = place_of(number, world)
         primitives[count], costs[count] = chosen, cost_of(x, y, chosen, world, body)
         number = after(x, y, chosen, world, body)
@@ -267,29 +270,40 @@ def leads_to(
 
 
 @in_place
-def least_unsupported(known: Known, tiles: NDArray[np.int64], world: World, body: Body) -> Any:
-    """Return the least cost in some tiles that no possible primitive supports; infinite if none."""
-    least = np.float32(np.inf)
-    for tile in tiles:
+def take_back(
+    search: Search, size: int, near: NDArray[np.int64], tiles: NDArray[np.int64], kept: float
+) -> tuple[float, int]:
+    """Take back what costs as much as a state in near tiles that lost its support, or more."""
+    # What costs less is supported still. What is reached from there is open anew. Returns the least
+    # cost that lost its support, and the heap's size; if less is to be kept, it changes nothing.
+    known, heap, aim, world, body = search
+    limit = np.float32(np.inf)
+    for tile in near:
         for number in range(tile << TILE_BITS, (tile + 1) << TILE_BITS):
             here = known.distance[number]
-            if known.mark[number] != UNREACHED and 0 < here < least:
-                found, _ = next_best(number, here, known, world, body)
-                least = here if found > here else least
-    return least
-
-
-@in_place
-def take_back(
-    known: Known, tiles: NDArray[np.int64], limit: float, world: World, body: Body
-) -> None:
-    """Open anew, by way of what costs less, what costs a limit or more."""
+            if known.mark[number] != UNREACHED and 0 < here < limit:
+                _, chosen = next_best(number, here, here, known, world, body)
+                limit = here if chosen < 0 else limit
+    if limit < kept or limit == np.inf:
+        return limit, size
+    # What costs more than a primitive beyond the limit is not reached from a closed state below it.
+    last = limit if world.cost.size + world.slowness.size == 0 else np.float32(np.inf)
+    for cost in body.cost:
+        last = max(last, limit + cost)
     for tile in tiles:
         for number in range(tile << TILE_BITS, (tile + 1) << TILE_BITS):
-            if known.mark[number] != UNREACHED and known.distance[number] >= limit:
-                found, _ = next_best(number, limit, known, world, body)
+            if known.mark[number] == UNREACHED or known.distance[number] < limit:
+                continue
+            found = np.float32(np.inf)
+            if known.distance[number] <= last:
+                found, _ = next_best(number, limit, found, known, world, body)
+            known.mark[number] = OPEN if found < np.inf else UNREACHED
+            if found < np.inf:
                 known.distance[number] = found
-                known.mark[number] = OPEN if found < np.inf else UNREACHED
+                x, y, _ = place_of(number, world)
+                key = np.float32(found + aim.weight * way_left(x, y, aim))
+                size = push(key, number, heap, size)
+    return limit, size
 
 
 # A lower bound from the map. The robot's origin stays in tiles that it may pass. A shortest way in
@@ -348,16 +362,11 @@ def way_to_box(x: int, y: int, box: NDArray[np.int64]) -> int:
 
 @in_place
 def look(
-    aim: Aim,
-    room: NDArray[np.uint8],
-    heap: Heap,
-    is_goal: NDArray[np.bool_],
-    box: NDArray[np.int64],
-    world: World,
-    body: Body,
+    search: Search, room: NDArray[np.uint8], is_goal: NDArray[np.bool_], box: NDArray[np.int64]
 ) -> None:
     """Write to an aim what is left from corners of tiles, infinite where no way leads."""
     # By A*, to the nearest goal and as much further: what is not on the way there is left out.
+    _, heap, aim, world, body = search
     left, (rows, columns) = aim.left, room.shape
     size, end, limit = 0, np.float32(0), np.inf
     left[:] = np.inf

@@ -44,14 +44,16 @@ def plan_along(
 ) -> PosePlan:
     """Return the plan of a path of poses that lie in cells, of a cost and the least one proved."""
     poses.flags.writeable = False
+    (x, y, _), (column, line) = poses.T, cells.T
+    is_next = (column[1:] != column[:-1]) | (line[1:] != line[:-1])
     bound = max(cost / least, 1.0) if least > 0 else math.inf
     return PosePlan(
         PlanStatus.SUCCEEDED,
-        cells[np.append(True, (cells[1:] != cells[:-1]).any(axis=1))],
+        cells[np.append(True, is_next)],
         cost=cost * (grid.seconds_per_cell or 1.0),
         goal=(int(cells[-1, 0]), int(cells[-1, 1])),
         poses=poses,
-        driven=float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum()) / grid.resolution,
+        driven=float(np.hypot(np.diff(x), np.diff(y)).sum()) / grid.resolution,
         bound=bound if cost > least * SAME else 1.0,
     )
 

@@ -68,10 +68,9 @@ class PosePlanner:
         self.body = body_of(network.motions, network.swept())
         self.points = paths.points_of(self.footprint, self.motions.resolution)
         # After its first pose, those of each primitive, and the share of its cost until there.
-        self._after = [
-            np.column_stack([poses, np.linspace(0, 1, len(poses))])[1:]
-            for poses in self.motions.poses
-        ]
+        ways = [np.column_stack([way, np.linspace(0, 1, len(way))]) for way in self.motions.poses]
+        self._after = np.concatenate([way[1:] for way in ways])
+        self._counts = np.array([len(way) - 1 for way in ways])
         self._fields: dict[tuple[Any, ...], PoseField] = {}  # used last at the end
         self._map: tuple[GridMap, World] | None = None  # the last one
         self._differences = lru_cache(maxsize=1)(differences)
@@ -243,18 +242,19 @@ class PosePlanner:
         costs: NDArray[np.float64],
     ) -> paths.Way:
         """Return the poses of primitives from a start, and what is spent before each."""
-        after = [self._after[primitive] for primitive in primitives]
-        offset, spent = self.motions.offset[primitives], np.cumsum(costs)
-        begins = np.column_stack([np.cumsum(offset, axis=0) - offset, spent - costs, costs])
-        first = [0.0, 0.0, self.motions.angles[start[2]], 0.0]
-        x, y, yaw, share = np.vstack([[first], *after]).T
-        over, up, before, cost = np.repeat(
-            np.vstack([np.zeros((1, 4)), begins]), [1, *map(len, after)], axis=0
-        ).T
-        x, y, yaw = x + over + start[0], y + up + start[1], turn_between(0, yaw + grid.origin[2])
-        poses, cells = np.column_stack([*grid.centres(x, y), yaw]), np.column_stack([x, y])
-        least = float(costs.sum()) / bound
-        return paths.Way(poses, paths.cells_of(cells), before + share * cost, least)
+        counts, offset = self._counts[primitives], self.motions.offset[primitives]
+        number, end = np.repeat(np.arange(len(counts)), counts), np.cumsum(counts)
+        skipped = np.cumsum(self._counts)[primitives] - end
+        begins = np.cumsum(offset, axis=0) - offset + start[:2]
+        before = np.column_stack([begins, np.cumsum(costs) - costs, costs])
+        poses = self._after.take(np.arange(len(number)) + skipped[number], axis=0)
+        (x, y, yaw, share), (over, up, spent, cost) = poses.T, before.take(number, axis=0).T
+        begin = *start[:2], self.motions.angles[start[2]], 0.0
+        way = zip(begin, (x + over, y + up, yaw, spent + share * cost), strict=True)
+        x, y, yaw, spent = (np.append(first, others) for first, others in way)
+        poses = np.column_stack([*grid.centres(x, y), turn_between(0, yaw + grid.origin[2])])
+        cells = paths.cells_of(np.column_stack([x, y]))
+        return paths.Way(poses, cells, spent, float(costs.sum()) / bound)
 
 
 def _meets(ends: NDArray[np.float64], pose: Any, grid: GridMap) -> bool:
