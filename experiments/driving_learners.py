@@ -12,8 +12,10 @@ from scipy.sparse.linalg import cg
 
 from ddqn_planner import Experience, GridMap
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
+from ddqn_planner.training.prior import prior_of
 
 WINDOW: Final = 0.5  # seconds over which poses are averaged
+MORE_PLACES: Final = 1.1  # times as many as the last time teach the prior anew
 CELL, SQUARE = 0.25, 1.0  # metres: the sides of places
 VISIT_NOISE: Final = 0.1  # variance of the log slowness of a visit
 # Of the parameters of a Gaussian process: the length, and the deviations of signal and noise.
@@ -147,8 +149,24 @@ class MarkovField(Learner):
         self.slowness = np.exp(self.mean)
 
 
+class TaughtExperience(Experience):
+    """What a robot has whose trainer trains the prior, too, as often as `trainer_node` does."""
+
+    def __init__(self, grid: GridMap) -> None:
+        super().__init__(SPEED)
+        self.grid, self.places = grid, 0
+
+    def record(self, seconds: Any, positions: Any) -> None:
+        """Learn from a drive."""
+        super().record(seconds, positions)
+        places = len(self.evidence.table)
+        if places > self.places and places >= MORE_PLACES * self.places:
+            self.places = places
+            self.prior = prior_of(self.grid, self.evidence.table, self.prior)
+
+
 LEARNERS: Final[dict[str, Callable[[GridMap], Any]]] = {
-    "experience": lambda grid: Experience(SPEED),
+    "experience": TaughtExperience,
     "shortest path": Learner,
     "last time per cell": LastTime,
     "mean per square": MeanTime,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,71 +31,64 @@ USUAL = 4.0  # from bound to bound of drives' errors; where it is more, so is a 
 PART_NOISE = 0.12  # of their mean log slowness, as each way through a place is another
 CHANGED = 0.01  # share of all evidence that is left then: where one place changed, others did
 
-# Robots that wait on both sides of a door wait at one place, between them: waits within so many
-# widths of the robot are of one place, which is the mean of about the last so many.
-SAME_WAIT, NEAREST_WAITS = 1.25, 4.0
 MOST_PASSAGES = 20.0  # a wait is the mean of about the last so many
 
 SHORTEST = 8  # a drive through fewer places says little about how sure expected times are
 KEPT, ASSUMED = 64, 8  # drives whose errors count, and drives assumed before, with normal errors
 NORMAL = 1.645  # 90 % of a normal distribution lie within so many standard deviations
-TAIL = 0.04  # share of errors beyond each bound: not 5 %, as successive drives are alike
+TAIL = 0.025  # of these errors beyond each bound: not 5 %, as few drives tell little of the next
 
-# Of each place: the weight of its visits, that times their log slowness, what the prior foretold of
-# it before, and where it was visited first.
-COLUMNS = "weight", "log", "foretold", "x", "y"
-WAIT_COLUMNS = "seconds", "passages", "x", "y"
-IN_FILES = "evidence", "waits", "driven", "errors"  # what they keep
+# Of each place: the weight of its visits, that times their log slowness, the weight of those since
+# a robot first waited near, the seconds that robots waited there, what the prior foretold of it
+# before, and where it was visited first.
+COLUMNS = "weight", "log", "passed", "waited", "foretold", "x", "y"
 
 
 class Visits(NamedTuple):
-    """The V places of a drive, one after the other: where (V, 2), and for how long (V,)."""
+    """What a drive showed of its V places, one after the other, and of its W waits."""
 
-    position: Float64
-    seconds: Float64
-    metres: Float64
-
-
-NO_VISITS = Visits(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+    position: Float64  # (V, 2)
+    seconds: Float64  # (V,): without waits
+    metres: Float64  # (V,)
+    waits: Float64  # (W, 3): x, y, seconds
 
 
 class Evidence:
     """What was seen at each place, a square of the world. It fades with the time that is driven."""
 
     def __init__(self, nominal_speed: float, robot_width: float, half_life: float) -> None:
-        self.nominal_speed, self.half_life = nominal_speed, half_life
-        self.side, self.wait_radius = robot_width / 2, robot_width
+        self.nominal_speed, self.half_life, self.side = nominal_speed, half_life, robot_width / 2
         self.forget()
 
     def forget(self) -> None:
         """Forget all."""
         self.prior: Prior | None = None
         self.driven = 0.0
-        self.places: dict[tuple[int, int], int] = {}  # the row of each in the table
         self.table = np.zeros((0, len(COLUMNS)))
-        self.waits = np.zeros((0, len(WAIT_COLUMNS)))
         self.errors: list[float] = []  # of the last drives' log times, in standard deviations
         self.posterior: Posterior | None = None  # over the last map
         self._fit()
 
-    def add(self, visits: Visits, waits: Float64) -> None:
-        """Learn from the visits of a drive, its waits (W, 3): x, y, seconds; and its whole time."""
-        self._compare(visits, waits)
-        self._add_visits(visits)
-        self._add_waits(visits, waits)
-        seconds = float(visits.seconds.sum() + waits[:, 2].sum())
-        self.driven += seconds
-        self.table[:, :2] *= 0.5 ** (seconds / self.half_life)
-        self._fit()
-
-    def _add_visits(self, visits: Visits) -> None:
-        rows = self._rows(visits.position)
-        slowness = visits.seconds * self.nominal_speed / visits.metres
-        log = np.log(np.clip(slowness, 1 / MAX_SLOWNESS, MAX_SLOWNESS))
+    def add(self, visits: Visits) -> None:
+        """Learn from a drive."""
+        self._compare(visits)
+        weight, slowness = visits.metres / self.side, visits.seconds / visits.metres
+        log = np.log(np.clip(slowness * self.nominal_speed, 1 / MAX_SLOWNESS, MAX_SLOWNESS))
+        rows, waited = self._rows(visits.position), self._rows(visits.waits[:, :2])
         if self._has_changed(rows, log):
-            self.table[:, :2] *= CHANGED
-        weight = visits.metres / self.side
-        np.add.at(self.table[:, :2], rows, np.column_stack([weight, weight * log]))
+            self.table[:, :4] *= CHANGED
+        np.add.at(self.table[:, 3], waited, visits.waits[:, 2])
+        # Only passages from the first wait on tell how long a wait is.
+        away = visits.position[:, None] - self.table[self.table[:, 3] > 0, 5:]
+        is_near = np.hypot(away[..., 0], away[..., 1]).min(axis=1, initial=np.inf) <= 2 * self.side
+        seen = weight[:, None] * np.column_stack([np.ones(len(log)), log, is_near])
+        np.add.at(self.table[:, :3], rows, seen)
+        self.table[waited, 2] = np.maximum(self.table[waited, 2], 1)
+        self.table[:, 2:4] /= np.maximum(self.table[:, 2:3] / MOST_PASSAGES, 1)
+        seconds = float(visits.seconds.sum() + visits.waits[:, 2].sum())
+        self.driven += seconds
+        self.table[:, :4] *= 0.5 ** (seconds / self.half_life)
+        self._fit()
 
     def _has_changed(self, rows: NDArray[np.int64], log: Float64) -> bool:
         """Return whether a part of a drive was other than all before."""
@@ -113,49 +105,27 @@ class Evidence:
                     return True
         return False
 
-    def _add_waits(self, visits: Visits, waits: Float64) -> None:
-        """Count the passages of places where robots wait, and the seconds of this drive."""
-        away = visits.position[None] - self.waits[:, None, 2:]
-        inside = np.hypot(away[..., 0], away[..., 1]) <= self.wait_radius
-        self.waits[:, 1] += (np.diff(inside, axis=1, prepend=False) & inside).sum(axis=1)
-        self.waits[:, :2] /= np.maximum(self.waits[:, 1:2] / MOST_PASSAGES, 1)
-        for x, y, seconds in waits.tolist():
-            row = self._wait_at(x, y)
-            self.waits[row, 0] += seconds
-            self.waits[row, 1] = max(self.waits[row, 1], 1)
-
-    def _wait_at(self, x: float, y: float) -> int:
-        """Return the row of a place where robots wait; a new place gets one."""
-        away = np.array([x, y]) - self.waits[:, 2:]
-        distance = np.hypot(*away.T)
-        if distance.min(initial=math.inf) > SAME_WAIT * self.wait_radius:
-            self.waits = np.vstack([self.waits, [0.0, 0.0, x, y]])
-            return len(self.waits) - 1
-        row = int(distance.argmin())
-        self.waits[row, 2:] += away[row] / NEAREST_WAITS
-        return row
-
-    def _squares(self, position: Float64) -> list[tuple[int, int]]:
-        """Return the square of the world of each position."""
-        return list(map(tuple, np.floor(position / self.side).astype(np.int64).tolist()))
+    def _squares(self, position: Float64) -> NDArray[np.complex128]:
+        """Return the square of the world of each position (N, 2)."""
+        return np.floor(position / self.side) @ [1, 1j]
 
     def _rows(self, position: Float64) -> NDArray[np.int64]:
-        """Return the row of each position; new places get one."""
-        before, squares = len(self.places), self._squares(position)
-        rows = [self.places.setdefault(square, len(self.places)) for square in squares]
-        visited, first = np.unique(np.array(rows, dtype=np.int64), return_index=True)
-        first = first[visited >= before]
-        fresh = np.zeros((len(first), len(COLUMNS)))
-        fresh[:, 3:5] = position[first]
+        """Return the row of each position (N, 2); new places get one, in the order of visits."""
+        known = len(self.table)
+        squares = self._squares(np.concatenate([self.table[:, 5:], position]))
+        _, first, rows = np.unique(squares, return_index=True, return_inverse=True)
+        new = np.sort(first)[known:]
+        fresh = np.zeros((len(new), len(COLUMNS)))
+        fresh[:, 5:] = position[new - known]
         if self.posterior is not None:
-            places = self.posterior.places_at(fresh[:, 3:5])
-            fresh[:, 2] = np.append(self.posterior.foretold, 0)[places]
+            places = self.posterior.places_at(fresh[:, 5:])
+            fresh[:, 4] = np.append(self.posterior.foretold, 0)[places]
         self.table = np.concatenate([self.table, fresh])
-        return np.array(rows, dtype=np.int64)
+        return np.argsort(np.argsort(first))[rows[known:]]
 
     def _fit(self) -> None:
         """Learn what all places have in common, how they differ, and what the prior is worth."""
-        weight, sum_of_log, foretold = self.table[self.table[:, 0] >= 0.2, :3].T
+        weight, sum_of_log, *_, foretold = self.table[self.table[:, 0] >= 0.2, :5].T
         log = sum_of_log / weight
         columns = np.column_stack([np.ones(len(log)), foretold])
         self.variance = VARIANCE  # of the log slowness of places
@@ -181,7 +151,7 @@ class Evidence:
         quantiles = np.quantile(sure, (0.25, 0.05)) if len(sure) >= SURE_PLACES else np.zeros(2)
         self.open, self.fastest = map(float, quantiles)
 
-    def _compare(self, visits: Visits, waits: Float64) -> None:
+    def _compare(self, visits: Visits) -> None:
         """Compare the time of a drive with the one expected on the last map."""
         if self.posterior is None:
             return
@@ -190,7 +160,7 @@ class Evidence:
         if free.sum() >= SHORTEST:
             nominal = visits.metres[free] / self.nominal_speed
             expected = nominal * self.posterior.slowness[places[free]]
-            seconds = visits.seconds[free].sum() + waits[:, 2].sum()
+            seconds = visits.seconds[free].sum() + visits.waits[:, 2].sum()
             deviation = self.posterior.deviation(expected, places[free])
             self.errors.append(math.log(seconds / expected.sum()) / deviation)
             self.errors = self.errors[-KEPT:]
@@ -198,9 +168,7 @@ class Evidence:
     def quantiles(self) -> Float64:
         """Return the lower bound, the mean, and the upper bound of 90 % of the errors of drives."""
         errors = np.concatenate([self.errors, NORMAL * np.linspace(-1.05, 1.05, ASSUMED)])
-        # Of n errors and the next one, as many lie outside on each side as of a sample of n + 1.
-        tail = TAIL * (1 + 1 / len(errors)) - 1 / len(errors)
-        low, high = np.quantile(errors, (max(tail, 0), min(1 - tail, 1)))
+        low, high = np.quantile(errors, (TAIL, 1 - TAIL))
         return np.array([low, errors.mean(), high])
 
     def over(self, grid: GridMap) -> Posterior:
@@ -220,11 +188,8 @@ class Evidence:
 
     def merge(self, other: Evidence) -> None:
         """Add what other evidence has."""
-        rows = self._rows(other.table[:, 3:5])
-        self.table[rows, :2] += other.table[:, :2]
-        for seconds, passages, x, y in other.waits.tolist():
-            row = self._wait_at(x, y)  # first: it may make the table anew
-            self.waits[row, :2] += seconds, passages
+        rows = self._rows(other.table[:, 5:])
+        self.table[rows, :4] += other.table[:, :4]
         self.errors = [*self.errors, *other.errors][-KEPT:]
         self.driven += other.driven
         self.use_prior(other.prior if self.prior is None else self.prior)
@@ -232,27 +197,21 @@ class Evidence:
     def use_prior(self, prior: Prior | None) -> None:
         """Let another prior foretell; its level, learned from these places, counts but once."""
         old, new = (0.0 if each is None else float(each.level) for each in (self.prior, prior))
-        self.table[:, 2] += new - old
+        self.table[:, 4] += new - old
         self.prior = prior
         self._fit()
 
-    def arrays(self) -> dict[str, Any]:
-        """Return what a file keeps."""
-        return dict(zip(IN_FILES, (self.table, self.waits, self.driven, self.errors), strict=True))
-
-    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Take what a file keeps; a ValueError if it cannot be true."""
-        given = [arrays[name].astype(np.float64) for name in IN_FILES]
-        table, waits, driven, errors = given
-        shapes = (len(table), len(COLUMNS)), (len(waits), len(WAIT_COLUMNS)), (), (errors.size,)
+    def restore(self, *arrays: NDArray[Any]) -> None:
+        """Take the table, the driven time and the errors of a file; a ValueError if they lie."""
+        given = table, driven, errors = [array.astype(np.float64) for array in arrays]
+        shapes = (len(table), len(COLUMNS)), (), (errors.size,)
         possible = shapes == tuple(array.shape for array in given)
         possible = possible and all(np.isfinite(array).all() for array in given)
         if possible:
-            self.places = {at: row for row, at in enumerate(self._squares(table[:, 3:5]))}
-            least = min(table[:, 0].min(initial=0), waits[:, :2].min(initial=0), float(driven))
-            possible = least >= 0 and len(self.places) == len(table)
-            possible &= bool(np.abs(table[:, 3:5]).max(initial=0) <= FARTHEST)
+            possible = min(table[:, [0, 2, 3]].min(initial=0), float(driven)) >= 0
+            possible &= len(np.unique(self._squares(table[:, 5:]))) == len(table)
+            possible &= bool(np.abs(table[:, 5:]).max(initial=0) <= FARTHEST)
         if not possible:
             raise ValueError("its evidence cannot be true")
-        self.table, self.waits, self.driven, self.errors = table, waits, float(driven), [*errors]
+        self.table, self.driven, self.errors = table, float(driven), [*errors]
         self._fit()

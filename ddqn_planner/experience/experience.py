@@ -16,7 +16,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ddqn_planner.experience.evidence import FARTHEST, NO_VISITS, Evidence, Visits
+from ddqn_planner.experience.evidence import FARTHEST, Evidence, Visits
 from ddqn_planner.experience.prior import Prior
 from ddqn_planner.files import as_path, differences, locked, write_atomically
 from ddqn_planner.grid import GridMap
@@ -27,7 +27,7 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Step: TypeAlias = Callable[[Evidence], None]
 
-VERSION = 2
+VERSION = 3  # 2 was never released
 PRIOR = "prior_"  # before the names of its arrays in a file
 EXPERIENCE = "experience.npz"  # the name of the file in a folder
 OPTIONS = ("nominal_speed", "robot_width", "half_life", "max_pause")
@@ -126,11 +126,11 @@ class Experience:
         time, position = time[possible], position[possible]
         fresh = np.diff(time, prepend=np.nan) != 0  # a repeated time adds nothing
         if fresh.any():
-            visits, waits = self._measured(time[fresh], position[fresh])
-            self._learn(partial(Evidence.add, visits=visits, waits=waits))
+            visits = self._measured(time[fresh], position[fresh])
+            self._learn(partial(Evidence.add, visits=visits))
 
-    def _measured(self, time: Float64, position: Float64) -> tuple[Visits, Float64]:
-        """Return the visits and the waits of a drive."""
+    def _measured(self, time: Float64, position: Float64) -> Visits:
+        """Return the visits of a drive."""
         speed, side = self.learned_speed, self.evidence.side
         seconds, at = averaged(time, position, WINDOW / speed)
         speeds = np.hypot(*np.diff(at, axis=0).T) / np.abs(np.diff(seconds))
@@ -154,16 +154,16 @@ class Experience:
         squares = np.floor(rows[:, :2] / side)
         entered = np.flatnonzero((np.diff(squares, axis=0, prepend=np.nan) != 0).any(axis=1))
         count, sums = np.diff(entered, append=len(rows)), np.add.reduceat(rows, entered)
-        visits = Visits(sums[:, :2] / count[:, None], sums[:, 2], step * count)
-        return visits, np.concatenate(waits)
+        middle, waited = sums[:, :2] / count[:, None], np.concatenate(waits)
+        return Visits(middle, sums[:, 2], step * count, waited)
 
     def record_failure(self, position: Sequence[float]) -> None:
         """Learn that the robot failed at a place: it costs as much as a wait of `max_pause`."""
         point = numbers("the position", position, (2,))
         if not (np.abs(point) < FARTHEST).all():
             raise ValueError(f"the position is {position!r}; give metres, at most {FARTHEST:g}")
-        waits = np.array([[*point, self.max_pause]])
-        self._learn(partial(Evidence.add, visits=NO_VISITS, waits=waits))
+        none, waits = np.zeros((0, 2)), np.array([[*point, self.max_pause]])
+        self._learn(partial(Evidence.add, visits=Visits(none, none[:, 0], none[:, 0], waits)))
 
     def _learn(self, step: Step) -> None:
         step(self.evidence)
@@ -295,8 +295,9 @@ class Experience:
         content = io.BytesIO()
         prior = self.prior._asdict() if self.prior is not None else {}
         arrays: dict[str, Any] = {PRIOR + name: array for name, array in prior.items()}
-        options = list(self.options.values())
-        np.savez(content, version=VERSION, options=options, **self.evidence.arrays(), **arrays)
+        options, kept = list(self.options.values()), self.evidence
+        arrays |= {"evidence": kept.table, "driven": kept.driven, "errors": kept.errors}
+        np.savez(content, version=VERSION, options=options, **arrays)
         return content.getvalue()
 
     @classmethod
@@ -318,12 +319,12 @@ class Experience:
                 raise ValueError(f"it has version {version}, not {VERSION}")
             options = dict(zip(OPTIONS, arrays["options"].tolist(), strict=True))
             experience = cls(**options)
-            if version == 1:  # before 0.4.0 failures stood where now is what the prior foretold
-                arrays["waits"], table = np.zeros((0, 4)), arrays["evidence"]
+            if version == 1:  # until 0.4.0 failures stood there, and when a place was visited
+                table = arrays["evidence"]
                 age = (arrays["driven"] - table[:, 5:]) / experience.half_life
                 faded = table[:, :2] * 0.5**age
-                arrays["evidence"] = np.hstack([faded, 0 * table[:, 2:3], table[:, 3:5]])
-            experience.evidence.restore(arrays)
+                arrays["evidence"] = np.hstack([faded, np.zeros((len(faded), 3)), table[:, 3:5]])
+            experience.evidence.restore(arrays["evidence"], arrays["driven"], arrays["errors"])
             prior = {n.removeprefix(PRIOR): a for n, a in arrays.items() if n.startswith(PRIOR)}
             experience.evidence.prior = Prior.from_arrays(prior) if prior else None
         except Exception as error:  # broken bytes make zipfile and NumPy raise many kinds of errors

@@ -23,7 +23,7 @@ CORRELATION = 1.0  # metres: how far the slowness of a place tells of that of ot
 STEP = 0.02  # slowness is told in steps of this share: fields need no repair for less
 ACCURACY = 0.01  # of the log slowness: no place is farther from the solution of its equations
 OVER_RELAXATION = 1.4  # of the solver: neighbours agree sooner
-WAIT_PASSAGES = 0.1  # passages without a wait that are assumed
+WAIT_PLACES = 0.1  # so many places around each one are assumed to be driven without a wait
 FEW_PLACES = 16.0  # it is assumed that so many were driven where nothing was slow
 NOISE = 0.1  # variance of the log slowness of one visit
 # Standard deviations of the log time of a drive: on ways that are known, and that are not.
@@ -74,16 +74,18 @@ class Posterior:
             features = map_features(self.grid)[y, x]
             self.foretold[:] = self.prior.log_slowness(features) if self.prior else 0
         self.expected = evidence.trust[0] + evidence.trust[1] * self.foretold
-        places = self.places_at(evidence.table[:, 3:5])
+        places = self.places_at(evidence.table[:, 5:])
         inside = places >= 0
-        weight, log = evidence.table[inside, :2].T
+        sums = np.zeros((len(self.middle), 4))
+        np.add.at(sums, places[inside], evidence.table[inside, :4])
+        weight, log, passed, waited = sums.T
         # A lattice whose links have strength 1 has about the variance ln(32 / kappa) / 4 pi;
         # 1 is added for cells of many metres, where that would be negative.
         kappa = (self.spacing / CORRELATION) ** 2
         scale = evidence.variance / (math.log1p(32 / kappa) / (4 * math.pi)) / NOISE
-        visits = scale * np.bincount(places[inside], weight, len(self.middle))
+        visits = scale * weight
         # Half of the noise is added, as the mean of its exponential is more than 1.
-        seen = scale * np.bincount(places[inside], log + weight * NOISE / 2, len(self.middle))
+        seen = scale * (log + weight * NOISE / 2)
         right = seen - visits * self.expected + 1j * visits
         # The equations map the same error everywhere to its product with these, and greater errors
         # to greater residuals: residuals up to that product prove that no error is greater.
@@ -97,26 +99,31 @@ class Posterior:
         self.known = np.clip(self.solution.imag, 0, 1)
         self.unknown = np.sqrt(1 - self.known)
         self.mean = self.expected + self.solution.real + evidence.surplus * (1 - self.known)
-        self.slowness = np.exp(self.mean) + self._waits(evidence)
+        self.slowness = np.exp(self.mean)
+        if waited.any():
+            self.slowness += evidence.nominal_speed * self._waits(passed, waited, evidence.side)
 
-    def _waits(self, evidence: Evidence) -> Float64:
-        """Spread the expected waits over the places around, so that a crossing costs each once."""
-        waits, of_each = np.zeros(len(self.middle)), [0.0]
-        radius = evidence.wait_radius
-        width = max(math.pi / 2 * radius, self.spacing)  # the mean way through a disc
-        means = evidence.waits[:, 0] / (evidence.waits[:, 1] + WAIT_PASSAGES)
-        for at, seconds in zip(self.places_at(evidence.waits[:, 2:]), means, strict=True):
-            if at >= 0:
-                near = np.array([at])
-                for _ in range(round(radius / self.spacing)):
-                    near = np.union1d(near, self.links[near].indices)
-                wait = seconds * evidence.nominal_speed / width
-                waits[near] += wait
-                of_each.append(wait * self.known[near].sum())
+    def _waits(self, passed: Float64, waited: Float64, side: float) -> Float64:
+        """Return the seconds that a robot waits for each metre through each place.
+
+        They are those waited around it, over the metres driven around it. So each way through costs
+        what a passage did, also beside the place where robots stood.
+        """
+        reach = round(2 * side / self.spacing)
+        seconds, places = self._around(waited, reach), self._around(passed, reach)
+        waits = seconds / (places + WAIT_PLACES) / side
         # Robots wait where nobody drove, too; but one place of waits says nothing of others.
-        elsewhere = (sum(of_each) - max(of_each)) / (FEW_PLACES + self.known.sum())
-        waits += elsewhere * (1 - self.known)
-        return waits
+        most = np.zeros(len(waits))
+        most[waited.argmax()] = 1
+        others = self.known * (self._around(most, 2 * reach) == 0)
+        elsewhere = float(waits @ others) / (FEW_PLACES + float(self.known.sum()))
+        return waits + elsewhere * (1 - self.known)
+
+    def _around(self, values: Float64, reach: int) -> Float64:
+        """Return a weighted mean of the places around each one, none of them behind a wall."""
+        for _ in range(reach):
+            values = (values + self.links @ values) / 5
+        return values
 
     def paint(self, hope: Float64, fastest: float) -> NDArray[np.float32]:
         """Return (H, W) float32: the slowness over that of the fastest place, which has this log.
@@ -183,10 +190,9 @@ def _relax(*arrays: Any) -> None:
 
 def cells_of(position: Float64, grid: GridMap) -> tuple[Int64, NDArray[np.bool_]]:
     """Return the nearest cells of positions, (N, 2) as (x, y), and which are on the map: (N,)."""
-    origin_x, origin_y, yaw = grid.origin
-    x, y = position[:, 0] - origin_x, position[:, 1] - origin_y
+    *origin, yaw = grid.origin
     cos, sin = math.cos(yaw), math.sin(yaw)
-    along = np.column_stack([cos * x + sin * y, cos * y - sin * x])
+    along = (position - origin) @ [[cos, -sin], [sin, cos]]
     cells = np.floor(along / grid.resolution).astype(np.int64)
     nearest = np.clip(cells, 0, [grid.width - 1, grid.height - 1])
     return nearest, (cells == nearest).all(axis=1)

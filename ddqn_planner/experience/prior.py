@@ -14,10 +14,9 @@ from ddqn_planner.grid.body import clearance
 
 Float32 = NDArray[np.float32]
 
-FEATURES = 11
+FEATURES = 7
 REACH = 3.0  # metres: what is farther away says nothing
 NARROW = 0.7, 1.2, 2.0  # metres: free widths up to which a way counts as narrow
-SQUARES = 0.5, 1.0, 2.0  # metres: half the sides of squares whose share of free space counts
 UNUSUAL = 3.0  # standard deviations: features are no farther off than those of training
 
 
@@ -28,12 +27,9 @@ def map_features(grid: GridMap) -> Float32:
     metres = np.minimum((cells - 0.5) * np.float32(grid.resolution), REACH)
     widths = _widths(occupied, grid.resolution), _widths(occupied.T, grid.resolution).T
     narrow, wide = np.minimum(*widths), np.maximum(*widths)
-    near, middle, far = (_free_share(occupied, side / grid.resolution) for side in SQUARES)
     steps = [1 / (1 + np.exp(7 * (narrow / width - 1))) for width in NARROW]
-    door = steps[1] * (far - near)
-    features = [np.exp(-metres / 0.25), np.exp(-metres / 0.75), metres, *steps]
-    features += [np.log(np.maximum(wide, 0.1)), door, near, middle, far]
-    return np.moveaxis(np.stack(features), 0, -1)
+    near, far = np.exp(-metres / 0.25), np.exp(-metres / 0.75)
+    return np.stack([near, far, metres, *steps, np.log(np.maximum(wide, 0.1))], axis=-1)
 
 
 def _widths(occupied: Occupancy, resolution: float) -> Float32:
@@ -43,20 +39,6 @@ def _widths(occupied: Occupancy, resolution: float) -> Float32:
     right = np.minimum.accumulate(np.where(occupied, at, len(at))[:, ::-1], axis=1)[:, ::-1]
     cells = np.maximum(right - left - 1, 0).astype(np.float32)
     return np.asarray(np.minimum(cells * np.float32(resolution), 2 * REACH))
-
-
-def _free_share(occupied: Occupancy, reach: float) -> Float32:
-    """Return the free share of the square around each cell that reaches so many cells: (H, W)."""
-    from scipy.ndimage import uniform_filter1d
-
-    whole, rest = divmod(max(2 * reach - 1, 0) / 2, 1)
-    share = (~occupied).astype(np.float32)
-    for axis in (0, 1):
-        # A side of 3.5 cells lies between those of 3 and 5 cells.
-        sizes = 2 * int(whole) + 1, 2 * int(whole) + 3
-        small, large = (n * uniform_filter1d(share, n, axis, None, "constant") for n in sizes)
-        share = (small + np.float32(rest) * (large - small)) / np.float32(2 * (whole + rest) + 1)
-    return share
 
 
 class Prior(NamedTuple):

@@ -172,7 +172,7 @@ class Driving:
         self._values |= {
             "drives": str(folder.drives),
             "learned speed (m/s)": f"{speed:.3f}",
-            "places": str(len(slow.places)),
+            "places": str(len(slow.table)),
             "folder": str(folder.folder),
         }
         data, path = folder.experience.to_bytes(), folder.experience_path
@@ -184,7 +184,7 @@ class Driving:
         if place is None or folder is None:
             return
         evidence, before = folder.experience.evidence, self._places_of_prior
-        known = len(evidence.places)
+        known = len(evidence.table)
         if not known or before <= known < MORE_PLACES * before:
             return
         self._places_of_prior = known
@@ -198,7 +198,7 @@ class Driving:
             self._node.get_logger().warning(f"the map foretells nothing: {explained(error)}")
             return
         evidence = folder.experience.evidence
-        if folder is self._folder and len(evidence.places) >= known:  # else it was forgotten
+        if folder is self._folder and len(evidence.table) >= known:  # else it was forgotten
             folder.experience.prior = prior
             self._save(folder)
 

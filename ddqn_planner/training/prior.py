@@ -25,7 +25,7 @@ MOST = 6.0  # weight of a place: those on every way do not govern all
 
 def prior_of(grid: GridMap, table: Any, older: Prior | None, seed: int = 0) -> Prior | None:
     """Train a prior on places of `Evidence.table` that are free on a map; few change nothing."""
-    cells, inside = cells_of(table[:, 3:5], grid)
+    cells, inside = cells_of(table[:, 5:], grid)
     x, y = cells.T
     seen = inside & ~grid.occupancy[y, x] & (table[:, 0] > 0)
     if seen.sum() < FEWEST_PLACES:

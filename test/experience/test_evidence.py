@@ -64,7 +64,7 @@ def test_the_posterior_is_that_of_a_gaussian_markov_random_field(seed: int) -> N
     for _ in range(3):
         drives.append(straight(*random.uniform(0.5, 9.5, (2, 2)), random.uniform(1, 6)))
     occupancy = random.random((40, 60)) < 0.2
-    x, y = np.floor(driven(*drives).evidence.table[:, 3:5] / 0.25).astype(int).T
+    x, y = np.floor(driven(*drives).evidence.table[:, 5:] / 0.25).astype(int).T
     occupancy[y, x] = False
     grid, experience = GridMap(occupancy, 0.25), Experience(SPEED)
     for drive in drives:  # solved again where evidence changed
@@ -84,7 +84,7 @@ def test_the_posterior_is_that_of_a_gaussian_markov_random_field(seed: int) -> N
     precision += np.eye(len(precision)) * 0.25**2
     precision *= np.log1p(32 / 0.25**2) / (4 * np.pi) / variance
     table, seen = experience.evidence.table, np.zeros(len(precision))
-    cells = np.floor(table[:, 3:5] / 0.25).astype(int)
+    cells = np.floor(table[:, 5:] / 0.25).astype(int)
     for (x, y), (weight, log, *_) in zip(cells, table, strict=True):
         precision[number[y, x], number[y, x]] += weight / NOISE
         seen[number[y, x]] += (log + weight * (NOISE / 2 - common)) / NOISE
@@ -303,7 +303,7 @@ def test_nine_of_ten_drives_take_a_time_within_their_interval(noise: float) -> N
 
 def test_memory_grows_with_the_driven_area() -> None:
     experience = driven(*[straight((2, 5), (12, 5), 2)] * 3)
-    places = len(experience.evidence.places)
+    places = len(experience.evidence.table)
     assert 35 <= places <= 45
     experience.record(*straight((2, 5), (12, 5), 2))
-    assert len(experience.evidence.places) == places
+    assert len(experience.evidence.table) == places

@@ -241,16 +241,16 @@ def test_every_broken_file_is_named(path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("version", 3),
+        ("version", 4),
         ("options", [0.5, -1.0, 900.0, 45.0]),
-        ("waits", np.zeros((3, 2))),
-        ("evidence", np.full((39, 5), np.nan)),
+        ("evidence", np.full((39, 7), np.nan)),
         ("driven", np.zeros(2)),
         ("driven", np.array("a")),
         ("driven", -1.0),
-        ("waits", -np.ones((1, 4))),
+        ("evidence", -np.ones((1, 7))),
         ("evidence", np.zeros((39, 5))),
-        ("evidence", np.full((39, 5), 1e9)),
+        ("evidence", np.zeros((39, 7))),
+        ("evidence", np.full((1, 7), 1e9)),
         ("errors", np.array([print], dtype=object)),  # nothing is unpickled
     ],
 )
@@ -295,10 +295,10 @@ def test_what_was_merged_is_as_if_one_robot_had_driven_all() -> None:
 
 def test_a_file_of_an_older_version_is_read(path: Path) -> None:
     with np.load(path) as arrays:
-        old = {name: array for name, array in arrays.items() if name != "waits"}
+        old = dict(arrays)
     table = old["evidence"]  # with failures, and when each place was visited
     old["evidence"] = np.column_stack(
-        [table[:, :2], table[:, 0] * 9, table[:, 3:], 0 * table[:, 0]]
+        [table[:, :2], table[:, 0] * 9, table[:, 5:], 0 * table[:, 0]]
     )
     np.savez(path, **{**old, "version": 1})
     assert at(HALL, Experience.load(path).slowness(HALL), 7, 5) == pytest.approx(3, rel=0.15)

@@ -29,19 +29,19 @@ def test_another_resolution_of_the_same_walls_has_nearly_the_same_features(
     assert difference[:, :3].max(initial=0) < 0.25 / 3  # a corner's distance depends on its cell
 
 
-def test_features_tell_a_wall_a_door_and_a_hall_apart_and_a_wall_around_the_map() -> None:
+def test_features_tell_walls_and_narrow_ways_and_a_wall_stands_around_the_map() -> None:
     occupancy = np.zeros((40, 40), dtype=bool)
     occupancy[20] = True
     occupancy[20, 10] = False
     features = map_features(GridMap(occupancy, 0.25))
-    metres, door = features[..., 2], features[..., 7] * ~occupancy
+    metres, narrow = features[..., 2], features[..., 3] * ~occupancy
     assert metres[19, 30] == pytest.approx(0.125)
     assert metres[16, 30] == pytest.approx(0.875)
     assert metres[0, 0] == pytest.approx(0.125)
     framed = map_features(GridMap(np.pad(occupancy, 20, constant_values=True), 0.25))
     assert framed[20:-20, 20:-20] == pytest.approx(features, abs=1e-6)
-    assert np.unravel_index(door.argmax(), door.shape) == (20, 10)
-    assert door[20, 10] > 4 * np.delete(door[:, 10], 20).max()
+    assert np.unravel_index(narrow.argmax(), narrow.shape) == (20, 10)
+    assert narrow[20, 10] > 4 * np.delete(narrow[:, 10], 20).max()
 
 
 def test_a_robots_body_moves_no_wall() -> None:
