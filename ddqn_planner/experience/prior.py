@@ -53,7 +53,8 @@ class Prior(NamedTuple):
     weights_2: Float32  # (H, H)
     bias_2: Float32
     weights_3: Float32  # (H,)
-    replay: Float32  # (N, F + 2): features, log slowness and weight of places, to learn on from
+    # (N, F + 4): x, y, features, log slowness and weight of places, to learn on from
+    replay: Float32
 
     def log_slowness(self, features: Float32) -> Float32:
         """Return the expected log slowness of places: (..., F) to (...,)."""
@@ -70,7 +71,7 @@ class Prior(NamedTuple):
             )
             possible = prior.log_slowness(np.zeros(FEATURES, dtype=np.float32)).shape == ()
             possible &= bool(np.isfinite(np.concatenate([array.ravel() for array in prior])).all())
-            possible &= prior.replay.shape[1:] == (FEATURES + 2,)
+            possible &= prior.replay.shape[1:] == (FEATURES + 4,)
             possible &= bool((prior.scale > 0).all() and (prior.replay[:, -1] >= 0).all())
         except (KeyError, TypeError, ValueError):
             possible = False

@@ -32,27 +32,34 @@ def prior_of(grid: GridMap, table: Any, older: Prior | None, seed: int = 0) -> P
         return older
     weight, log = table[seen, :2].T
     features, mean = map_features(grid)[y[seen], x[seen]], log / weight
-    return train_prior(features, mean, np.minimum(weight, MOST), older, seed)
+    return train_prior(features, mean, np.minimum(weight, MOST), older, seed, table[seen, 5:])
 
 
 def train_prior(
-    features: Any, log_slowness: Any, weights: Any, older: Prior | None = None, seed: int = 0
+    features: Any,
+    log_slowness: Any,
+    weights: Any,
+    older: Prior | None = None,
+    seed: int = 0,
+    positions: Any = None,
 ) -> Prior:
     """Train a prior on N places: features (N, F), mean log slowness (N,) and its weight (N,).
 
     The places come in the order in which they were first driven. How long to train, and how much to
     believe the result, is what foretells places best that were left out: none of it, if none does.
-    The places of an older prior are replayed, so that what it knew of other maps is not forgotten.
+    The places of an older prior are replayed, so that what it knew of other maps is not forgotten;
+    positions (N, 2) tell which of them are these ones.
     """
     random = np.random.default_rng(seed)
-    new = np.column_stack([features, log_slowness, weights]).astype(np.float32)
+    at = np.zeros((len(features), 2)) if positions is None else positions
+    new = np.column_stack([at, features, log_slowness, weights]).astype(np.float32)
     old = new[:0] if older is None else older.replay
-    known = {row.tobytes() for row in new[:, :FEATURES]}  # a later drive tells of them anew
-    old = old[[row.tobytes() not in known for row in old[:, :FEATURES]]]
+    known = {row.tobytes() for row in new[:, :-2]}  # a later drive tells of them anew
+    old = old[[row.tobytes() not in known for row in old[:, :-2]]]
     rows = np.concatenate([old, new])
-    x, target, weight = rows[:, :FEATURES], rows[:, FEATURES], rows[:, -1] / rows[:, -1].mean()
+    x, target, weight = rows[:, 2:-2], rows[:, -2], rows[:, -1] / rows[:, -1].mean()
     mean, scale = x.mean(axis=0), np.maximum(x.std(axis=0), SMALLEST_SCALE)
-    level = np.average(new[:, FEATURES], weights=new[:, -1])
+    level = np.average(new[:, -2], weights=new[:, -1])
     # Other maps may be slower as a whole: theirs is a level of its own.
     is_old = (np.arange(len(rows)) < len(old)).astype(np.float32)
     x = np.column_stack([np.clip((x - mean) / scale, -UNUSUAL, UNUSUAL), is_old])

@@ -52,7 +52,7 @@ def test_a_robots_body_moves_no_wall() -> None:
 def some_prior() -> Prior:
     random, units = np.random.default_rng(0), 3
     layers = (FEATURES, units), units, (units, units), units, units
-    shapes = FEATURES, FEATURES, (), FEATURES, *layers, (7, FEATURES + 2)
+    shapes = FEATURES, FEATURES, (), FEATURES, *layers, (7, FEATURES + 4)
     return Prior(*(np.abs(random.normal(size=shape)).astype(np.float32) for shape in shapes))
 
 
