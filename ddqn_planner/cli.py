@@ -27,14 +27,7 @@ if TYPE_CHECKING:
 # Options of `plan` that only one kind of model can follow.
 OF_CELLS: Final = "robot_radius", "move_rule", "mode", "start_clearing_radius", "cells"
 OF_BODIES: Final = "yaws", "yaw_tolerance", "bound"
-
-
-class HelpFormatter(argparse.HelpFormatter):
-    """Shows the default of each option that has one."""
-
-    def _get_help_string(self, action: argparse.Action) -> str:
-        has_default = action.default not in (None, "", argparse.SUPPRESS) and action.nargs != 0
-        return f"{action.help} (default: %(default)s)" if has_default else str(action.help)
+MODEL: Final = "name or file (default: %(default)s)"
 
 
 def exit_code(program: str, run: Callable[[], int]) -> int:
@@ -70,8 +63,9 @@ def plan(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
         ("json", bool, False, "print JSON instead of text"),
         ("picture", Path, None, "draw map, path, and the value or the body"),
     )
-    words, pair = "body: headings in the map frame, radians", ("START", "GOAL")
-    parser.add_argument("--yaws", type=float, nargs=2, default=(0, 0), metavar=pair, help=words)
+    words = "body: headings in the map frame, radians (default: %(default)s)"
+    pair: Any = {"type": float, "nargs": 2, "metavar": ("START", "GOAL")}
+    parser.add_argument("--yaws", default=(0, 0), help=words, **pair)
     options = parser.parse_args(arguments)
     map_file, start, goal = _read_map(options)
     planner = api.Planner.load(options.model)
@@ -99,14 +93,11 @@ def _plan_cells(options: Any, planner: api.Planner, grid: GridMap, start: Cell, 
     radius = as_number("--start-clearing-radius", options.start_clearing_radius, *metres)
     asked = options.move_rule, options.mode, tolerance / grid.resolution
     radius /= grid.resolution
-    began = time.perf_counter()
     plan = planner.plan(grid, start, goal, *asked, start_clearing_radius=radius)
-    seconds, rule = time.perf_counter() - began, plan.move_rule
-    optimum = value = None
+    rule, optimum, value = plan.move_rule, None, None
     if plan.cells and grid.is_free(plan.cells[0]):
         no_costs = api.GridMap(grid.occupancy, forbidden=grid.forbidden)
-        shortest = search(plan.cells[0], plan.cells[-1], no_costs, rule)
-        optimum = path_length(shortest, rule)
+        optimum = path_length(search(plan.cells[0], plan.cells[-1], no_costs, rule), rule)
     if options.picture and plan.cells and planner.network.supports((grid.height, grid.width)):
         value = planner.q_field(grid, plan.cells[-1], rule).value
     lines = [f"{x} {y}" for x, y in plan.cells if options.cells]
@@ -115,10 +106,9 @@ def _plan_cells(options: Any, planner: api.Planner, grid: GridMap, start: Cell, 
         lines.append(f"start {plan.cells[0]}, goal {plan.cells[-1]}, {driven:.2f} m")
         known = "" if optimum is None else f"optimum {optimum:.2f} under {rule.value}, "
         known += "" if plan.cost is None else f"cost {plan.cost:.2f}, "
-        known += f"{plan.method.value}, planned in {seconds * 1e3:.1f} ms"
-        lines.append(f"length {plan.length:.2f} cells, {known}")
+        lines.append(f"length {plan.length:.2f} cells, {known}{plan.method.value}")
     answer: Any = {"cells": plan.cells, "method": plan.method.value, "length": plan.length}
-    answer |= {"optimum": optimum, "move_rule": rule.value, "planning_seconds": seconds}
+    answer |= {"optimum": optimum, "move_rule": rule.value}
     rows = [(*cell, *np.round(grid.cell_to_world(cell), 6)) for cell in plan.cells]
     table = ("x", "y", "x_metres", "y_metres"), rows
     title = f"{plan.length:.2f} cells" if plan.cells else plan.status.value
@@ -134,20 +124,17 @@ def _plan_poses(options: Any, planner: api.Planner, grid: GridMap, start: Cell, 
     cells_and_yaws = zip((start, goal), options.yaws, strict=True)
     first, last = ((*grid.cell_to_world(cell), yaw) for cell, yaw in cells_and_yaws)
     tolerance = options.tolerance, options.yaw_tolerance
-    began = time.perf_counter()
     plan = planner.plan_poses(grid, first, last, tolerance, options.bound)
-    seconds = time.perf_counter() - began
-    metres = plan.length * grid.resolution
+    metres, bound = plan.length * grid.resolution, plan.bound
     title = f"{metres:.2f} m" if plan.cells else plan.status.value
-    known = f"at most {plan.bound:.3f} times the least cost, planned in {seconds * 1e3:.1f} ms"
-    lines = [f"{metres:.2f} m, {len(plan.poses)} poses, {known}"]
-    answer = {"poses": plan.poses.tolist(), "metres": metres, "cost": plan.cost}
-    answer |= {"bound": plan.bound, "planning_seconds": seconds}
+    known = f"{len(plan.poses)} poses, at most {bound:.3f} times the least cost"
+    poses = plan.poses.tolist()
+    answer = {"poses": poses, "metres": metres, "cost": plan.cost, "bound": bound}
     ends = plan.poses[[0, -1]] if plan.cells else np.array([first, last])
     footprint = planner.pose_planner.footprint / grid.resolution
     body = footprint, in_cells(plan.poses, grid), in_cells(ends, grid)
     table = ("x", "y", "yaw"), np.round(plan.poses, 6).tolist()
-    return _show(options, grid, plan, answer, lines, table, title=title, body=body)
+    return _show(options, grid, plan, answer, [f"{title}, {known}"], table, title=title, body=body)
 
 
 def _show(
@@ -156,12 +143,14 @@ def _show(
     """Print JSON, or a map and lines, or why there is no path; write and draw what is asked for."""
     from ddqn_planner.pictures import MAX_TEXT_WIDTH, draw_text, save_picture
 
+    ms = plan.field_ms + plan.rollout_ms
     if options.json:
-        print(json.dumps({"status": plan.status.name, "reason": plan.status.value, **answer}))
+        said = {"status": plan.status.name, "reason": plan.status.value, **answer}
+        print(json.dumps({**said, "planning_seconds": ms / 1e3}))
     elif plan.cells:
         if grid.width <= MAX_TEXT_WIDTH or sys.stdout.isatty():
             print(draw_text(grid, plan.cells))
-        print(*lines, sep="\n")
+        print(*lines, sep="\n", end=f", planned in {ms:.1f} ms\n")
     else:
         hint = " for the body; --picture shows it" if "body" in drawn else ""
         print(f"no path: {plan.status.value}{hint}", file=sys.stderr)
@@ -177,6 +166,8 @@ def _add_options(parser: argparse.ArgumentParser, *options: tuple[str, Any, Any,
     for name, kind, default, words in options:
         how = {"action": "store_true"} if kind is bool else {"type": kind, "metavar": "X"}
         how = {"choices": kind} if isinstance(kind, Sequence) else how
+        if kind is not bool and default not in (None, ""):
+            words += " (default: %(default)s)"
         parser.add_argument(f"--{name}", default=default, help=words, **how)
 
 
@@ -324,7 +315,7 @@ def certify(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     from ddqn_planner.model import load_model
     from ddqn_planner.model.certificate import NO_CERTIFICATE
 
-    parser.add_argument("model", nargs="?", default="any_map", help="name or file")
+    parser.add_argument("model", nargs="?", default="any_map", help=MODEL)
     network, metadata = load_model(parser.parse_args(arguments).model)
     certificate = network.certificate(metadata.move_rule)
     print(certificate or NO_CERTIFICATE)
@@ -390,7 +381,7 @@ def warm_up(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     """Compile all that plans need, so that no node compiles it. Run it where the nodes run."""
     from ddqn_planner.warm_up import warm_up as stages
 
-    parser.add_argument("model", nargs="?", default="any_map", help="name or file")
+    parser.add_argument("model", nargs="?", default="any_map", help=MODEL)
     planner, began = api.Planner.load(parser.parse_args(arguments).model), time.perf_counter()
     list(stages(planner, learns=True))
     print(f"compiled, or loaded, in {time.perf_counter() - began:.1f} s")
@@ -411,8 +402,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     names = parser.add_subparsers(required=True, metavar="|".join(COMMANDS))
     parsers = {}
     for name, command in COMMANDS.items():
-        how: Any = {"description": command.__doc__, "formatter_class": HelpFormatter}
-        parsers[name] = names.add_parser(name, help=str(command.__doc__).split(".")[0], **how)
+        words = str(command.__doc__)
+        parsers[name] = names.add_parser(name, help=words.split(".")[0], description=words)
     if not arguments or arguments[0] not in COMMANDS:
         parser.parse_args(arguments)  # ends with the help, or an error
     name, *others = arguments

@@ -14,7 +14,8 @@ from ddqn_planner import GridMap, MoveRule, Planner
 from ddqn_planner.grid import OCCUPIED, UNKNOWN, legal_moves, move_costs
 from ddqn_planner.grid.noise import random_costs
 from ddqn_planner.model import AnyMapQNetwork
-from ddqn_planner.training.any_map import ANY_MAP, RULES, random_scenarios
+from ddqn_planner.model.certificate import MOVE_RULES
+from ddqn_planner.training.any_map import ANY_MAP, random_scenarios
 from ddqn_planner.training.environment import GridVectorEnvironment
 from ddqn_planner.training.evaluation import evaluate
 
@@ -98,7 +99,7 @@ def move_errors(planner: Planner) -> tuple[int, float]:
     # One map of all patches: a centre's neighbours all lie in its own patch.
     cells = costs_B9.reshape(16, 16, 3, 3).swapaxes(1, 2).reshape(48, 48)
     grid = GridMap(cells == OCCUPIED, cost=cells)
-    for rule in RULES:
+    for rule in MOVE_RULES:
         legal_BA = legal_moves(grid.occupancy, rule)[:, 1::3, 1::3].reshape(8, -1).T
         cost_BA = move_costs(grid.cost_multiplier, rule)[:, 1::3, 1::3].reshape(8, -1).T
         p_BA = network.success(network.features(patch_B9, rule))

@@ -22,11 +22,12 @@ from rcl_interfaces.srv import GetParameters
 from std_srvs.srv import Trigger
 from tables import table
 
-from ddqn_planner.grid import OCCUPIED, MapFile, save_map
+from ddqn_planner.grid import OCCUPIED, MapFile, MoveRule, save_map
 from ddqn_planner.grid.noise import MAX_NEW_OBSTACLES, random_requests
 from ddqn_planner.model import load_model
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.training.environment import paper_scenario
+from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import Trainer
 
 KILLS = 50
@@ -173,7 +174,11 @@ class Faults(Client):
         if model.exists():
             load_model(model)
         if (checkpoint := model.with_name("checkpoint.safetensors")).exists():
-            steps = Trainer.load_checkpoint(checkpoint, [paper_scenario()]).steps
+            trainer = Trainer(
+                [paper_scenario()], MoveRule.CORNER_CUTTING, HyperParameters(), seed=0
+            )
+            trainer.restore(checkpoint)
+            steps = trainer.steps
         self.start("trainer")
         self.ask(GetParameters, "/training/trainer/get_parameters", None, bool)
         message = self.trigger("start")

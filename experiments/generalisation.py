@@ -22,7 +22,7 @@ from tables import table
 from tqdm import tqdm
 
 from ddqn_planner import GridMap, MoveRule, Planner, QField
-from ddqn_planner.cli import HelpFormatter, exit_code
+from ddqn_planner.cli import exit_code
 from ddqn_planner.grid import MOVES, Cell, legal_moves, path_cost, read_map_file, shortest_distances
 from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.noise import random_costs, random_requests, unknown_costs
@@ -279,7 +279,7 @@ def _row(rollouts: Sequence[Rollout]) -> list[object]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; return the exit code."""
     parser = argparse.ArgumentParser(
-        "generalisation.py", None, __doc__, formatter_class=HelpFormatter
+        "generalisation.py", None, __doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
     add = parser.add_argument
     add("--model", default="any_map", help="name or file")

@@ -33,11 +33,16 @@ from ddqn_planner.grid import (
     shortest_distances,
     shortest_path,
 )
-from ddqn_planner.model.shared_background import evaluate, look
 from ddqn_planner.planning.paths import search
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.shared_background import adam, differentiate, networks_of
+from ddqn_planner.training.shared_background import (
+    adam,
+    differentiate,
+    evaluate,
+    look,
+    networks_of,
+)
 from ddqn_planner.training.trainer import Trainer
 
 TRAINING_MAPS, TEST_MAPS, NOISE_SEED = 100, 200, 0

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ddqn_planner.model.networks import observe
 from ddqn_planner.training.double_dqn import Transitions, double_dqn_gradient
 from ddqn_planner.training.propagation import FUSED
 from ddqn_planner.training.trainer import Trainer
@@ -59,8 +58,7 @@ class TorchLearner:
         trainer._learner = self
 
     def _observe(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
-        background, shape = self.environment.background[scenario], self.environment.shape
-        return torch.from_numpy(observe(background, cell, shape))
+        return torch.from_numpy(self.environment.observe(scenario, cell))
 
     def q_values(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> NDArray[Any]:
         """Return Q(s, a) of robots in `cell` (B,) on the maps `scenario` (B,): (B, 8)."""

@@ -13,16 +13,15 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from ddqn_planner.cli import HelpFormatter
 from ddqn_planner.files import write_atomically, write_csv
 from ddqn_planner.grid import LENGTHS, MoveRule, neighbours
 from ddqn_planner.model import PaperQNetwork
-from ddqn_planner.model.shared_background import evaluate
 from ddqn_planner.planning import Planner
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario, paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.propagation import value_iteration
 from ddqn_planner.training.run import TrainingRun
+from ddqn_planner.training.shared_background import evaluate, look, network_of, windows_of
 from ddqn_planner.training.trainer import Trainer
 
 SCENARIO: Final = paper_scenario()
@@ -102,7 +101,9 @@ class Settings:
 
 def parser_of(program: str, description: str | None, out: str) -> argparse.ArgumentParser:
     """Return a parser with the options of an experiment with seeds."""
-    parser = argparse.ArgumentParser(program, None, description, formatter_class=HelpFormatter)
+    parser = argparse.ArgumentParser(
+        program, None, description, formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
     add = parser.add_argument
     add("--seeds", type=int, default=5, metavar="N", help="trainings, or worlds of each kind")
     add("--out", type=Path, default=Path(out), help="folder of what is written")
@@ -200,7 +201,14 @@ def rollouts(planner: Planner, environment: GridVectorEnvironment) -> NDArray[np
         return np.array([[p.length if p.cells else np.nan for p in each] for each in plans])
     # All maps at once, and the paths' cells alone: whole fields take 10 to 20 times as long.
     maps, background = np.arange(len(environment.start)), environment.background
-    network, lengths = planner.network.on_maps(background, len(maps)), np.zeros((2, len(maps)))
+    windows, of_model = (
+        windows_of(background.astype(np.float64), environment.shape),
+        planner.network,
+    )
+    tensors = [of_model.tensors[name] for name in of_model.shapes(of_model.sizes)]
+    network = network_of(tensors, windows, len(maps))
+    look(network)
+    lengths = np.zeros((2, len(maps)))
     for length, is_masked in zip(lengths, (True, False), strict=True):
         cell, visited = environment.start.copy(), np.zeros(background.shape, np.bool_)
         while (on_way := np.isfinite(length) & (cell != environment.goal)).any():

@@ -3,9 +3,9 @@
 import json
 import os
 import reprlib
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, get_origin
 
 import numpy as np
 import safetensors.numpy
@@ -31,11 +31,6 @@ NETWORKS: Final[dict[str, type[QNetwork]]] = {
     network.name: network
     for network in (PaperQNetwork, PropagationQNetwork, AnyMapQNetwork, RobotNetwork)
 }
-TYPES: Final[dict[str, tuple[type, ...]]] = {
-    **dict.fromkeys(("network", "move_rule", "map_fingerprint", "package_version"), (str,)),
-    **{"sizes": (dict,), "gamma": (float, int), "steps": (int,), "seed": (int,)},
-}
-"""The types of each entry of `ModelMetadata` in JSON."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +45,11 @@ class ModelMetadata:
     steps: int  # of its training
     seed: int
     package_version: str
+
+
+# The types of its entries in JSON.
+TYPES: Any = {f.name: (get_origin(f.type) or f.type,) for f in fields(ModelMetadata)}
+TYPES |= {"move_rule": (str,), "gamma": (float, int)}
 
 
 def package_version() -> str:
@@ -145,7 +145,7 @@ def _parse(values: object) -> ModelMetadata:
     if network not in NETWORKS:
         raise ValueError(f"network is {reprlib.repr(network)}; this version knows {[*NETWORKS]}")
     if network == "paper":  # missing in files of version 0.1.0, whose networks have none
-        sizes = {**sizes, "hidden_units": sizes.get("hidden_units", 0)}
+        sizes = {"hidden_units": 0, **sizes}
     size_names = NETWORKS[network].size_names
     if sizes.keys() != set(size_names):
         raise ValueError(f"sizes is {reprlib.repr(sizes)}; it must have {[*size_names]}")

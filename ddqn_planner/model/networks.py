@@ -22,7 +22,6 @@ from ddqn_planner.model.move_costs import (
     patch_numbers,
     unique_patches,
 )
-from ddqn_planner.model.shared_background import Network, evaluate, look, network_of, windows_of
 
 if TYPE_CHECKING:
     from ddqn_planner.model.robot import BodyCertificate
@@ -30,12 +29,13 @@ if TYPE_CHECKING:
 Array: TypeAlias = NDArray[np.float32]
 
 # Shapes: A = 8 actions, B = a batch, I and O = inputs and outputs of a layer, P = patches, F =
-# filters, R x L = rows and columns of a convolution, U = outputs after it, X and W = columns.
+# filters, L = windows of a convolution, K = F * L, U = outputs after it, C = cells, one more for
+# what is outside the map.
 
 # A move of at least this probability counts as one that always succeeds: the sigmoid function never
 # reaches 1, and its rest must not decide between paths.
 CERTAIN = 0.99
-BATCH = 2**12  # patches or cells per evaluation: the layers' outputs then fit into a cache
+BATCH = 2**12  # patches per evaluation: the layers' outputs then fit into a cache
 
 # The paper (section 4) uses four values and does not give them. With ours the robot stands out.
 # With a smaller value for the robot, the many obstacles outweigh it and training is less stable.
@@ -94,16 +94,6 @@ def observation_background(occupancy: NDArray[np.bool_], goal: Cell) -> NDArray[
     return background.ravel()
 
 
-def observe(
-    background: NDArray[np.float32], cells: NDArray[np.int64], shape: tuple[int, int]
-) -> NDArray[np.float32]:
-    """Draw robots in cells (B,) into backgrounds (B, C) or (C,): the paper's input, (B, H, W)."""
-    observations = np.empty((len(cells), background.shape[-1]), dtype=np.float32)
-    observations[:] = background
-    observations[np.arange(len(cells)), cells] = ROBOT
-    return observations.reshape(-1, *shape)
-
-
 class PaperQNetwork(QNetwork):
     """The paper's network (Fig. 3), for maps of its own size: a 3x3 convolution, dense layers."""
 
@@ -127,25 +117,36 @@ class PaperQNetwork(QNetwork):
 
     def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Array:
         """Evaluate a robot in each cell: Q(s, a) toward one goal, (8, H, W), whatever the rule."""
-        cells = np.arange(grid.occupancy.size)
-        background = observation_background(grid.occupancy, goal)
-        network = self.on_maps(background[None], min(len(cells), BATCH))
-        q_AC: Array = np.empty((len(MOVES), len(cells)), dtype=np.float32)
-        for some in np.split(cells, range(BATCH, len(cells), BATCH)):
-            evaluate(network, np.zeros_like(some), some)
-            with np.errstate(over="ignore"):
-                q_AC[:, some] = network.q[: len(some)].T
+        # In double precision: differences of large sums stay exact enough, and do not overflow.
+        tensors = [self.tensors[name].astype(np.float64) for name in self.shapes(self.sizes)]
+        kernel_F9, bias_F, layer_UK, layer_bias_U, *last = tensors
+        kernel_9F, filters = kernel_F9.reshape(-1, 9).T, len(bias_F)
+        cut_L9, cells = window_cells(grid.occupancy.shape), grid.occupancy.size
+        layer_LFU = layer_UK.reshape(-1, filters, len(cut_L9)).T.copy()
+        shown = np.append(observation_background(grid.occupancy, goal), 0.0)  # 0 outside the map
+        before_LF = shown[cut_L9] @ kernel_9F + bias_F
+        after_LF = np.maximum(before_LF, 0)
+        output_CU = np.tile(layer_bias_U + np.tensordot(after_LF, layer_LFU, 2), (cells + 1, 1))
+        # Each window is seen with a robot in each of its cells. What that changes adds up.
+        robot_L9F = (ROBOT - shown[cut_L9])[..., None] * kernel_9F
+        change_L9F = np.maximum(before_LF[:, None] + robot_L9F, 0) - after_LF[:, None]
+        change_9LU = (change_L9F @ layer_LFU).swapaxes(0, 1)
+        for cell_L, change_LU in zip(cut_L9.T, change_9LU, strict=True):
+            output_CU[cell_L] += change_LU
+        if last:
+            output_CU = np.maximum(output_CU, 0) @ last[0].T + last[1]
+        with np.errstate(over="ignore"):
+            q_AC: Array = output_CU[:-1].T.astype(np.float32)
         return q_AC.reshape(-1, *grid.occupancy.shape)
 
-    def on_maps(self, background: Array, batch: int) -> Network:
-        """Return what evaluates so many robots on maps with these backgrounds (S, C)."""
-        # In double precision: differences of large sums stay exact enough, and do not overflow.
-        shape = self.sizes["height"], self.sizes["width"]
-        windows = windows_of(background.astype(np.float64), shape, ROBOT)
-        tensors = [self.tensors[name] for name in self.shapes(self.sizes)]
-        network = network_of(tensors, windows, batch)
-        look(network)
-        return network
+
+def window_cells(shape: tuple[int, int]) -> NDArray[np.int64]:
+    """Return the cells of each window of the convolution, (L, 9), or H * W outside the map."""
+    cells = shape[0] * shape[1]
+    padded = np.pad(np.arange(cells).reshape(shape), 1, constant_values=cells)
+    cut = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))[::2, ::2]
+    cell_L9: NDArray[np.int64] = cut.reshape(-1, 9)
+    return cell_L9
 
 
 class PropagationQNetwork(QNetwork):

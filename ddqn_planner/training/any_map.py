@@ -4,8 +4,9 @@ from typing import Final
 
 import numpy as np
 
-from ddqn_planner.grid import GridMap, MoveRule
+from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.noise import random_costs, random_requests, unknown_costs
+from ddqn_planner.model.certificate import MOVE_RULES
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
@@ -31,7 +32,6 @@ ANY_MAP: Final = HyperParameters(
     steps=1_536_000,
 )
 MAPS: Final = 512
-RULES: Final = (MoveRule.ROBOT_SAFE, MoveRule.CORNER_CUTTING)
 
 
 def random_scenarios(seed: int, maps: int = MAPS) -> list[Scenario]:
@@ -39,7 +39,7 @@ def random_scenarios(seed: int, maps: int = MAPS) -> list[Scenario]:
     random = np.random.default_rng(seed)
     scenarios = []
     for number in range(maps):
-        rule = RULES[number % 2]
+        rule = MOVE_RULES[number % len(MOVE_RULES)]
         # High fill rates show 3x3 patches that are rare otherwise.
         occupancy = random.random((10, 10)) < random.uniform(0.1, 0.6)
         # All four are drawn each time: the draws belong to what one seed gives.

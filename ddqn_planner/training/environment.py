@@ -8,8 +8,8 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, read_map_file
-from ddqn_planner.model.networks import GOAL, OBSTACLE, ROBOT, observation_background, observe
+from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, neighbours, read_map_file
+from ddqn_planner.model.networks import GOAL, OBSTACLE, ROBOT, observation_background
 from ddqn_planner.resources import find_resource
 from ddqn_planner.training.exploring_starts import initial_cells
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -47,7 +47,7 @@ class GridVectorEnvironment:
     """N robots on maps of one size, moved in one step; each episode draws one of S scenarios."""
 
     # Cells are numbers y * W + x. The results of moves are looked up in tables (S, 8, H * W).
-    # `reset` begins the first episodes too; one that has ended keeps its last cell until then.
+    # `reset` begins the first episodes too; one that has ended waits for it, and makes no move.
 
     def __init__(
         self,
@@ -66,7 +66,7 @@ class GridVectorEnvironment:
         self.random = random or np.random.default_rng()
 
         maps = [observation_background(s.grid.occupancy, s.goal) for s in scenarios]
-        self.background = np.stack(maps)
+        self.background, self.next_cell = np.stack(maps), neighbours(self.shape)
         tables, to_number = (len(maps), len(MOVES), -1), np.array([1, self.shape[1]])
         with_rules = list(zip(self.scenarios, self.move_rules, strict=True))
         legal = [s.grid.legal_moves(rule) for s, rule in with_rules]
@@ -75,7 +75,6 @@ class GridVectorEnvironment:
         self.free_reward = np.stack(reward).reshape(tables)
         collision = np.float32(parameters.obstacle_reward)
         self.rewards = np.where(self.legal, self.free_reward, collision)
-        self.next_cell = np.arange(self.background.shape[1]) + (MOVES @ to_number)[:, None]
         self.start = np.array([s.start for s in scenarios]) @ to_number
         self.goal = np.array([s.goal for s in scenarios]) @ to_number
 
@@ -85,9 +84,11 @@ class GridVectorEnvironment:
         self._free_count = free_SC.sum(axis=1)
         self._free_first = np.cumsum(self._free_count) - self._free_count
 
-        self.scenario = np.zeros(parameters.environments, dtype=np.int64)
-        self.cell = self.start[self.scenario]
-        self.steps = np.zeros(parameters.environments, dtype=np.int64)
+        count, most = parameters.environments, parameters.max_episode_steps
+        self.scenario, self.cell, self.steps = np.zeros((3, count), np.int64)
+        # Of each robot's episode: the cells in their order, and the sum of the rewards.
+        self.visited, self.total_reward = np.zeros((count, most + 1), np.int64), np.zeros(count)
+        self.terminated, self.truncated = np.zeros((2, count), np.bool_)
 
     def reset(self, mask: NDArray[np.bool_] | None = None) -> None:
         """Start new episodes: all, or those where `mask` (N,) is True."""
@@ -97,27 +98,30 @@ class GridVectorEnvironment:
         free = self._free, self._free_first[scenario], self._free_count[scenario]
         start, p_r = self.start[scenario], self.parameters.p_r
         self.cell[mask] = initial_cells(start, *free, p_r, self.random)
-        self.steps[mask] = 0
+        self.visited[mask, 0] = self.cell[mask]
+        self.steps[mask], self.total_reward[mask] = 0, 0.0
 
-    def move(
-        self, actions: NDArray[np.int64]
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
+    def move(self, actions: NDArray[np.int64]) -> tuple[NDArray[Any], ...]:
         """Move each robot once, (N,) actions; return reward, terminated, truncated: (N,) each."""
         lookup = (self.scenario, actions, self.cell)
         legal, reward = self.legal[lookup], self.rewards[lookup]
-        self.cell = np.where(legal, self.next_cell[actions, self.cell], self.cell)
+        self.cell[:] = np.where(legal, self.next_cell[actions, self.cell], self.cell)
         self.steps += 1
-        terminated = ~legal | (self.cell == self.goal[self.scenario])
-        truncated = ~terminated & (self.steps >= self.parameters.max_episode_steps)
-        return reward, terminated, truncated
+        self.visited[np.arange(len(actions)), self.steps] = self.cell
+        self.total_reward += reward
+        self.terminated[:] = ~legal | (self.cell == self.goal[self.scenario])
+        self.truncated[:] = ~self.terminated & (self.steps >= self.parameters.max_episode_steps)
+        return reward, self.terminated, self.truncated
 
-    def observations(self) -> Observations:
-        """Return what the robots observe: (N, H, W) float32."""
-        return observe(self.background[self.scenario], self.cell, self.shape)
+    def observe(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Observations:
+        """Return what robots in `cell` (B,) see of the maps `scenario` (B,): (B, H, W) float32."""
+        observations = self.background[scenario]
+        observations[np.arange(len(cell)), cell] = ROBOT
+        return observations.reshape(-1, *self.shape)
 
 
 class GridEnvironment(gymnasium.Env[Observations, np.int64]):
-    """``ddqn_planner.training:ddqn_planner/Grid-v0``: one robot, by default on the paper's map."""
+    """``ddqn_planner.training.environment:ddqn_planner/Grid-v0``: by default, the paper's map."""
 
     metadata = {"render_modes": []}  # noqa: RUF012
 
@@ -141,10 +145,16 @@ class GridEnvironment(gymnasium.Env[Observations, np.int64]):
         super().reset(seed=seed)
         self.vector.random = self.np_random
         self.vector.reset()
-        return self.vector.observations()[0], {}
+        return self._observe(), {}
 
     def step(self, action: np.int64) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
         """Move the robot once."""
         (reward,), (terminated,), (truncated,) = self.vector.move(np.array([action]))
-        observation = self.vector.observations()[0]
-        return observation, float(reward), bool(terminated), bool(truncated), {}
+        return self._observe(), float(reward), bool(terminated), bool(truncated), {}
+
+    def _observe(self) -> Observations:
+        observation: Observations = self.vector.observe(self.vector.scenario, self.vector.cell)[0]
+        return observation
+
+
+gymnasium.register("ddqn_planner/Grid-v0", f"{__name__}:GridEnvironment")

@@ -53,10 +53,10 @@ def open_record(path: Path, episodes: int) -> Appender:
 def record(episode: Episode, move_rule: MoveRule) -> bytes:
     """Return the row of an episode, its cells as ``x:y``."""
     e, length = episode, round(path_length(episode.cells, move_rule), 4)
-    rewards = f"{round(e.total_reward, 6)},{round(e.average_reward, 6)}"
+    rewards = round(e.total_reward, 6), round(e.average_reward, 6)
     cells = " ".join(f"{x}:{y}" for x, y in e.cells)
-    start = f"{e.number},{e.step},{e.scenario},{e.outcome.value},{e.moves},{length}"
-    return f"{start},{rewards},{cells}\r\n".encode()
+    row = e.number, e.step, e.scenario, e.outcome.value, e.moves, length, *rewards, cells
+    return f"{','.join(map(str, row))}\r\n".encode()
 
 
 def read_cells(path: str | Path, every: int) -> Iterator[tuple[Cell, ...]]:

@@ -11,7 +11,7 @@ from torch.nn import functional
 from torch.optim.adam import adam
 
 from ddqn_planner.compiled import compiled
-from ddqn_planner.grid import LENGTHS, MOVES, neighbours
+from ddqn_planner.grid import LENGTHS, MOVES
 from ddqn_planner.model import PropagationQNetwork
 from ddqn_planner.model.move_costs import patches
 from ddqn_planner.training.double_dqn import Transitions, double_dqn_gradient
@@ -53,7 +53,7 @@ class PropagationLearner:
         cost_SCA = self._cost(self._target, feature_UI).numpy()[self._place_SC]
         reward_SCA = -cost_SCA if self.uses_costs else e.free_reward.swapaxes(1, 2)
         gamma, collision = e.parameters.gamma, e.parameters.obstacle_reward
-        given = reward_SCA, e.goal, neighbours(e.shape), gamma, collision
+        given = reward_SCA, e.goal, e.next_cell, gamma, collision
         return_SCA, self._q_SCA = value_iteration(p_SCA, *given)
         # A state: the features, the return r + γ V(s') of each move (γ V(s') where r is learned),
         # r_o. A gradient through V would diverge: none flows.

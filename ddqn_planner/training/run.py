@@ -2,15 +2,14 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import asdict
 from pathlib import Path
 
-from ddqn_planner.files import WorkFolder, differences, write_atomically
+from ddqn_planner.files import WorkFolder, write_atomically
 from ddqn_planner.grid import MoveRule
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.episodes import Episode, open_record, record
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.trainer import CheckpointError, Trainer
+from ddqn_planner.training.trainer import Trainer
 
 SAVE_INTERVAL = 5_000  # environment steps between two checkpoints
 # A folder with one of these files belongs to a training.
@@ -32,23 +31,10 @@ class TrainingRun(WorkFolder):
         super().__init__(Path(folder), MARKS, "training", "trains", after)
         self.model_path = self.folder / "model.safetensors"
         self.checkpoint_path = self.folder / CHECKPOINT
-        with self.opening() as files:
-            with _memory_with_remedy():
-                if self.checkpoint_path.exists():
-                    self.trainer = trainer = Trainer.load_checkpoint(
-                        self.checkpoint_path, scenarios
-                    )
-                    now = {**asdict(parameters), "seed": seed, "move_rule": move_rule.value}
-                    saved = {**asdict(trainer.parameters), "steps": parameters.steps}
-                    saved |= {"seed": trainer.seed, "move_rule": trainer.move_rule.value}
-                    if changed := differences(saved, now):
-                        raise CheckpointError(
-                            f"{self.folder} holds a training with {changed}; give those values to "
-                            "continue it, or another folder"
-                        )
-                    trainer.parameters = parameters
-                else:
-                    self.trainer = Trainer(scenarios, move_rule, parameters, seed)
+        with self.opening() as files, _memory_with_remedy():
+            self.trainer = Trainer(scenarios, move_rule, parameters, seed)
+            if self.checkpoint_path.exists():
+                self.trainer.restore(self.checkpoint_path)
             self._record = open_record(self.folder / "episodes.csv", self.trainer.episodes)
             files.enter_context(closing(self._record))
         first = self.saved_at = self.trainer.steps
@@ -79,13 +65,11 @@ class TrainingRun(WorkFolder):
 
 @contextmanager
 def _memory_with_remedy() -> Iterator[None]:
-    """Say what to do where the memory is too small, for torch too, which has no error for it."""
+    """Say what to do where the memory is too small."""
     try:
         yield
-    except (MemoryError, RuntimeError) as error:
-        if isinstance(error, RuntimeError) and "can't allocate memory" not in str(error):
-            raise
+    except MemoryError as error:
         raise MemoryError(
             "the training does not fit into the memory; take a smaller map, or smaller filters, "
-            "hidden_units, batch_size, environments or replay_capacity"
+            "hidden_units, batch_size, environments, max_episode_steps or replay_capacity"
         ) from error

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from safetensors import safe_open
 
-from ddqn_planner.files import write_atomically
+from ddqn_planner.files import differences, write_atomically
 from ddqn_planner.grid import MOVES, MoveRule
 from ddqn_planner.model import (
     NETWORKS,
@@ -72,14 +72,11 @@ class Trainer:
         self._replay = ReplayBuffer(parameters.replay_capacity)
 
         self.environment.reset()
-        self._visited: list[list[int]] = [[int(cell)] for cell in self.environment.cell]
-        self._total_reward = np.zeros(parameters.environments)
         self._learner: Any = None  # the paper's network needs none: it learns in compiled code
         if isinstance(self.network, PropagationQNetwork):
             self._learner = PropagationLearner(self.network, self._parts, self.environment)
         else:
-            robots = self.environment, self._replay, self._total_reward
-            self._arrays = arrays_of(self._parts, *robots)
+            self._arrays = arrays_of(self._parts, self.environment, self._replay)
 
     @property
     def epsilon(self) -> float:
@@ -92,30 +89,28 @@ class Trainer:
         """Train until step `until`; yield what ended, often and at each multiple of `every`."""
         while self.steps < until:
             pause = min(until, (self.steps // every + 1) * every)
-            cells, terminated, truncated = self._step() if self._learner else self._play(pause)
-            for visited, entered in zip(self._visited, cells.T.tolist(), strict=True):
-                visited += entered
-            ended = terminated | truncated
-            yield self._end_episodes(ended, terminated) if ended.any() else []
+            if self._learner:
+                self._step()
+            else:
+                self._play(pause)
+            yield self._end_episodes()
 
-    def _play(self, until: int) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
-        """Make some steps in compiled code; return what `_step` returns."""
+    def _play(self, until: int) -> None:
+        """Make some steps in compiled code, until an episode ends."""
         counters = np.array([self.steps, self.updates, self._replay.added])
-        made = play(*self._arrays, (self._exploration, self._sampling), counters, until)
+        play(*self._arrays, (self._exploration, self._sampling), counters, until)
         self.steps, self.updates, self._replay.added = counters.tolist()
-        *_, terminated, truncated, trail = self._arrays[-1]
-        return trail[:made], terminated, truncated
 
-    def _step(self) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
-        """Make a step, with torch; return the entered cells (1, N), and which episodes ended."""
+    def _step(self) -> None:
+        """Make a step, with torch."""
         e, p = self.environment, self.parameters
-        scenario, cell = e.scenario.copy(), e.cell
+        scenario, cell = e.scenario, e.cell.copy()
         actions = self._exploration.integers(len(MOVES), size=p.environments)
         is_greedy = self._exploration.random(p.environments) >= self.epsilon
         if is_greedy.any():
             q_NA = self._learner.q_values(scenario, cell)
             actions = np.where(is_greedy, q_NA.argmax(axis=1), actions)
-        reward, terminated, truncated = e.move(actions)
+        reward, terminated, _ = e.move(actions)
         discount = np.where(terminated, 0.0, p.gamma).astype(np.float32)
         self._replay.add(Transitions(scenario, cell, actions, reward, e.cell, discount))
         before, self.steps = self.steps, self.steps + p.environments
@@ -124,31 +119,24 @@ class Trainer:
                 self.updates += 1
                 batch = self._replay.sample(p.batch_size, self._sampling)
                 self._learner.update(batch, self.updates)
-        self._total_reward += reward
-        return e.cell[None], terminated, truncated
 
-    def _end_episodes(
-        self, ended: NDArray[np.bool_], terminated: NDArray[np.bool_]
-    ) -> list[Episode]:
-        """Return the ended episodes, and start new ones in their environments."""
-        episodes: list[Episode] = []
-        places, width = np.flatnonzero(ended).tolist(), self.environment.shape[1]
-        for index in places:
-            cells, scenario = self._visited[index], int(self.environment.scenario[index])
-            moves, outcome = len(cells) - 1, EpisodeEnd.OUT_OF_STEPS
-            if cells[-1] == self.environment.goal[scenario]:
+    def _end_episodes(self) -> list[Episode]:
+        """Return the episodes that have ended, and start others in their place."""
+        e, episodes = self.environment, list[Episode]()
+        ended = e.terminated | e.truncated
+        for index in np.flatnonzero(ended).tolist():
+            scenario, moves = int(e.scenario[index]), int(e.steps[index])
+            cells, outcome = e.visited[index, : moves + 1].tolist(), EpisodeEnd.OUT_OF_STEPS
+            if cells[-1] == e.goal[scenario]:
                 outcome = EpisodeEnd.REACHED_GOAL
-            elif terminated[index]:
+            elif e.terminated[index]:
                 outcome, cells = EpisodeEnd.COLLIDED, cells[:-1]
-            visited = tuple((cell % width, cell // width) for cell in cells)
-            total = float(self._total_reward[index])
+            visited = tuple((cell % e.shape[1], cell // e.shape[1]) for cell in cells)
             self.episodes += 1
-            ends = self.episodes, self.steps, scenario, outcome, visited, moves, total
-            episodes.append(Episode(*ends))
-        self.environment.reset(ended)
-        for index in places:
-            self._visited[index] = [int(self.environment.cell[index])]
-        self._total_reward[ended] = 0.0
+            ends = self.episodes, self.steps, scenario, outcome, visited, moves
+            episodes.append(Episode(*ends, float(e.total_reward[index])))
+        if episodes:
+            e.reset(ended)
         return episodes
 
     def planner(self) -> Planner:
@@ -167,63 +155,66 @@ class Trainer:
         planner = self.planner()
         return model_bytes(planner.network, planner.metadata)
 
-    def save_checkpoint(self, path: str | Path) -> None:
-        """Write all that `load_checkpoint` needs; after an OSError, an old file is unchanged."""
-        description = {  # with the names of 0.1, whose checkpoints load too
+    def _description(self) -> dict[str, Any]:
+        """Return what of a checkpoint is no array, with the names of 0.1: those load too."""
+        e = self.environment
+        return {
             "seed": self.seed,
-            "move_rule": self.move_rule,
+            "move_rule": self.move_rule.value,
             "parameters": asdict(self.parameters),
-            "scenarios": _fingerprints(self.scenarios),
+            "scenarios": [[s.grid.fingerprint, [*s.start], [*s.goal]] for s in self.scenarios],
             "counters": [self.steps, self.updates, self.episodes, self._replay.added],
-            "walked": self._visited,
+            "walked": [
+                cells[: count + 1].tolist() for cells, count in zip(e.visited, e.steps, strict=True)
+            ],
             "generators": [generator.bit_generator.state for generator in self._generators],
         }
-        tensors = {name: np.asarray(t, order="C") for name, t in self._tensors().items()}
-        text = json.dumps(description)
-        metadata = {CHECKPOINT_KEY: text, DIGEST_KEY: _digest(text, tensors)}
-        write_atomically(Path(path), safetensors.numpy.save(tensors, metadata))
 
-    @classmethod
-    def load_checkpoint(cls, path: str | Path, scenarios: Sequence[Scenario]) -> Trainer:
-        """Return the trainer of a checkpoint, made with these scenarios, or a CheckpointError."""
+    def save_checkpoint(self, path: Path) -> None:
+        """Write all that `restore` needs; after an OSError, an old file is unchanged."""
+        tensors = {name: np.asarray(t, order="C") for name, t in self._tensors().items()}
+        text = json.dumps(self._description())
+        metadata = {CHECKPOINT_KEY: text, DIGEST_KEY: _digest(text, tensors)}
+        write_atomically(path, safetensors.numpy.save(tensors, metadata))
+
+    def restore(self, path: Path) -> None:
+        """Take over a checkpoint of this training, whatever its `steps`, or a CheckpointError."""
         try:
             with safe_open(path, framework="np") as file:
-                metadata = file.metadata()
-                text = metadata[CHECKPOINT_KEY]
-                description = json.loads(text)
-                if description["scenarios"] != _fingerprints(scenarios):
-                    raise CheckpointError(
-                        f"{path}: was made with another map, start or goal; give that one, or "
-                        "train into another folder"
-                    )
-                parameters = HyperParameters(**description["parameters"])
-                rule = MoveRule(description["move_rule"])
-                trainer = cls(scenarios, rule, parameters, description["seed"])
-                counters = description["counters"]
-                trainer.steps, trainer.updates, trainer.episodes, trainer._replay.added = counters
-                tensors = trainer._tensors()
+                metadata, now = file.metadata(), self._description()
+                saved = json.loads(metadata[CHECKPOINT_KEY])
+                if saved["scenarios"] != now["scenarios"]:
+                    raise CheckpointError("was made with another map, start or goal; give that one")
+                parameters = replace(
+                    HyperParameters(**saved["parameters"]), steps=self.parameters.steps
+                )
+                names = "seed", "move_rule", *now["parameters"]
+                before, now = saved | asdict(parameters), now | now["parameters"]
+                if changed := differences({name: before[name] for name in names}, now):
+                    raise CheckpointError(f"was made with {changed}; give those values")
+                self.steps, self.updates, self.episodes, self._replay.added = saved["counters"]
+                tensors = self._tensors()
                 shapes = {name: [*tensor.shape] for name, tensor in tensors.items()}
                 # Before any is read: a small sparse file can claim tensors of any size.
                 if {name: file.get_slice(name).get_shape() for name in file.keys()} != shapes:  # noqa: SIM118
                     raise ValueError("its tensors have other names or shapes")
                 for name, tensor in tensors.items():
                     tensor[...] = file.get_tensor(name)
-                if metadata[DIGEST_KEY] != _digest(text, tensors):
+                if metadata[DIGEST_KEY] != _digest(metadata[CHECKPOINT_KEY], tensors):
                     raise ValueError("its digest is another")
-            trainer._visited = description["walked"]
-            states = zip(trainer._generators, description["generators"], strict=True)
-            for generator, state in states:
+            for visited, cells in zip(self.environment.visited, saved["walked"], strict=True):
+                visited[: len(cells)] = cells
+            for generator, state in zip(self._generators, saved["generators"], strict=True):
                 generator.bit_generator.state = state
-            if trainer._learner:
-                trainer._learner.settle()
-        except (CheckpointError, MemoryError):
+            if self._learner:
+                self._learner.settle()
+        except CheckpointError as error:
+            raise CheckpointError(f"{path}: {error}, or train into another folder") from None
+        except MemoryError:
             raise
         except Exception as error:  # a broken file can raise any error in the libraries
-            raise CheckpointError(
-                f"{path}: is no complete checkpoint ({error!r}); remove it to train anew, or train "
-                "into another folder"
-            ) from error
-        return trainer
+            problem = f"is no complete checkpoint ({error!r}); remove it to train anew"
+            raise CheckpointError(f"{path}: {problem}, or train into another folder") from error
 
     def _tensors(self) -> dict[str, NDArray[Any]]:
         """Return the arrays of a checkpoint, which share the trainer's memory."""
@@ -239,7 +230,7 @@ class Trainer:
             moments = {"exp_avg": mean[name], "exp_avg_sq": square[name]}
             groups[f"optimiser.{index}"] = {"step": np.array(self.updates, np.float32), **moments}
         tensors = {f"{g}.{n}": array for g, arrays in groups.items() for n, array in arrays.items()}
-        return tensors | {"total_reward": self._total_reward}
+        return tensors | {"total_reward": self.environment.total_reward}
 
 
 def _initial_tensors(shapes: Mapping[str, tuple[int, ...]], seed: int) -> dict[str, Any]:
@@ -248,14 +239,11 @@ def _initial_tensors(shapes: Mapping[str, tuple[int, ...]], seed: int) -> dict[s
     for name, shape in shapes.items():
         layer, _, _ = name.partition(".")
         most = math.prod(shapes[f"{layer}.weight"][1:]) ** -0.5
-        tensors[name] = torch.empty(shape).uniform_(-most, most, generator=generator).numpy()
+        tensors[name] = np.empty(shape, np.float32)
+        torch.from_numpy(tensors[name]).uniform_(-most, most, generator=generator)
         if name == "prices.bias":  # a cost multiplier below 1 has no gradient: it must begin above
             tensors[name][:] = 1
     return tensors
-
-
-def _fingerprints(scenarios: Sequence[Scenario]) -> list[list[object]]:
-    return [[s.grid.fingerprint, list(s.start), list(s.goal)] for s in scenarios]
 
 
 def _digest(text: str, tensors: dict[str, NDArray[Any]]) -> str:

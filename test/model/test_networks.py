@@ -10,7 +10,7 @@ from torch_layers import in_torch, papers_layers, propagation_layers
 from ddqn_planner.grid import OCCUPIED, Cell, GridMap, MoveRule
 from ddqn_planner.model import AnyMapQNetwork, PropagationQNetwork, networks
 from ddqn_planner.model.move_costs import every_patch, patch_numbers, patches, unique_patches
-from ddqn_planner.model.networks import FREE, GOAL, OBSTACLE, ROBOT, observation_background, observe
+from ddqn_planner.model.networks import FREE, GOAL, OBSTACLE, ROBOT, observation_background
 from ddqn_planner.planning.field import network_field
 
 
@@ -22,10 +22,11 @@ def test_the_papers_network_is_its_layers(place: Place, hidden_units: int, seed:
     q = network.q_values(grid, goal, MoveRule.ROBOT_SAFE)
     assert q.shape == (8, grid.height, grid.width)
     assert q.dtype == np.float32
-    background = observation_background(grid.occupancy, goal)
-    cells = np.arange(grid.occupancy.size)
-    observations = torch.from_numpy(observe(background, cells, grid.occupancy.shape))
-    answer = papers_layers(in_torch(network.tensors), observations)
+    background, cells = observation_background(grid.occupancy, goal), grid.occupancy.size
+    observations = np.tile(background, (cells, 1))
+    np.fill_diagonal(observations, ROBOT)
+    shown = torch.from_numpy(observations.reshape(cells, *grid.occupancy.shape))
+    answer = papers_layers(in_torch(network.tensors), shown)
     np.testing.assert_allclose(q, answer.T.reshape(q.shape).numpy(), rtol=1e-5, atol=1e-5)
 
 
@@ -45,14 +46,10 @@ def test_propagation_networks_are_their_layers(place: Place, rule: MoveRule, see
 @given(grids_with_free_cell())
 def test_the_observation_shows_four_kinds_of_cell(place: Place) -> None:
     grid, goal = place
+    expected = np.where(grid.occupancy, OBSTACLE, FREE).astype(np.float32)
+    expected[goal[::-1]] = GOAL
     background = observation_background(grid.occupancy, goal)
-    shape = grid.occupancy.shape
-    observations = observe(background, np.arange(grid.occupancy.size), shape)
-    for robot, observation in zip(np.ndindex(shape), observations, strict=True):
-        expected = np.where(grid.occupancy, OBSTACLE, FREE).astype(np.float32)
-        expected[goal[::-1]] = GOAL
-        expected[robot] = ROBOT
-        np.testing.assert_array_equal(observation, expected)
+    np.testing.assert_array_equal(background, expected.ravel())
     assert len({FREE, GOAL, OBSTACLE, ROBOT}) == 4
 
 

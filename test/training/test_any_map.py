@@ -4,7 +4,8 @@ import pytest
 from ddqn_planner import GridMap, MoveRule, Planner
 from ddqn_planner.grid import UNKNOWN
 from ddqn_planner.grid.noise import random_costs
-from ddqn_planner.training.any_map import ANY_MAP, MAPS, RULES, random_scenarios
+from ddqn_planner.model.certificate import MOVE_RULES
+from ddqn_planner.training.any_map import ANY_MAP, MAPS, random_scenarios
 from ddqn_planner.training.evaluation import Evaluation, evaluate
 from ddqn_planner.training.trainer import Trainer
 
@@ -27,7 +28,7 @@ def evaluation_of(planner: Planner, grid: GridMap, rule: MoveRule) -> Evaluation
 
 
 @pytest.mark.slow(seconds=20)
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("rule", MOVE_RULES)
 def test_training_on_random_maps_learns_moves_and_costs(planner: Planner, rule: MoveRule) -> None:
     random = np.random.default_rng(2)
     rooms = np.zeros((40, 50), dtype=bool)
@@ -57,9 +58,9 @@ def test_the_maps_to_train_on_are_those_of_the_seed_and_have_costs_of_every_sort
     assert said == same
     assert said[0] != other[0]
     for scenario in scenarios:
-        joined = scenario.grid.reachable([scenario.goal], scenario.move_rule or RULES[0])
+        joined = scenario.grid.reachable([scenario.goal], scenario.move_rule or MOVE_RULES[0])
         assert joined[scenario.start[1], scenario.start[0]]
-    assert {scenario.move_rule for scenario in scenarios} == set(RULES)
+    assert {scenario.move_rule for scenario in scenarios} == set(MOVE_RULES)
     grids = [scenario.grid for scenario in scenarios]
     assert len(grids) == MAPS
     filled = [grid.occupancy.mean() for grid in grids]

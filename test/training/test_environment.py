@@ -56,7 +56,7 @@ def test_a_batch_moves_as_by_hand(paper: Scenario, rule: MoveRule, count: int, r
         cells = [(int(cell) % 20, int(cell) // 20) for cell in batch.cell]
         actions = random.integers(8, size=count)
         rewards, terminated, truncated = batch.move(actions)
-        observations = batch.observations()
+        observations = batch.observe(batch.scenario, batch.cell)
         for i, cell in enumerate(cells):
             after, reward_by_hand, ended = step_by_hand(paper, rule, parameters, cell, actions[i])
             steps[i] += 1
@@ -83,7 +83,7 @@ def test_the_scalar_environment_is_a_batch_of_one(paper: Scenario) -> None:
         batch.reset()
         ended = False
         while not ended:
-            assert (batch.observations()[0] == observation).all()
+            assert (batch.observe(batch.scenario, batch.cell)[0] == observation).all()
             action = actions.integers(8)
             expected = batch.move(np.array([action]))
             observation, *found, info = scalar.step(action)
@@ -101,7 +101,7 @@ def test_an_episode_starts_with_probability_p_r_in_any_cell(paper: Scenario, p_r
     drawn: tuple[list[int], list[int]] = [], []
     for _ in range(4):
         batch.reset()
-        has_walls = (batch.observations() < 0).any(axis=(1, 2))
+        has_walls = (batch.observe(batch.scenario, batch.cell) < 0).any(axis=(1, 2))
         np.testing.assert_array_equal(has_walls, batch.scenario == 0)
         for number in (0, 1):
             drawn[number].extend(batch.cell[batch.scenario == number].tolist())
@@ -118,7 +118,7 @@ def test_an_episode_starts_with_probability_p_r_in_any_cell(paper: Scenario, p_r
 def test_gymnasium_accepts_the_environment() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        environment = gymnasium.make("ddqn_planner.training:ddqn_planner/Grid-v0")
+        environment = gymnasium.make("ddqn_planner.training.environment:ddqn_planner/Grid-v0")
         check_env(environment.unwrapped, skip_render_check=True)
 
 
