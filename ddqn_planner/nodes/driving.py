@@ -93,9 +93,7 @@ class DrivingRobot:
         """Return a pose's position in the frame of the map, if there is one, or a ValueError."""
         if self._node.map is None:
             return None
-        frame = self._node.map.frame
-        self._frames.check(name, pose, frame)
-        position = self._frames.to_map(name, pose, frame).pose.position
+        position = self._frames.to_map(name, pose, self._node.map.frame).pose.position
         return position.x, position.y
 
     def _on_status(self, message: GoalStatusArray) -> None:
@@ -105,11 +103,10 @@ class DrivingRobot:
             for status in message.status_list
             if status.status == GoalStatus.STATUS_ABORTED
         }
-        # What failed before the node listened failed elsewhere.
-        before = aborted if self._aborted is None else self._aborted
-        self._aborted = before | aborted
-        if aborted - before:
+        if self._aborted is not None and aborted - self._aborted:
             self.recorder.abort()
+        # What failed before the node listened failed elsewhere.
+        self._aborted = aborted.union(self._aborted or ())
 
     def told(self) -> dict[str, str]:
         """Return what the diagnostics say of it."""

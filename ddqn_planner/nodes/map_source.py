@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -333,7 +332,8 @@ class ExpectedTimes:
             self._outcome, self._forecast = outcome, self._worker.call(self.describe, outcome)
         if not self._forecast.done():
             self._report.change()  # to look again soon
-        return self._forecast.result() or {}
+        is_refused = self._forecast.exception()  # as when no memory is left
+        return {} if is_refused else self._forecast.result() or {}
 
     def load(self, message: UInt8MultiArray | None = None) -> bool:
         """Use a message, or the file that is set, or none; return whether it is another one."""
@@ -361,17 +361,15 @@ class ExpectedTimes:
         return grid.with_layers(slowness=slowness, seconds_per_cell=seconds)
 
     def describe(self, outcome: Outcome) -> dict[str, str]:
-        """Return how long a plan takes, unless its map is old or untimed, or no memory is left."""
+        """Return how long a plan takes, unless its map is old or untimed."""
         now, request, path = self._spread_on, outcome.request, outcome.plan.path
         if not (self._experience and now and request and request.grid.slowness is not None):
             return {}
         if not len(path) or not is_like(request.grid, now):
             return {}
-        with suppress(MemoryError):
-            seconds, low, high = self._experience.expected_time(now, path)
-            interval = {"expected time, 90 % interval (s)": f"{low:.1f} to {high:.1f}"}
-            return {"expected time (s)": f"{seconds:.1f}", **interval}
-        return {}
+        seconds, low, high = self._experience.expected_time(now, path)
+        interval = {"expected time, 90 % interval (s)": f"{low:.1f} to {high:.1f}"}
+        return {"expected time (s)": f"{seconds:.1f}", **interval}
 
 
 def is_like(grid: GridMap, other: GridMap) -> bool:

@@ -202,7 +202,7 @@ class PlannerNode(ManagedNode):
         if outcome.status in (UNCHANGED.status, NOT_ACTIVE.status):
             return
         self._publish(outcome, active)
-        self._improve_later(outcome, active)
+        self._improve_later(outcome)
         # Not the reason: its places and lengths may differ.
         logged = goals, outcome.goal, outcome.status, outcome.plan.method
         if self._logged != logged:
@@ -223,26 +223,26 @@ class PlannerNode(ManagedNode):
         if len(outcome.plan.path):
             self._followed = outcome
             # It gets the better path with its next request.
-            self._improve_later(outcome, None)
+            self._improve_later(outcome)
             self._plan_publisher.publish(to_publish)
         self._report.log(outcome)
         return path, outcome
 
-    def _improve_later(self, outcome: Outcome, active: ActiveGoal | None) -> None:
+    def _improve_later(self, outcome: Outcome) -> None:
         """Look for the least path of a body, unless it would not be worth a switch."""
         plan, self._newest = outcome.plan, outcome
         worth = (1 + self._settings.switch_threshold) * SAME_COST
         if isinstance(plan, PosePlan) and plan.bound > worth:
             executor: Any = self.executor
-            executor.create_task(self._improve_path, outcome, active)
+            executor.create_task(self._improve_path, outcome)
 
-    async def _improve_path(self, outcome: Outcome, active: ActiveGoal | None) -> None:
+    async def _improve_path(self, outcome: Outcome) -> None:
         def given_up() -> Outcome | None:
             return None if outcome is self._newest else UNCHANGED
 
         better = await self._answer([], self._requests.improve(outcome), given_up)
-        if active is self._active and better.request is not None:
-            self._publish(better, active)
+        if outcome is self._active.last and better.request is not None:
+            self._publish(better, self._active)
 
     async def _on_is_path_valid(self, request: Any, response: Any) -> Any:
         """Answer Nav2's IsPathValid: whether the robot can drive the rest of a path."""
@@ -307,7 +307,7 @@ class PlannerNode(ManagedNode):
 
     def _has_pose_now(self) -> bool:
         """Return whether the pose has come for which the active goal waits."""
-        with suppress(RequestError):
+        with suppress(ValueError):
             if self._active.lacks_pose:
                 for pose in (self._places.start(), *self._active.poses):
                     self._places.to_map("the pose", pose, self._map.frame)

@@ -48,30 +48,20 @@ class Frames:
         self.began = -math.inf  # to listen
 
     def check(self, name: str, stamped: PoseStamped, map_frame: str) -> None:
-        """Check a pose as `check_pose` does; its frame may be any with TF."""
+        """Check a pose as `check_pose` does; with TF its frame may be any."""
         check_pose(name, stamped, "" if self.available else map_frame, REMEDY)
 
     def to_map(self, name: str, stamped: PoseStamped, map_frame: str) -> PoseStamped:
-        """Return a pose in the map's frame by the transform of its time; or a RequestError."""
-        frame = stamped.header.frame_id
+        """Check a pose, and return it in the map's frame of its time; a RequestError without TF."""
+        self.check(name, stamped, map_frame)
+        frame, stamp = stamped.header.frame_id, Time.from_msg(stamped.header.stamp)
         if frame == map_frame:
             return stamped
         try:
-            return transformed(stamped, self._transform_at(stamped, map_frame))
+            return transformed(stamped, self._lookup(map_frame, frame, stamp))
         except ValueError as error:
             reason = f"{name}'s frame is {frame!r}, and {error}, or give it in the map's frame"
             raise RequestError("TF_ERROR", reason, self.began) from None
-
-    def _transform_at(self, stamped: PoseStamped, map_frame: str) -> TransformStamped:
-        stamp, frames = Time.from_msg(stamped.header.stamp), (map_frame, stamped.header.frame_id)
-        try:
-            return self._lookup(*frames, stamp)
-        except ValueError:
-            newest = self._lookup(*frames)
-            later = (Time.from_msg(newest.header.stamp) - stamp).nanoseconds / 1e9
-            if not 0 < later <= PATIENCE:  # the pose is from before the node listened
-                raise
-            return newest
 
     def origin_of(self, frame: str, map_frame: str) -> PoseStamped:
         """Return where a frame's origin is now; ValueError if TF does not know it of now."""
@@ -84,13 +74,16 @@ class Frames:
             leads = f"no transform leads from {source!r} to {target!r}"
             return ValueError(f"{leads} ({why}); publish one")
 
-        if not self.available:
-            raise none("tf2_ros is not installed")
         self.listen()
         self._read()
         try:
             found = self._buffer.lookup_transform(target, source, stamp)
         except self._tf2_ros.TransformException as error:
+            if stamp.nanoseconds:
+                newest = self._lookup(target, source)
+                later = (Time.from_msg(newest.header.stamp) - stamp).nanoseconds / 1e9
+                if 0 < later <= PATIENCE:  # the pose is from before the node listened
+                    return newest
             raise none(error) from None
         of = Time.from_msg(found.header.stamp)
         age, limit = (self._node.get_clock().now() - of).nanoseconds / 1e9, self._tolerance()
@@ -166,16 +159,16 @@ def listen(
 class Places(Frames):
     """Frames, and where the robot is by ``start_source``: the last `initialpose`, `odom`, or TF."""
 
-    # `on_start` is called when there is a start from which to plan at once.
+    # `frame` returns the map's; `on_start` is called when there is a start to plan from at once.
     def __init__(
         self,
         node: BaseNode,
-        refusals: Refusals,
-        map_frame: Callable[[], str],
+        report: Refusals,
+        frame: Callable[[], str],
         on_start: Callable[[], None],
     ) -> None:
         super().__init__(node, lambda: float(node.value("transform_tolerance")))
-        self._refusals, self._map_frame, self._on_start = refusals, map_frame, on_start
+        self._report, self._map_frame, self._on_start = report, frame, on_start
         self._pose: PoseStamped | None = None
         self._subscription: Any = None
         self.topic = ""
@@ -189,12 +182,12 @@ class Places(Frames):
         if topic == self.topic:
             return
         self._node.destroy_subscription(self._subscription)
-        self._refusals.accept(self.topic)
+        self._report.accept(self.topic)
         self.topic, self._pose, self._heard_from = topic, None, time.monotonic()
         if topic == "tf":
             self.listen()
         else:
-            self._subscription = listen(self._node, topic, 10, self._refusals, self._take)
+            self._subscription = listen(self._node, topic, 10, self._report, self._take)
 
     def _forget_odometry(self) -> None:
         if self.topic == "odom":
@@ -212,7 +205,7 @@ class Places(Frames):
         """Transform the last `initialpose` as soon as TF can: it forgets the times before."""
         frame = self._map_frame()
         if self.topic == "initialpose" and self._pose is not None and frame:
-            with suppress(RequestError):
+            with suppress(ValueError):
                 self._pose = self.to_map("the start", self._pose, frame)
 
     def start(self) -> PoseStamped:

@@ -24,15 +24,7 @@ from ddqn_planner.model.certificate import NO_CERTIFICATE
 from ddqn_planner.nodes.conversions import cell_from_pose, pose_of, turns
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.poses import Places
-from ddqn_planner.nodes.report import (
-    NO_REQUEST,
-    Outcome,
-    Report,
-    Request,
-    RequestError,
-    reached,
-    reason_of,
-)
+from ddqn_planner.nodes.report import Outcome, Report, Request, RequestError, reached, reason_of
 from ddqn_planner.nodes.runtime import BaseNode, Worker
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus
 from ddqn_planner.planning.field import shift_between
@@ -47,33 +39,31 @@ UNCHANGED = Outcome("UNCHANGED", "the active goal needs no new plan")
 T = TypeVar("T")
 
 
+@dataclass
 class ActiveGoal:
     """Decides when to plan again, and what to publish; the table in docs/nodes.md has the rules."""
 
-    def __init__(
-        self, poses: list[PoseStamped], period: float, followed: Outcome | None = None
-    ) -> None:
-        # The last ``goal_pose``, or the last ``goal_poses``, of which the nearest one counts.
-        self.poses = poses
-        # Of this goal's outcomes, the last whose path was published, and the last of all.
-        self.followed, self._last = followed, NO_REQUEST
-        self._period, self._next_look = period, 0.0  # seconds
+    poses: list[PoseStamped]  # the last ``goal_pose``, or ``goal_poses``: the nearest one counts
+    period: float  # seconds between looks if something changed
+    followed: Outcome | None = None  # the last one whose path was published for this goal
+    last: Outcome = UNCHANGED
+    next_look: float = 0.0
 
     @property
     def lacks_pose(self) -> bool:
         """Whether it waits for TF or odometry."""
-        return bool(self.poses) and self._last.status in ("NO_START", "TF_ERROR")
+        return bool(self.poses) and self.last.status in ("NO_START", "TF_ERROR")
 
     def is_look_due(self, lacks_map: bool) -> bool:
         """Return whether it is time to look if something changed; the next plan does then."""
-        stopped = lacks_map and self._last.request is not None  # a costmap: its path is taken back
-        return bool(self.poses) and (stopped or time.monotonic() >= self._next_look)
+        stopped = lacks_map and self.last.request is not None  # a costmap: its path is taken back
+        return bool(self.poses) and (stopped or time.monotonic() >= self.next_look)
 
     def is_due(self, planner: Planner, request: Request, header: Header) -> bool:
         """Return whether there is a reason to plan."""
-        last, now = self._last, time.monotonic()
-        if looks := self._period == 0 or now >= self._next_look:
-            self._next_look = now + self._period
+        last, now = self.last, time.monotonic()
+        if looks := self.period == 0 or now >= self.next_look:
+            self.next_look = now + self.period
         # A map that came again as it was is planned on, so that the diagnostics name the last one.
         known = last.request and _inputs_of(last.request, last.map_header)
         if known == _inputs_of(request, header):
@@ -84,8 +74,8 @@ class ActiveGoal:
 
     def is_news(self, outcome: Outcome) -> bool:
         """Return whether to publish the path of an outcome, which may be empty."""
-        shown, new = ((it.status, it.header.frame_id) for it in (self._last, outcome))
-        self._last, self._next_look = outcome, time.monotonic() + self._period
+        shown, new = ((it.status, it.header.frame_id) for it in (self.last, outcome))
+        self.last, self.next_look = outcome, time.monotonic() + self.period
         has_path = len(outcome.plan.path) > 0
         is_news = shown != new or (has_path and outcome.plan.extra_cost is None)
         if is_news and has_path:
@@ -121,11 +111,6 @@ def _rest(planner: Planner, request: Request) -> Any:
         return rest_of_path(way, request.start, grid, request.move_rule)
     assert planner.pose_planner is not None
     return planner.pose_planner.rest_of(way, request.start, grid)
-
-
-def move_rule(rule: str, planner: Planner) -> MoveRule:
-    """Return a rule by its name, or the rule of the model if the name is empty."""
-    return MoveRule(rule or planner.metadata.move_rule)
 
 
 def read_model(model: str) -> tuple[Planner, str]:
@@ -197,7 +182,7 @@ class ModelSource:
             description["model footprint (m)"] = str(body.footprint.tolist())
         return description | {
             "model file": self.file,
-            "move rule": move_rule(rule, self.planner).value,
+            "move rule": MoveRule(rule or metadata.move_rule).value,
             "model move rule": metadata.move_rule.value,
             "model sizes": ", ".join(f"{key} {size}" for key, size in metadata.sizes.items()),
             "model training steps": str(metadata.steps),
@@ -256,7 +241,7 @@ class Requests:
             grid,
             start=first,
             goals=(second,),
-            move_rule=move_rule(settings.move_rule, planner),
+            move_rule=MoveRule(settings.move_rule or planner.metadata.move_rule),
             method=PlanMethod(settings.mode),
             tolerance=metres / grid.resolution,
             simplified=settings.path_simplification != "none",
@@ -330,7 +315,7 @@ class Requests:
         if planner.pose_planner is not None:
             way, anywhere = np.array([*map(pose_of, poses)]), (np.inf, np.inf)
             return len(planner.pose_planner.rest_of(way, pose_of(robot), grid, anywhere)) > 0
-        rule = move_rule(settings.move_rule, planner)
+        rule = MoveRule(settings.move_rule or planner.metadata.move_rule)
         return is_path_valid(cells, cell, grid, rule, _clearing_radius(settings, grid))
 
     async def _inputs(self) -> tuple[Header, GridMap, Planner]:
@@ -351,7 +336,6 @@ class Requests:
         """Return a pose in the map's frame, whose transform is waited for, and its cell."""
         deadline = time.monotonic() + self.settings.transform_tolerance
         try:
-            self.places.check(name, stamped, frame)
             to_map = partial(self.places.to_map, name, stamped, frame)
             pose = await self._wait_for(to_map, deadline)
             return pose, cell_from_pose(name, pose, grid, frame)

@@ -14,7 +14,6 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, Quaternion
 from nav_msgs.msg import OccupancyGrid, Path
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.exceptions import InvalidParameterValueException
 from rclpy.timer import Timer
 from std_msgs.msg import Float32, Header, String, UInt8MultiArray
 
@@ -124,7 +123,7 @@ class TrainerNode(BaseNode):
         try:
             map_file = read_map_file(find_map(name))
         except (ValueError, OSError) as error:
-            raise InvalidParameterValueException("map_file", name, str(error)) from None
+            raise RuntimeError(f"map_file is {name!r}: {error}") from None
         grid = map_file.grid(*map(self.value, OF_MAPS))
         self.map = MapInFrame(grid, "map")
         for which, cell in (("start", map_file.start), ("goal", map_file.goal)):
