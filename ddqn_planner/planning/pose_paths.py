@@ -76,11 +76,12 @@ def in_cells(poses: Float64, grid: GridMap) -> Float64:
 
 def nearest_pose(poses: Float64, robot: Any, grid: GridMap, reach: tuple[float, float]) -> int:
     """Return which of some poses (N, 3) is nearest to a robot; -1 if none is within reach."""
-    x, y, yaw = (poses - robot).T
-    apart, turn = np.hypot(x, y) / grid.resolution, np.abs(turn_between(0, yaw))
-    is_near = (apart <= reach[0]) & (turn <= reach[1])
-    far = np.where(is_near, apart / REACH[0] + turn / REACH[1], np.inf)
-    return int(far.argmin()) if is_near.any() else -1
+    apart = np.hypot(poses[:, 0] - robot[0], poses[:, 1] - robot[1]) / grid.resolution
+    near = np.flatnonzero(apart <= reach[0])
+    turn = np.abs(turn_between(poses[near, 2], robot[2]))
+    near, turn = near[turn <= reach[1]], turn[turn <= reach[1]]
+    far = apart[near] / REACH[0] + turn / REACH[1]
+    return int(near[far.argmin()]) if len(near) else -1
 
 
 def is_free(poses: Float64, grid: GridMap, body: Body) -> bool:
