@@ -293,7 +293,9 @@ class PlannerNode(ManagedNode):
         if self._is_configured:
             self._requests.look_again()
             self._places.transform_start()
-            if self._active.is_look_due(bool(self._map.missing)) or self._has_pose_now():
+            active, is_lost = self._active, bool(self._map.missing)
+            has_come = active.lacks_pose and self._places.know(active.poses)
+            if has_come or active.is_look_due(is_lost):
                 self._replan.trigger()
         if self._report.is_due():
             missing = [self._refusal.reason] if self._refusal is not None else []
@@ -304,15 +306,6 @@ class PlannerNode(ManagedNode):
             if self._is_configured:
                 values |= self._map.describe()
             self._report.publish(fatal, "; ".join(filter(None, missing)), values)
-
-    def _has_pose_now(self) -> bool:
-        """Return whether the pose has come for which the active goal waits."""
-        with suppress(ValueError):
-            if self._active.lacks_pose:
-                for pose in (self._places.start(), *self._active.poses):
-                    self._places.to_map("the pose", pose, self._map.frame)
-                return True
-        return False
 
 
 def _paths(outcome: Outcome, *makers: Callable[..., Any]) -> list[Any]:

@@ -54,10 +54,11 @@ class Frames:
     def to_map(self, name: str, stamped: PoseStamped, map_frame: str) -> PoseStamped:
         """Check a pose, and return it in the map's frame of its time; a RequestError without TF."""
         self.check(name, stamped, map_frame)
-        frame, stamp = stamped.header.frame_id, Time.from_msg(stamped.header.stamp)
+        frame = stamped.header.frame_id
         if frame == map_frame:
             return stamped
         try:
+            stamp = Time.from_msg(stamped.header.stamp)
             return transformed(stamped, self._lookup(map_frame, frame, stamp))
         except ValueError as error:
             reason = f"{name}'s frame is {frame!r}, and {error}, or give it in the map's frame"
@@ -207,6 +208,14 @@ class Places(Frames):
         if self.topic == "initialpose" and self._pose is not None and frame:
             with suppress(ValueError):
                 self._pose = self.to_map("the start", self._pose, frame)
+
+    def know(self, goals: list[PoseStamped]) -> bool:
+        """Return whether the start and some goals have a place on the map."""
+        with suppress(ValueError):
+            for pose in (self.start(), *goals):
+                self.to_map("a pose", pose, self._map_frame())
+            return True
+        return False
 
     def start(self) -> PoseStamped:
         """Return the last pose in its own frame, by TF in the map's; or raise a RequestError."""

@@ -89,9 +89,9 @@ def _inputs_of(request: Request, header: Header | None) -> tuple[Any, ...]:
     return request.grid, header, request.cells[0], *(round(yaw / HEADING) for yaw in yaws)
 
 
-def path_under_way(last: Outcome | None, request: Request, frame: str) -> Any:
+def path_under_way(last: Outcome, request: Request, frame: str) -> Any:
     """Return the last path in cells of a request's map; none if it has another place or form."""
-    if last is None or frame != last.header.frame_id:
+    if frame != last.header.frame_id:
         return ()
     plan, before = last.plan, last.request  # with another model perhaps
     if isinstance(request, PoseRequest):
@@ -258,7 +258,7 @@ class Requests:
             followed = active.followed
             if several:
                 request, more = request.to_nearest(more), []
-        if not more:
+        if followed is not None and not more:
             under_way = path_under_way(followed, request, header.frame_id)
             request = replace(request, under_way=under_way)
         if active is not None and not active.is_due(planner, request, header):
@@ -269,7 +269,7 @@ class Requests:
                 break
             request = request.after(plans[-1], goal)
             plans.append(await self._plan(planner, request))
-        plan, number = joined(plans), len(plans)
+        plan, number = joined(plans) if more else plans[0], len(plans)
         before, goal = poses[number - 1], poses[number + reached(request, plan)]
         reason = reason_of(request, plan, before, goal, settings.robot_radius)
         if more and not len(plan.path):
