@@ -303,14 +303,17 @@ def changed_cells(
         return None
     whole: Box = (slice(0, new.height), slice(0, new.width))
     found, patches = [np.empty((0, 2), np.int64)], new.patches_since(old)
+    most = CHANGED_SHARE * new.occupancy.size
     for box in [whole] if patches is None else patches:
         rows, columns = box
         number = np.flatnonzero(new.differs(old, box) if differs is None else differs(box))
+        most -= len(number)
+        if most < 0:  # before their places are looked up: experience changes most of a map
+            return None
         # With few of many, sooner than `np.nonzero`.
         y, x = np.divmod(number, columns.stop - columns.start)
         found.append(np.column_stack([x + columns.start, y + rows.start]))
-    cells = np.concatenate(found)
-    return cells if len(cells) <= CHANGED_SHARE * new.occupancy.size else None
+    return np.concatenate(found)
 
 
 # The fields that a planner keeps
