@@ -1,17 +1,15 @@
 """Conversions between ROS messages, checked as Nav2 does (nav2_util), and grid maps and paths."""
 
-from __future__ import annotations
-
 import array
 import hashlib
 import math
 from collections.abc import Sequence
 from itertools import compress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
-from nav_msgs.msg import OccupancyGrid, Path
+from nav_msgs.msg import MapMetaData, OccupancyGrid, Path
 from numpy.typing import NDArray
 from rclpy.serialization import serialize_message
 from std_msgs.msg import Header, MultiArrayDimension, MultiArrayLayout, UInt8MultiArray
@@ -21,9 +19,6 @@ from ddqn_planner.grid.arguments import Cells
 from ddqn_planner.grid.body import grid_from_costmap
 from ddqn_planner.grid.map_file import MAX_CELLS
 from ddqn_planner.grid.moves import positions
-
-if TYPE_CHECKING:
-    from ddqn_planner.planning import QField
 
 Origin = tuple[float, float, float]
 Float64 = NDArray[np.float64]
@@ -39,17 +34,16 @@ def grid_from_message(message: OccupancyGrid, *rules: Any) -> GridMap:
     info, turned = message.info, message.info.origin.orientation
     size = f"{info.width} x {info.height} cells"
     needs, has = info.width * info.height, len(message.data)
-    if not message.header.frame_id:
-        raise ValueError("the map's frame is ''; name one in header.frame_id")
-    if not MIN_RESOLUTION < info.resolution < math.inf:
-        remedy = f"give metres per cell, finite and above {MIN_RESOLUTION}"
-        raise ValueError(f"the map's resolution is {info.resolution}; {remedy}")
-    if needs == 0:
-        raise ValueError(f"the map has {size}; give at least one row and column")
-    if needs > MAX_CELLS:
-        raise ValueError(f"the map has {size}; give at most {MAX_CELLS}, or a coarser resolution")
-    if has != needs:
-        raise ValueError(f"the map's data has {has} values; its {size} need {needs}")
+    metres = f"give metres per cell, finite and above {MIN_RESOLUTION}"
+    for is_right, wrong in (
+        (message.header.frame_id, "frame is ''; name one in header.frame_id"),
+        (MIN_RESOLUTION < info.resolution < math.inf, f"resolution is {info.resolution}; {metres}"),
+        (needs, f"size is {size}; give at least one row and column"),
+        (needs <= MAX_CELLS, f"size is {size}; give at most {MAX_CELLS}, or a coarser resolution"),
+        (has == needs, f"data has {has} values; its {size} need {needs}"),
+    ):
+        if not is_right:
+            raise ValueError(f"the map's {wrong}")
     _check_pose("the map's origin", info.origin)
     if math.hypot(turned.x, turned.y) > TOLERANCE:
         raise ValueError(f"the map's origin is rolled or pitched ({_numbers(turned)}); give a yaw")
@@ -81,29 +75,14 @@ def occupancy_message(
     values: NDArray[Any] | None, resolution: float, origin: Origin, header: Header
 ) -> OccupancyGrid:
     """Make a message of a map's values or forbidden directions, see `GridMap`; empty of none."""
-    message = OccupancyGrid(header=header)
     if values is None:
-        return message
-    message.info.map_load_time = header.stamp
-    message.info.resolution = float(resolution)
-    message.info.height, message.info.width = (int(size) for size in values.shape)
-    message.info.origin.position.x = float(origin[0])
-    message.info.origin.position.y = float(origin[1])
-    message.info.origin.orientation = quaternion(origin[2])
-    message.data = array.array("b", values.astype(np.int8, copy=False).tobytes())
-    return message
-
-
-def value_message(field: QField | None, grid: GridMap, header: Header) -> OccupancyGrid:
-    """Make a map message of a value field: 0 the lowest value, 100 the goal's, -1 for no value."""
-    percent = np.full(grid.occupancy.shape, -1, dtype=np.int8)
-    if field is not None:
-        known = np.isfinite(field.value) & ~grid.occupancy
-        values = field.value[known]
-        if values.size:
-            shares = np.interp(values, (values.min(), values.max()), (0, 100))
-            percent[known] = np.rint(shares)
-    return occupancy_message(percent, grid.resolution, grid.origin, header)
+        return OccupancyGrid(header=header)
+    (height, width), (x, y, yaw) = values.shape, map(float, origin)
+    corner = Pose(position=Point(x=x, y=y), orientation=quaternion(yaw))
+    info = MapMetaData(map_load_time=header.stamp, resolution=float(resolution), origin=corner)
+    info.width, info.height = width, height
+    data = array.array("b", values.astype(np.int8, copy=False).tobytes())
+    return OccupancyGrid(header=header, info=info, data=data)
 
 
 def path_message(

@@ -8,7 +8,6 @@ import numpy as np
 from geometry_msgs.msg import Point
 from nav_msgs.msg import OccupancyGrid
 from numpy.typing import NDArray
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
@@ -17,7 +16,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from ddqn_planner.grid import MOVES, GridMap
 from ddqn_planner.grid.motions import turn_between
-from ddqn_planner.nodes.conversions import value_message
+from ddqn_planner.nodes.conversions import occupancy_message
 from ddqn_planner.nodes.report import Outcome
 from ddqn_planner.nodes.runtime import LATCHED, Worker
 from ddqn_planner.planning import QField
@@ -38,14 +37,14 @@ DIRECTIONS = np.exp(1j * np.arctan2(MOVES[:, 1], MOVES[:, 0]))
 class FieldDisplay:
     """Publishes what subscribers ask for: ``~/value``, ``~/policy``, ``~/footprints``."""
 
-    # Its worker has no other calls: neither requests nor maps wait for a field that is only shown.
+    # Its worker, which publishes, has no other calls: neither requests nor maps wait for a field
+    # that is only shown.
     def __init__(self, node: Node, worker: Worker) -> None:
         self._logger, self._worker = node.get_logger(), worker
         self._shown: Outcome | None = None
         # Of what each topic showed when it was published last, the header; None for nothing.
         self._published: dict[str, Header | None] = dict.fromkeys(LAYERS)
-        self._look = node.create_guard_condition(self._on_look, MutuallyExclusiveCallbackGroup())
-        matched = PublisherEventCallbacks(matched=lambda _: self._look.trigger())
+        matched = PublisherEventCallbacks(matched=self._look)
         self._publishers = {
             name: node.create_publisher(kind, f"~/{name}", LATCHED, event_callbacks=matched)
             for name, (kind, _) in LAYERS.items()
@@ -55,26 +54,27 @@ class FieldDisplay:
         """Show the field of an outcome from now on; none if it has none, as of another goal."""
         last = self._shown
         if outcome.plan.goal is None and last is not None:
-            header = Header(stamp=outcome.header.stamp, frame_id=last.header.frame_id)
-            outcome = replace(last, planner=None, header=header)
+            outcome = replace(last, planner=None, header=outcome.header)
         if outcome.plan.goal and (last is None or _key(outcome) != _key(last)):
             self._shown = outcome
-            self._look.trigger()
+            self._look()
 
-    async def _on_look(self) -> None:
+    def _look(self, _: object = None) -> None:
+        self._worker.call(self._publish)
+
+    def _publish(self) -> None:
         for name, publisher in self._publishers.items():
             if (shown := self._shown) is None:
                 return
             if isinstance(shown.plan, PosePlan) != (name == "footprints"):
                 shown = replace(shown, planner=None)
             visible = shown.header if shown.planner is not None else None
-            # What is latched is cleared even if nobody subscribes now.
-            is_asked_for = visible is None or publisher.get_subscription_count() > 0
-            if visible is self._published[name] or not is_asked_for:
-                continue
-            self._published[name] = visible
             try:
-                publisher.publish(await self._worker.call(LAYERS[name][1], shown))
+                # What is latched is cleared even if nobody subscribes now.
+                is_asked_for = visible is None or publisher.get_subscription_count() > 0
+                if visible is not self._published[name] and is_asked_for:
+                    self._published[name] = visible
+                    publisher.publish(LAYERS[name][1](shown))
             except InvalidHandle:  # cleaned up meanwhile
                 return
             except Exception as error:  # as when no memory is left: the node must survive
@@ -93,6 +93,15 @@ def _field_of(outcome: Any) -> tuple[QField | None, GridMap, Header]:
     request, planner, goal = outcome.request, outcome.planner, outcome.plan.goal
     field = planner.q_field(request.grid, goal, request.move_rule) if planner is not None else None
     return field, request.grid, outcome.header
+
+
+def value_message(field: QField | None, grid: GridMap, header: Header) -> OccupancyGrid:
+    """Make a map message of a value field: 0 the lowest value, 100 the goal's, -1 for no value."""
+    percent = np.full(grid.occupancy.shape, -1, dtype=np.int8)
+    if field is not None and (known := np.isfinite(field.value) & ~grid.occupancy).any():
+        values = field.value[known]
+        percent[known] = np.rint(np.interp(values, (values.min(), values.max()), (0, 100)))
+    return occupancy_message(percent, grid.resolution, grid.origin, header)
 
 
 def policy_message(field: QField | None, grid: GridMap, header: Header) -> MarkerArray:

@@ -1,18 +1,14 @@
 """The executor of the nodes."""
 
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from rclpy.event_handler import EventHandler
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.task import Task
 from rclpy.waitable import NumberOfEntities
-
-EVENTS_PERIOD = 0.5  # seconds: how late a busy node may hear that publishers or subscribers came
 
 # What a wait set waits for, as it calls them, and where a node has them.
 KINDS = {
@@ -36,7 +32,6 @@ class NodeExecutor(SingleThreadedExecutor):
 
     # rclpy's makes a wait set each time that it waits, and wakes itself after each callback.
     _has_changed = True  # the node has other entities than the wait set
-    _events_due = 0.0
 
     def wake(self) -> None:
         """Wait for what the node has now."""
@@ -73,13 +68,8 @@ class NodeExecutor(SingleThreadedExecutor):
         """Wait until something is ready, and begin to call it."""
         if self._has_changed:
             self._look_at_node()
+        wait_set = self._wait_set
         waitables = [it for it in self._waitables if it.callback_group.can_execute(it)]
-        wait_set, timeout = self._wait_set, -1
-        if (seconds := self._events_due - time.monotonic()) > 0:  # events are half of all
-            waitables = [it for it in waitables if not isinstance(it, EventHandler)]
-            timeout = int(1e9 * seconds)
-        else:
-            self._events_due = time.monotonic() + EVENTS_PERIOD
         wait_set.clear_entities()
         wait_set.add_guard_condition(self._guard.handle)
         for (kind, _), entity in self._entities.items():
@@ -87,18 +77,14 @@ class NodeExecutor(SingleThreadedExecutor):
                 getattr(wait_set, f"add_{kind}")(entity.handle)
         for waitable in waitables:
             waitable.add_to_wait_set(wait_set)
-        wait_set.wait(timeout)
-        for waitable in waitables:
-            if waitable.is_ready(wait_set):
-                self._begin(waitable, self._take_waitable)
+        wait_set.wait(-1)
+        ready: list[Any] = [(it, self._take_waitable) for it in waitables if it.is_ready(wait_set)]
         for kind in KINDS:
-            for pointer in wait_set.get_ready_entities(kind):
-                if entity := self._entities.get((kind, pointer)):
-                    self._begin(entity, getattr(self, f"_take_{kind}"))
-
-    def _begin(self, entity: Any, take: Callable[[Any], Any]) -> None:
+            take = getattr(self, f"_take_{kind}")
+            found = (self._entities.get((kind, at)) for at in wait_set.get_ready_entities(kind))
+            ready += [(entity, take) for entity in found if entity]
         # Not by `create_task`, which would wake the executor.
-        self._tasks.append((Task(self._execute, (entity, take), executor=self), None, None))
+        self._tasks.extend((Task(self._execute, each, executor=self), None, None) for each in ready)
 
     async def _execute(self, entity: Any, take: Callable[[Any], Any]) -> None:
         """Call an entity's callback, unless another of its group runs, or the node has changed."""

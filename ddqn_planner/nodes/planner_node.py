@@ -127,6 +127,8 @@ class PlannerNode(ManagedNode):
             self._refusal = NOT_ACTIVE
             while self._answering:
                 await self._requests.next_look
+                if not self._answering:  # an answer that ends with its service may be lost
+                    await self._requests.next_look
         return True
 
     # Parameters

@@ -34,11 +34,9 @@ from ddqn_planner.nodes.conversions import (
     path_message,
     quaternion,
     turns,
-    value_message,
 )
 from ddqn_planner.nodes.poses import Frames, Places, transformed
 from ddqn_planner.nodes.report import Refusals, RequestError
-from ddqn_planner.planning import QField
 
 HEADER = Header(frame_id="map")
 
@@ -94,25 +92,6 @@ def test_a_pose_has_a_cell_also_off_the_map_or_is_refused_by_the_name_of_its_val
         bad = changed(PoseStamped(header=HEADER), f"pose.{field}", value)
         with pytest.raises(ValueError, match=reason):
             cell_from_pose("the goal", bad, grid, "map")
-
-
-SHOWN = [([0.0, 1.004, 1.996, 3.0], [0, 33, 67, 100]), ([0.0, 0.0], [100, 100])]
-SHOWN += [([-3e38, 3e38], [0, 100]), ([np.nan, np.nan], [-1, -1])]
-
-
-@pytest.mark.parametrize(("values", "percent"), SHOWN)
-def test_values_are_percent_or_unknown(values: list[float], percent: list[int]) -> None:
-    # Behind them an occupied cell, and one without a move.
-    q = np.tile(np.array([*values, values[0], 9], np.float32), (8, 1, 1))
-    legal = np.ones(q.shape, dtype=np.bool_)
-    legal[:, 0, -1] = False
-    occupancy = np.zeros(q.shape[1:], dtype=np.bool_)
-    occupancy[0, -2] = True
-    field = QField((len(values) - 1, 0), q, legal)
-    message = value_message(field, GridMap(occupancy, 0.5), HEADER)
-    assert message.data.tolist() == [*percent, -1, -1]
-    assert message.info.resolution == 0.5
-    assert message.header.frame_id == "map"
 
 
 def is_turn(before: tuple[int, int], at: tuple[int, int], after: tuple[int, int]) -> bool:

@@ -14,11 +14,30 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves, shortest_distances
-from ddqn_planner.nodes.display import MAX_ARROWS, policy_message
+from ddqn_planner.nodes.display import MAX_ARROWS, policy_message, value_message
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.planning import QField
 
 HEADER = Header(frame_id="map")
+
+
+SHOWN = [([0.0, 1.004, 1.996, 3.0], [0, 33, 67, 100]), ([0.0, 0.0], [100, 100])]
+SHOWN += [([-3e38, 3e38], [0, 100]), ([np.nan, np.nan], [-1, -1])]
+
+
+@pytest.mark.parametrize(("values", "percent"), SHOWN)
+def test_values_are_percent_or_unknown(values: list[float], percent: list[int]) -> None:
+    # Behind them an occupied cell, and one without a move.
+    q = np.tile(np.array([*values, values[0], 9], np.float32), (8, 1, 1))
+    legal = np.ones(q.shape, dtype=np.bool_)
+    legal[:, 0, -1] = False
+    occupancy = np.zeros(q.shape[1:], dtype=np.bool_)
+    occupancy[0, -2] = True
+    field = QField((len(values) - 1, 0), q, legal)
+    message = value_message(field, GridMap(occupancy, 0.5), HEADER)
+    assert message.data.tolist() == [*percent, -1, -1]
+    assert message.info.resolution == 0.5
+    assert message.header.frame_id == "map"
 
 
 def exact_field(grid: GridMap, goal: Cell) -> QField:

@@ -232,8 +232,7 @@ def test_with_another_rclpy_its_own_executor_runs_the_node(monkeypatch: pytest.M
     rclpy.shutdown()
 
 
-def test_callbacks_resume_in_order_unless_destroyed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(of_nodes, "EVENTS_PERIOD", 1000.0)  # else it looks again after that
+def test_callbacks_resume_in_order_unless_destroyed() -> None:
     called, awaited, stopping = [], Future(), threading.Event()
 
     async def begin() -> None:

@@ -201,7 +201,7 @@ def test_a_malformed_map_or_start_is_refused_and_a_goal_has_an_empty_plan(robot:
     robot.send_map(changed(robot.map_message(), "info.width", 0))
     robot.send_start(changed(robot.pose((3, 3)), "pose.orientation", Quaternion(w=0.0)))
     for reason in (
-        "map refused: the map has 0 x 6 cells",
+        "map refused: the map's size is 0 x 6 cells",
         "initialpose refused: the start's orientation is .* a quaternion of norm 0",
     ):
         assert robot.wait_for_reason(reason).level == WARN
