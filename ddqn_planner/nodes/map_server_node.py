@@ -130,8 +130,7 @@ def known_path(grid: GridMap, map_file: MapFile) -> tuple[MoveRule, list[Cell]]:
         remedy = f"add '{PACKAGE}: {{start: [x, y], goal: [x, y]}}' in cells to its YAML"
         raise ValueError(f"the map file names no start and goal; {remedy}")
     for move_rule in (MoveRule.ROBOT_SAFE, MoveRule.CORNER_CUTTING):
-        path = shortest_path(grid, start, goal, move_rule)
-        if path:
+        if path := shortest_path(grid, start, goal, move_rule):
             return move_rule, path
     raise ValueError(f"no path leads from the start {start} to the goal {goal} of the map file")
 

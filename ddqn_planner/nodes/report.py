@@ -129,8 +129,8 @@ def _place(stamped: PoseStamped, cell: Cell) -> str:
 class Refusals:
     """What a node refused and has not accepted since, and why; it is logged when that changes."""
 
-    def __init__(self, node: BaseNode) -> None:
-        self.node = node
+    def __init__(self, node: BaseNode, on_change: Callable[[], None] = lambda: None) -> None:
+        self.node, self._on_change, self._due = node, on_change, 0.0
         self.refused: dict[str, str] = {}
         self.publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
@@ -158,7 +158,9 @@ class Refusals:
             self.change()
 
     def change(self) -> None:
-        """Be told that something was refused or accepted."""
+        """Publish soon: something about the node changed."""
+        self._due = 0.0
+        self._on_change()
 
     def problems(self) -> list[str]:
         """Return what a user reads of all that is refused."""
@@ -177,15 +179,7 @@ class Refusals:
 class Report(Refusals):
     """Logs what the planner node does, and publishes the last outcome with what was refused."""
 
-    def __init__(self, node: BaseNode, on_change: Callable[[], None]) -> None:
-        super().__init__(node)
-        self.outcome, self._on_change = NO_REQUEST, on_change
-        self._due = 0.0
-
-    def change(self) -> None:
-        """Publish soon: something about the node changed."""
-        self._due = 0.0
-        self._on_change()
+    outcome = NO_REQUEST
 
     def is_due(self) -> bool:
         """Return whether somebody listens, and something changed or `PERIOD` has passed."""
@@ -224,7 +218,6 @@ class Report(Refusals):
             "rollout time (ms)": f"{plan.rollout_ms:.3f}",
             "planned on the map of (s)": seconds(of_map.stamp) if of_map else "",
             **more,
-            **{f"refused {what}": reason for what, reason in self.refused.items()},
         }
         self.tell("plan", level, "; ".join([outcome.reason, *problems]), values)
 
