@@ -118,13 +118,20 @@ class MapSource:
             return str(error)
         return ""
 
+    @property
+    def _size(self) -> str:
+        """The size of the map in use, in words; empty without one."""
+        if self._used is None:
+            return ""
+        size = f"{self._grid.width} x {self._grid.height} cells"
+        return f"{size} of {self._grid.resolution:.6g} m in frame {self.frame!r}"
+
     def describe(self) -> dict[str, str]:
         """Return what the diagnostics say of the map."""
         description = {}
         if self._used is not None:
-            grid, stamp = self._grid, seconds(self._used.header.stamp)
-            size = f"{grid.width} x {grid.height} cells of {grid.resolution:.6g} m"
-            description = {"map": f"{size} in frame {self.frame!r}", "map stamp (s)": stamp}
+            stamp = seconds(self._used.header.stamp)
+            description = {"map": self._size, "map stamp (s)": stamp}
         if self._updates:
             description["map updates applied"] = str(self._applied_updates)
             description["map updates refused"] = str(self._updates - self._applied_updates)
@@ -226,7 +233,10 @@ class MapSource:
             if received is self._newest:  # without a log: they may be on their way
                 self._report.refuse("map", str(error), log=False)
             return False
+        before = self._size
         self._used, self._grid, received.directions = received, grid, directions
+        if self._size != before:
+            self._node.get_logger().info(f"map of {self._size}")
         if received is self._newest:
             self._report.accept("map")
         self.change()

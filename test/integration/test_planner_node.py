@@ -278,8 +278,10 @@ def test_the_log_says_once_what_stays_the_same(robot: Robot) -> None:
     robot.node.wait_for_log("no plan: the goal's frame is 'map', .*'upstairs'")
     plan = robot.client.subscribe(Path, "plan", LATCHED).wait()
     assert (plan.poses, plan.header.frame_id) == ([], "upstairs")
+    assert "map of 6 x 6 cells of 0.5 m in frame 'map'" not in robot.node.log  # it was known
     for line in (
-        *("a path of ", "no plan: the goal is occupied", "no plan: the goal's frame"),
+        *("map of 6 x 6 cells of 0.5 m in frame 'upstairs'", "a path of "),
+        *("no plan: the goal is occupied", "no plan: the goal's frame"),
         "initialpose refused: the start's frame is ''",
     ):
         assert robot.node.log.count(line) == 1, robot.node.log
