@@ -47,7 +47,8 @@ def train_prior(
 
     The places come in the order in which they were first driven. How long to train, and how much to
     believe the result, is what foretells places best that were left out: none of it, if none does.
-    The places of an older prior are replayed, so that what it knew of other maps is not forgotten;
+    On a new map an older prior stays as long as it foretells these places better. Later its places
+    are replayed, so that what it knew of other maps is not forgotten;
     positions (N, 2) tell which of them are these ones.
     """
     random = np.random.default_rng(seed)
@@ -71,10 +72,20 @@ def train_prior(
     error = np.linalg.norm(fit - share * size) / max(size.sum(), 1e-9)
     doubt = DOUBT * error / max(share * (1 - 2 / len(fit)), 1e-9)  # fewer blocks, greater errors
     share = min(share, 1) * (1 - min(doubt, 1) ** 2)
+    if older is not None and len(old) == len(older.replay):  # it has seen none of these places
+        own, others = (share * foretold)[len(old) :], older.log_slowness(new[:, 2:-2])
+        if _error(others, new) < _error(own, new):
+            return older
     direct, *layers, last = (array[-1].squeeze() for array in trained)
     kept = [part[np.sort(random.permutation(len(part))[:REPLAYED])] for part in (old, new)]
     network = share * direct[:FEATURES], *layers, share * last, np.concatenate(kept)
     return Prior(*(np.asarray(array, np.float32) for array in (mean, scale, level, *network)))
+
+
+def _error(foretold: Float32, places: Float32) -> float:
+    """Return how far off the log slowness of places is foretold, whatever their level."""
+    off, weight = places[:, -2] - foretold, places[:, -1]
+    return float(weight @ (off - np.average(off, weights=weight)) ** 2)
 
 
 def _train(*arrays: Float32, seed: int) -> tuple[Float32, list[Float32]]:

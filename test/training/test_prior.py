@@ -128,3 +128,11 @@ def test_what_all_places_have_in_common_is_not_learned_twice() -> None:
     merged = Experience(0.5)
     merged.merge(experience)
     np.testing.assert_allclose(merged.slowness(grid), before, rtol=0.1)
+
+
+def test_an_older_prior_stays_on_a_new_map_as_long_as_it_foretells_it_better() -> None:
+    older = train_prior(*measured(0))
+    features, slowness, weights = (array[:40] for array in measured(1))
+    elsewhere = np.ones((40, 2))
+    assert train_prior(features, slowness, weights, older, 0, elsewhere) is older
+    assert train_prior(features, -slowness, weights, older, 0, elsewhere) is not older
