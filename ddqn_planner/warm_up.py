@@ -1,9 +1,6 @@
 """All that is compiled for a planner: by a node before it is active, or at an installation."""
 
-import ctypes
 from collections.abc import Iterator
-from contextlib import suppress
-from pathlib import Path
 
 import numpy as np
 
@@ -26,31 +23,19 @@ def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
         experience.apply(grid)
     if planner.pose_planner is not None:
         _plan_poses(planner)
-        yield  # there is no rest
-    else:
-        planner.plan(grid, start, goal, simplified=True)
-        planner.plan(grid.with_patch([[True]], 1, 1), start, goal)
-        is_path_valid([start, goal], start, grid, planner.metadata.move_rule)
-        yield
-        # From an obstacle there is a way out, to where a path begins, perhaps one-way.
-        obstacle = free.copy()
-        obstacle[0, 0] = True
-        for forbidden in (None, 16 + free.astype(np.uint8)):
-            blocked = GridMap(obstacle, forbidden=forbidden)
-            planner.plan(blocked, start, goal, start_clearing_radius=1.0)
-    _unmap_compiler()
+        yield from (None, None)  # there is no rest
+        return
+    planner.plan(grid, start, goal, simplified=True)
+    planner.plan(grid.with_patch([[True]], 1, 1), start, goal)
+    is_path_valid([start, goal], start, grid, planner.metadata.move_rule)
     yield
-
-
-def _unmap_compiler() -> None:
-    """Give back the pages of LLVM's code, some 50 MB: what is compiled runs without it."""
-    # It is read from its file again should something else be compiled.
-    with suppress(OSError, AttributeError):  # not Linux
-        for mapping in Path("/proc/self/maps").read_text(encoding="utf-8").splitlines():
-            if " r-xp " in mapping and mapping.endswith("/libllvmlite.so"):
-                begin, end = (int(at, 16) for at in mapping.split()[0].split("-"))
-                pages = ctypes.c_void_p(begin), ctypes.c_size_t(end - begin)
-                ctypes.CDLL(None).madvise(*pages, 4)  # MADV_DONTNEED
+    # From an obstacle there is a way out, to where a path begins, perhaps in one direction only.
+    obstacle = free.copy()
+    obstacle[0, 0] = True
+    for forbidden in (None, 16 + free.astype(np.uint8)):
+        blocked = GridMap(obstacle, forbidden=forbidden)
+        planner.plan(blocked, start, goal, start_clearing_radius=1.0)
+    yield
 
 
 def _plan_poses(planner: Planner) -> None:
