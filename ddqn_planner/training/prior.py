@@ -48,8 +48,8 @@ def train_prior(
     The places come in the order in which they were first driven. How long to train, and how much to
     believe the result, is what foretells places best that were left out: none of it, if none does.
     On a new map an older prior stays as long as it foretells these places better. Later its places
-    are replayed, so that what it knew of other maps is not forgotten;
-    positions (N, 2) tell which of them are these ones.
+    are replayed, so that what it knew of other maps is not forgotten; positions (N, 2) tell which
+    of them are these ones.
     """
     random = np.random.default_rng(seed)
     at = np.zeros((len(features), 2)) if positions is None else positions
