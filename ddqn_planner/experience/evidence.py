@@ -80,7 +80,7 @@ class Evidence:
         np.add.at(self.table[:, 3], waited, visits.waits[:, 2])
         # Only passages from the first wait on tell how long a wait is.
         away = visits.position[:, None] - self.table[self.table[:, 3] > 0, 5:]
-        is_near = np.hypot(away[..., 0], away[..., 1]).min(axis=1, initial=np.inf) <= 2 * self.side
+        is_near = np.hypot(away[..., 0], away[..., 1]).min(axis=1, initial=np.inf) <= 4 * self.side
         seen = weight[:, None] * np.column_stack([np.ones(len(log)), log, is_near])
         np.add.at(self.table[:, :3], rows, seen)
         self.table[waited, 2] = np.maximum(self.table[waited, 2], 1)

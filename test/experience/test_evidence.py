@@ -240,7 +240,7 @@ def test_a_wait_is_added_to_each_passage_as_the_mean_of_its_seconds(
         experience.record(*(waited(seconds) if number % (others + 1) == 0 else waited(0)))
     waits = len(range(0, 10, others + 1))
     cost = planner.plan(experience.apply(grid), *ends).cost
-    assert cost - usual == pytest.approx(seconds * waits / 10, rel=0.35, abs=0.7)
+    assert cost - usual == pytest.approx(seconds * waits / 10, rel=0.15)
 
 
 def test_a_wait_is_not_spread_along_the_way_or_to_other_ways() -> None:
