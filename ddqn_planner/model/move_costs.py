@@ -25,18 +25,18 @@ OUTSIDE = 512  # the patch of cells outside the map: no move leads out of them
 class MoveCosts(NamedTuple):
     """The cost of each move of each cell, on a map with a border of one cell."""
 
-    # It is table[8 patch[cell] + action]. With terms, that is a length, times 1 + max(0, sum of
-    # them), at most MAX_MULTIPLIER; with multipliers, it is multiplied by the mean of its cells'.
+    # It is table[8 patch[cell] + action]. With terms, that is a length, times the sum of the terms
+    # of its two cells, half of 1 or more each; with multipliers, times the mean of its cells'.
     patch: NDArray[Any]  # (C,) uint16 or int32: the number of each cell's patch
     table: Array  # (8 P,) float32: at least 1; infinite where a move is not possible
     value: NDArray[np.uint8]  # (C,), for the terms, or empty
-    terms: Array  # (9 * L * 8,) float32: what each value of each cell of a patch adds, or empty
+    terms: Array  # (2 * 8 * L,) float32: of the cell before a move and of that after it, or empty
     multiplier: Array  # (C,) float32: 1 or more, or empty
     width: int  # columns of the padded map
     highest: float  # no possible move costs more
     straight: float  # no straight move costs less
     diagonal: float  # no diagonal move costs less
-    low: Array  # (L,): with terms, half of a move's multiplier is no less, for each cell; or empty
+    low: Array  # (L,): with terms, the least multiplier by the least value of a map; or empty
     least: float = 1.0  # no multiplier on the map is less
 
     @classmethod
@@ -79,8 +79,7 @@ class MoveCosts(NamedTuple):
         if self.terms.size and grid.cost is not None:
             value = cell_values(grid.occupancy, grid.cost)
             lowest = int((value - np.uint8(1)).min())  # an unknown cell has a cost of 255 here
-            least = float(2 * self.low[min(lowest, OCCUPIED) + 1])
-            costs = costs._replace(value=value, least=least)
+            costs = costs._replace(value=value, least=float(self.low[min(lowest, OCCUPIED) + 1]))
         if grid.forbidden is not None:
             forbidden = _with_border(grid.forbidden, 0).ravel()
             patch, table = _with_directions(patch, self.table, forbidden)

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import MOVES, OCCUPIED, UNKNOWN, Cell, GridMap, MoveRule
-from ddqn_planner.grid.grid_map import MULTIPLIERS
 from ddqn_planner.model.certificate import MOVE_RULES, Certificate, certify
 from ddqn_planner.model.move_costs import (
     MAX_MULTIPLIER,
@@ -35,6 +34,7 @@ Array: TypeAlias = NDArray[np.float32]
 # A move of at least this probability counts as one that always succeeds: the sigmoid function never
 # reaches 1, and its rest must not decide between paths.
 CERTAIN = 0.99
+NOISE = 0.02  # weights of prices below that count as 0: training leaves some where none belong
 BATCH = 2**12  # patches per evaluation: the layers' outputs then fit into a cache
 
 # The paper (section 4) uses four values and does not give them. With ours the robot stands out.
@@ -248,6 +248,11 @@ class AnyMapQNetwork(PropagationQNetwork):
     inputs = 28
     uses_costs = True
 
+    def __init__(self, sizes: Mapping[str, int], tensors: Mapping[str, Array]) -> None:
+        prices = {name: t for name, t in tensors.items() if name.startswith("prices")}
+        clear = {name: np.where(np.abs(t) < NOISE, 0, t) for name, t in prices.items()}
+        super().__init__(sizes, {**tensors, **clear})
+
     @classmethod
     def shapes(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
         """Return the shape of each tensor."""
@@ -269,8 +274,7 @@ class AnyMapQNetwork(PropagationQNetwork):
     def _proved_costs(self, move_rule: MoveRule, with_costs: bool, timed: bool) -> MoveCosts | None:
         if not with_costs:
             return super()._proved_costs(move_rule, with_costs, timed)
-        certificate = self.certificate(move_rule)
-        if not certificate.proved:
+        if not self.certificate(move_rule).proved:
             return None
         legal_PA = legal_in_patches(every_patch(), move_rule)
         lengths_PA = np.where(legal_PA, move_rule.lengths, np.inf).astype(np.float32)
@@ -278,18 +282,21 @@ class AnyMapQNetwork(PropagationQNetwork):
         # The layer is linear, so that its output is a sum over the patch's cells.
         weight_AI, bias_A = self.tensors["prices.weight"], self.tensors["prices.bias"]
         occupied_9A, cost_9A, unknown_9A = weight_AI[:, :27].T.reshape(3, 9, -1)
-        terms_9LA = np.empty((9, VALUES, len(MOVES)), dtype=np.float32)
-        terms_9LA[:, 0], terms_9LA[:, -1] = unknown_9A, occupied_9A
-        terms_9LA[:, 1:-1] = (np.arange(OCCUPIED) / 100)[:, None] * cost_9A[:, None]
-        terms_9LA[4] += bias_A + weight_AI[:, 27] * move_rule.cuts_corners
-        greatest = 1 + max(0.0, float(terms_9LA.max(axis=1).sum(axis=0).max()))
-        highest = costs.highest * min(greatest, MAX_MULTIPLIER)
-        # What is proved of the sums bounds them from below by two values; they need no more often.
-        share = 1 - certificate.multiplier_error - 1e-5  # the sums are rounded
-        low_L = MULTIPLIERS.take(np.arange(UNKNOWN, OCCUPIED + 1), mode="wrap") * np.float32(share)
-        return costs._replace(
-            terms=terms_9LA.ravel(), highest=highest, low=np.maximum(low_L, 1) / 2
-        )
+        terms_9AL = np.empty((9, len(MOVES), VALUES), dtype=np.float32)
+        terms_9AL[..., 0], terms_9AL[..., -1] = unknown_9A, occupied_9A
+        terms_9AL[..., 1:-1] = cost_9A[..., None] * (np.arange(OCCUPIED) / 100)
+        terms_9AL[4] += (bias_A + weight_AI[:, 27] * move_rule.cuts_corners)[:, None]
+        actions, after = np.arange(len(MOVES)), 4 + MOVES @ [1, 3]
+        terms_2AL = np.stack([terms_9AL[4], terms_9AL[after, actions]])
+        terms_2AL[..., -1] = terms_2AL[..., -2]  # no move leads there
+        terms_9AL[4] = terms_9AL[after, actions] = 0
+        greatest = 1 + float(terms_2AL.max(axis=2).sum(axis=0).max())
+        if terms_9AL.any() or terms_2AL.min() < 0 or greatest > MAX_MULTIPLIER:
+            return None  # what a move costs does not follow from its two cells
+        from_on = np.minimum.accumulate(terms_2AL[..., ::-1], axis=2)[..., ::-1]
+        low_L = 1 + np.minimum(terms_2AL[..., :1], from_on).sum(axis=0).min(axis=0)
+        terms = terms_2AL.ravel() + np.float32(0.5)
+        return costs._replace(terms=terms, highest=costs.highest * greatest, low=low_L)
 
 
 def _with_biases(weights: Mapping[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place, inlined
 from ddqn_planner.grid import MOVES, Cell
-from ddqn_planner.model.move_costs import MAX_MULTIPLIER, VALUES, MoveCosts
+from ddqn_planner.model.move_costs import VALUES, MoveCosts
 
 Distances = NDArray[np.float64]
 Cells = NDArray[np.int32]
@@ -30,7 +30,7 @@ MOVE_X, MOVE_Y = MOVES.T.copy()
 # The lowest bit of a byte that is set.
 FIRST = np.array([0] + [(bits & -bits).bit_length() - 1 for bits in range(1, 256)], np.uint64)
 # Unsigned, as numba then looks for no index that counts from the end.
-ONE, ACTIONS, OF_CELL = np.uint64(1), np.uint64(8), np.uint64(8 * VALUES)
+ONE, ACTIONS, OF_ACTION, AFTER = np.array([1, 8, VALUES, 8 * VALUES], np.uint64)
 
 
 class Known(NamedTuple):
@@ -50,25 +50,14 @@ class Known(NamedTuple):
 def cost_of(cell: int, action: int, costs: Any) -> Any:
     """Return the cost of a move, infinite if it is not possible. See `MoveCosts`."""
     patch, table, value, terms, multiplier, width = costs
-    place = np.uint64(action)
-    cost = table[ACTIONS * np.uint64(patch[np.uint64(cell)]) + place]
+    cost = table[ACTIONS * np.uint64(patch[np.uint64(cell)]) + np.uint64(action)]
+    after = np.uint64(cell + MOVE_Y[action] * width + MOVE_X[action])
     if multiplier.size > 0:
-        after = cell + MOVE_Y[action] * width + MOVE_X[action]
-        return cost * (np.float64(multiplier[cell]) + multiplier[after]) / 2
-    if terms.size == 0 or cost == np.inf:
-        return np.float64(cost)
-    total = np.float32(0)
-    middle = np.uint64(cell) - np.uint64(width)
-    for _ in range(3):
-        total += (
-            terms[ACTIONS * value[middle - ONE] + place]
-            + terms[ACTIONS * value[middle] + place + OF_CELL]
-            + terms[ACTIONS * value[middle + ONE] + place + OF_CELL + OF_CELL]
-        )
-        middle += np.uint64(width)
-        place += OF_CELL + OF_CELL + OF_CELL
-    factor = np.float32(1) + total if total > 0 else np.float32(1)
-    return np.float64(cost * (factor if factor < MAX_MULTIPLIER else np.float32(MAX_MULTIPLIER)))
+        return cost * (np.float64(multiplier[np.uint64(cell)]) + multiplier[after]) / 2
+    if terms.size > 0:
+        place = np.uint64(action) * OF_ACTION
+        cost *= terms[place + value[np.uint64(cell)]] + terms[place + AFTER + value[after]]
+    return np.float64(cost)
 
 
 # The wavefront
@@ -96,7 +85,7 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
             first = np.argsort(order)
             opened, order = opened[first], order[first]
         bucket, used = np.empty((ring, capacity), np.int32), np.zeros(ring, np.int64)
-        how = start, bounds, buckets, limit, offsets, costs.low
+        how = start, bounds, buckets, limit, offsets
         queue = opened, order, bucket, used
         taken, visited, is_full = _grow(distance, state, queue, how, costs[:6])
         left = [bucket[slot, : used[slot]] for slot in used.nonzero()[0]]
@@ -135,9 +124,9 @@ def _remaining(x: int, y: int, bounds: Any) -> Any:
 @in_place
 def _grow(distance: Any, state: Any, queue: Any, how: Any, costs: Any) -> tuple[int, int, bool]:
     """Do the work of `grow`, with the open cells in their order, until a bucket may be full."""
-    patch, table, value, _, _, width = costs
+    patch, table, value, terms, _, width = costs
     opened, order, bucket, used = queue
-    start, bounds, buckets, limit, offsets, low = how
+    start, bounds, buckets, limit, offsets = how
     start_y, start_x = start // width, start % width
     ring, most = bucket.shape[0], bucket.shape[1] - 8
     taken, queued, front, visited, is_full = 0, 0, 0, 0, False
@@ -167,15 +156,17 @@ def _grow(distance: Any, state: Any, queue: Any, how: Any, costs: Any) -> tuple[
             state[cell] = CLOSED
             visited += 1
             here = distance[cell]
-            # With values, these are lower bounds: few moves need more than that. Illegal ones take
-            # no branch, which would often be predicted wrong.
+            # Without multipliers: the exact costs are no less. Illegal moves take no branch, which
+            # would often be predicted wrong.
             better = np.uint64(0)
+            last = AFTER + np.uint64(value[cell] if terms.size > 0 else 0)
             for number in range(8):
                 action = np.uint64(number)
                 previous = cell - offsets[action]
                 cost = table[ACTIONS * np.uint64(patch[previous]) + action]
-                if low.size > 0:
-                    cost *= low[value[previous]] + low[value[cell]]
+                if terms.size > 0:
+                    place = OF_ACTION * action
+                    cost *= terms[place + value[previous]] + terms[place + last]
                 known = distance[previous] if distance[previous] > 0 else np.inf
                 better |= np.uint64(here + cost < known) << action
             x, y = np.int64(cell) % width - start_x, np.int64(cell) // width - start_y

@@ -65,6 +65,7 @@ class Trainer:
         sizes = {name: known[name] for name in network_class.size_names}
         first = _initial_tensors(network_class.shapes(sizes), int(weights.generate_state(1)[0]))
         self.network = network_class(sizes, first)
+        self.network.tensors = first  # all of them: what is noise is known once they are trained
         copies = np.copy, np.zeros_like, np.zeros_like
         target, mean, square = ({name: copy(t) for name, t in first.items()} for copy in copies)
         # The networks θ and θ⁻, and Adam's moments of the gradient: all that an update changes.
