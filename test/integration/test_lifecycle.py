@@ -23,6 +23,7 @@ from rclpy.task import Future
 
 from ddqn_planner.nodes import executor as of_nodes
 from ddqn_planner.nodes.planner_node import PlannerNode
+from ddqn_planner.nodes.runtime import LATCHED
 
 OF_CONFIGURED = {"planner/get_plan", "planner/reload_model", "plan", "map", "goal_pose"}
 
@@ -138,7 +139,7 @@ def test_the_planner_survives_transitions_among_requests(robot: Robot) -> None:
     messages = {"map": robot.map_message(), "goal_pose": robot.pose(GOAL)}
     messages["initialpose"] = initial_pose(robot.pose(START))
     for topic, message in messages.items():
-        robot.client.publish(topic, message, listeners=0)
+        robot.client.publish(topic, message, LATCHED, listeners=0)
     request = GetPlan.Request(start=robot.pose(START), goal=robot.pose(GOAL))
     for label in ["configure", "activate", "deactivate", "cleanup"] * 3:
         for _ in range(20):
