@@ -1,3 +1,6 @@
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -136,47 +139,43 @@ def test_a_move_whose_cost_or_p_is_nan_is_not_possible(tensor: str) -> None:
     assert q[2, 0, 0] == pytest.approx(-(1 + 2**0.5) / 0.9)  # up, and then down to the right
 
 
+def priced(part: str, place: Any, change: Callable[[Any], Any]) -> Planner:
+    """Return a planner with `any_map`, but for some of its prices' weights or biases."""
+    shipped = Planner.load("any_map")
+    tensors = {name: tensor.copy() for name, tensor in shipped.network.tensors.items()}
+    tensors[f"prices.{part}"][place] = change(tensors[f"prices.{part}"][place])
+    return Planner(AnyMapQNetwork(shipped.network.sizes, tensors), shipped.metadata)
+
+
 @pytest.mark.parametrize(("weight", "counts"), [(0.019, False), (0.5, True)])
 def test_small_prices_of_other_cells_are_noise_and_others_count(
     weight: float, counts: bool
 ) -> None:
-    shipped = Planner.load("any_map")
-    tensors = {name: tensor.copy() for name, tensor in shipped.network.tensors.items()}
-    tensors["prices.weight"][0, 9] = (
-        weight  # of what the cell (-1, -1) costs, for a move to the east
-    )
-    network, free = AnyMapQNetwork(shipped.network.sizes, tensors), np.zeros((5, 9), np.bool_)
-    cost = np.zeros(free.shape, np.int8)
+    # Of what the cell at (-1, -1) costs, for a move to the east.
+    planner = priced("weight", (0, 9), lambda _: weight)
+    cost = np.zeros((5, 9), np.int8)
     cost[1, :] = 80
-    grid = GridMap(free, cost=cost)
-    assert (network.move_costs(grid, MoveRule.ROBOT_SAFE) is None) == counts
-    field = Planner(network, shipped.metadata).q_field(grid, (7, 2))
+    grid = GridMap(np.zeros(cost.shape, np.bool_), cost=cost)
+    assert (planner.network.move_costs(grid, MoveRule.ROBOT_SAFE) is None) == counts
+    field = planner.q_field(grid, (7, 2))
     step = field.value[2, 6] - field.q[0, 2, 5]
     assert step == pytest.approx(1.4 if counts else 1.0, abs=0.01)
 
 
 def test_a_price_below_that_of_free_cells_is_no_sum_of_two_cells() -> None:
-    shipped = Planner.load("any_map")
-    bias = shipped.network.tensors["prices.bias"] - np.float32(0.05)
-    network = AnyMapQNetwork(
-        shipped.network.sizes, {**shipped.network.tensors, "prices.bias": bias}
-    )
+    planner = priced("bias", ..., lambda bias: bias - 0.05)
     grid = GridMap(np.zeros((3, 3), np.bool_), cost=np.full((3, 3), 1, np.int8))
-    assert network.certificate(MoveRule.ROBOT_SAFE).proved
-    assert network.move_costs(grid, MoveRule.ROBOT_SAFE) is None  # 1 + max(0, sum) is no sum
-    field = Planner(network, shipped.metadata).q_field(grid, (2, 1))
-    assert field.q[0, 1, 1] == pytest.approx(-1)
+    assert planner.network.certificate(MoveRule.ROBOT_SAFE).proved
+    assert planner.network.move_costs(grid, MoveRule.ROBOT_SAFE) is None  # of 1 + max(0, sum)
+    assert planner.q_field(grid, (2, 1)).q[0, 1, 1] == pytest.approx(-1)
 
 
 def test_the_cheapest_path_is_found_where_unknown_cells_are_the_cheapest() -> None:
-    shipped = Planner.load("any_map")
-    tensors = {name: tensor.copy() for name, tensor in shipped.network.tensors.items()}
-    tensors["prices.weight"][:, 18:27] *= 0.1
+    planner = priced("weight", np.s_[:, 18:27], lambda weights: 0.1 * weights)
     cost = np.full((7, 15), OCCUPIED - 1, np.int8)
     cost[5], cost[2:5, 0], cost[2:5, 14] = UNKNOWN, UNKNOWN, UNKNOWN
     grid = GridMap(np.zeros(cost.shape, np.bool_), cost=cost)
-    planner = Planner(AnyMapQNetwork(shipped.network.sizes, tensors), shipped.metadata)
     plan = planner.plan(grid, (0, 2), (14, 2))
-    whole = Planner(planner.network, shipped.metadata).q_field(grid, (14, 2))
+    whole = Planner(planner.network, planner.metadata).q_field(grid, (14, 2))
     assert whole.value[2, 0] > -27  # straight ahead it would be 42
     assert plan.cells == whole.rollout((0, 2)).cells
