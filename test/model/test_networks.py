@@ -165,7 +165,9 @@ def test_small_prices_of_other_cells_are_noise_and_others_count(
 def test_a_price_below_that_of_free_cells_is_no_sum_of_two_cells() -> None:
     planner = priced("bias", ..., lambda bias: bias - 0.05)
     grid = GridMap(np.zeros((3, 3), np.bool_), cost=np.full((3, 3), 1, np.int8))
-    assert planner.network.certificate(MoveRule.ROBOT_SAFE).proved
+    certificate = planner.network.certificate(MoveRule.ROBOT_SAFE)
+    assert certificate is not None
+    assert certificate.proved
     assert planner.network.move_costs(grid, MoveRule.ROBOT_SAFE) is None  # of 1 + max(0, sum)
     assert planner.q_field(grid, (2, 1)).q[0, 1, 1] == pytest.approx(-1)
 
