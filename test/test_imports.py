@@ -94,9 +94,9 @@ else:
 def test_compiling_is_announced_once_and_a_load_from_the_cache_is_not(tmp_path: Path) -> None:
     code = """if True:
         import numpy as np
-        from ddqn_planner.model.move_costs import patch_numbers
+        from ddqn_planner.model.move_costs import read_cells
         for kind in (bool, np.uint8):
-            patch_numbers(np.zeros((2, 2), kind))
+            read_cells(np.zeros((2, 2), kind), None)
     """
     for words in (f"ddqn_planner compiles its functions, once, and keeps them in {tmp_path}/", ""):
         said = run(code, NUMBA_CACHE_DIR=str(tmp_path)).stderr

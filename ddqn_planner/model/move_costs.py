@@ -61,7 +61,7 @@ class MoveCosts(NamedTuple):
             layers = [(name, getattr(grid, name)) for name in LAYERS]
             parts = {name: layer[seen].copy() for name, layer in layers if layer is not None}
             part = grid.with_layers(**parts)
-            of_part = self.on(part, patch_numbers(part.occupancy))
+            of_part = self.on(part)
             highest, least = max(after.highest, of_part.highest), min(after.least, of_part.least)
             after = after._replace(highest=highest, least=least)
             for name in ("patch", "value", "multiplier"):
@@ -73,13 +73,14 @@ class MoveCosts(NamedTuple):
                     after = after._replace(**{name: layer.ravel()})
         return after
 
-    def on(self, grid: GridMap, patch: NDArray[Any]) -> MoveCosts:
-        """Return the costs on a map, given its patches, with its directions and expected times."""
-        costs = self._replace(patch=patch, width=grid.width + 2)
-        if self.terms.size and grid.cost is not None:
-            value = cell_values(grid.occupancy, grid.cost)
-            lowest = int((value - np.uint8(1)).min())  # an unknown cell has a cost of 255 here
-            costs = costs._replace(value=value, least=float(self.low[min(lowest, OCCUPIED) + 1]))
+    def on(self, grid: GridMap, patch: NDArray[Any] | None = None) -> MoveCosts:
+        """Return the costs on a map, of these patches, with its directions and expected times."""
+        value, least = self.value, self.least
+        if patch is None:
+            cost = grid.cost if self.terms.size else None
+            patch, value, lowest = read_cells(grid.occupancy, cost)
+            least = float(self.low[lowest + 1]) if cost is not None else 1.0
+        costs = self._replace(patch=patch, value=value, width=grid.width + 2, least=least)
         if grid.forbidden is not None:
             forbidden = _with_border(grid.forbidden, 0).ravel()
             patch, table = _with_directions(patch, self.table, forbidden)
@@ -116,13 +117,6 @@ def _occurring(values: NDArray[np.uint8], occurs: NDArray[np.bool_]) -> None:
         occurs[value] = True
 
 
-def cell_values(occupancy: NDArray[np.bool_], cost: NDArray[np.int8]) -> NDArray[np.uint8]:
-    """Return the value of each cell, see `VALUES`: (C,) uint8."""
-    # The cost of an occupied cell is 0.
-    values = cost.view(np.uint8) + np.uint8(-UNKNOWN) + occupancy * np.uint8(OCCUPIED)
-    return _with_border(values, VALUES - 1).ravel()
-
-
 def _with_border(inside: NDArray[Any], value: int) -> NDArray[Any]:
     """Return an array with one more cell of a value on each side: `np.pad` takes 50 µs longer."""
     array = np.full((inside.shape[0] + 2, inside.shape[1] + 2), value, inside.dtype)
@@ -130,24 +124,45 @@ def _with_border(inside: NDArray[Any], value: int) -> NDArray[Any]:
     return array
 
 
-def patch_numbers(occupancy: NDArray[np.bool_]) -> NDArray[np.uint16]:
-    """Return each cell's patch: (C,) uint16, with bit 3 y + x where its cell (x, y) is occupied."""
+def read_cells(
+    occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None
+) -> tuple[NDArray[np.uint16], NDArray[np.uint8], int]:
+    """Return each cell's patch and, with costs, its value: (C,); and the least cost, unknown most.
+
+    A patch has bit 3 y + x where its cell (x, y) is occupied.
+    """
     occupied = _with_border(occupancy, 1).view(np.uint8)
-    numbers = np.full(occupied.shape, OUTSIDE, np.uint16)
-    _patch_numbers(occupied, numbers)
-    return numbers.ravel()
+    patch = np.full(occupied.shape, OUTSIDE, np.uint16)
+    value = np.full(occupied.shape if cost is not None else (0, 0), VALUES - 1, np.uint8)
+    of_cells = value if cost is None else cost.view(np.uint8)
+    lowest = _read_cells(occupied, of_cells, patch, value)
+    return patch.ravel(), value.ravel(), int(lowest)
 
 
 @in_place
-def _patch_numbers(occupied: NDArray[np.uint8], numbers: NDArray[np.uint16]) -> None:
-    """Write the number of each cell inside the border."""
-    for y in range(1, numbers.shape[0] - 1):
-        for x in range(1, numbers.shape[1] - 1):
+def _read_cells(
+    occupied: NDArray[np.uint8],
+    cost: NDArray[np.uint8],
+    patch: NDArray[np.uint16],
+    value: NDArray[np.uint8],
+) -> Any:
+    """Write patches and values of the cells inside the border; return the least cost."""
+    lowest, one, closed = np.uint8(OCCUPIED), np.uint8(1), np.uint8(OCCUPIED)
+    for y in range(1, patch.shape[0] - 1):
+        for x in range(1, patch.shape[1] - 1):
             below, here, above = occupied[y - 1], occupied[y], occupied[y + 1]
             bits = below[x - 1] + 2 * below[x] + 4 * below[x + 1]
             bits += 8 * here[x - 1] + 16 * here[x] + 32 * here[x + 1]
             bits += 64 * above[x - 1] + 128 * above[x] + 256 * above[x + 1]
-            numbers[y, x] = bits
+            patch[y, x] = bits
+        if value.size:
+            here, of_row, values = occupied[y], cost[y - 1], value[y]
+            for x in range(of_row.size):
+                # An unknown cell has a cost of 255 here, and an occupied one 0.
+                of_cell = np.uint8(of_row[x] + here[x + 1] * closed)
+                values[x + 1] = of_cell + one
+                lowest = of_cell if of_cell < lowest else lowest
+    return lowest
 
 
 def patches(occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None) -> NDArray[np.int8]:

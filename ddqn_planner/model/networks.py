@@ -18,7 +18,6 @@ from ddqn_planner.model.move_costs import (
     MoveCosts,
     every_patch,
     legal_in_patches,
-    patch_numbers,
     unique_patches,
 )
 
@@ -205,7 +204,7 @@ class PropagationQNetwork(QNetwork):
         timed = grid.slowness is not None
         with_costs = self.uses_costs and grid.cost is not None and not timed
         costs = self._proved(move_rule, with_costs, timed)
-        return costs and costs.on(grid, patch_numbers(grid.occupancy))
+        return costs and costs.on(grid)
 
     def _proved_costs(self, move_rule: MoveRule, with_costs: bool, timed: bool) -> MoveCosts | None:
         """Return the costs of moves without what depends on the map."""
@@ -222,10 +221,9 @@ class PropagationQNetwork(QNetwork):
         # A move counts as possible where p > 1/2, and is tried until it succeeds. The progress and
         # detour terms of the paper's reward (section 4.2) add up to a constant along a path.
         timed = grid.slowness is not None
+        patch_C, patch_P9 = None, every_patch()
         if self.uses_costs and grid.cost is not None and not timed:
             patch_C, patch_P9 = unique_patches(grid.occupancy, grid.cost)
-        else:
-            patch_C, patch_P9 = patch_numbers(grid.occupancy), every_patch()
         return MoveCosts.of_table(self._costs_of(patch_P9, move_rule, timed)).on(grid, patch_C)
 
     def _costs_of(self, patch_P9: NDArray[np.int8], move_rule: MoveRule, timed: bool) -> Array:

@@ -12,7 +12,7 @@ from torch_layers import in_torch, papers_layers, propagation_layers
 
 from ddqn_planner.grid import OCCUPIED, UNKNOWN, Cell, GridMap, MoveRule
 from ddqn_planner.model import AnyMapQNetwork, PropagationQNetwork, networks
-from ddqn_planner.model.move_costs import every_patch, patch_numbers, patches, unique_patches
+from ddqn_planner.model.move_costs import every_patch, patches, read_cells, unique_patches
 from ddqn_planner.model.networks import FREE, GOAL, OBSTACLE, ROBOT, observation_background
 from ddqn_planner.planning import Planner
 from ddqn_planner.planning.field import network_field
@@ -66,7 +66,7 @@ def test_a_patch_is_the_3x3_cells_and_outside_is_occupied(place: Place) -> None:
         found = patches(grid.occupancy, cost)
         for (y, x), patch in zip(np.ndindex(cells.shape), found, strict=True):
             np.testing.assert_array_equal(patch.reshape(3, 3), padded[y : y + 3, x : x + 3])
-        patch_C, unique = patch_numbers(grid.occupancy), every_patch()
+        patch_C, unique = read_cells(grid.occupancy, None)[0], every_patch()
         if cost is not None:
             patch_C, unique = unique_patches(grid.occupancy, cost)
         inside = np.pad(np.ones(cells.shape, bool), 1).ravel()
