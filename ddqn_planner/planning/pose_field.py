@@ -153,7 +153,7 @@ class PoseField:
         self.grid, self.world, self.way, self.visits = grid, world, None, 0
         touched, is_near = self.known.touched, np.zeros(world.tile.shape, np.bool_)
         far = self.body.reach // TILE + 1
-        for x, y in np.unique(cells // TILE, axis=0).tolist():
+        for x, y in set(zip(*(cells // TILE).T.tolist(), strict=True)):
             is_near[max(y - far, 0) : y + far + 1, max(x - far, 0) : x + far + 1] = True
         near, tiles = np.flatnonzero(is_near.ravel() & touched), np.flatnonzero(touched)
         cost = self._cost()
