@@ -53,6 +53,17 @@ def in_place(function: Function) -> Function:
     return compiled(function, _nrt=False)
 
 
+def inner(function: Function, **options: Any) -> Function:
+    """Let compiled functions call a function without its entry for Python, so they compile sooner.
+
+    For tuples of many arrays that entry is most of the code.
+    """
+    with_entry = compiled(function, **options)
+    without = compiled(function, no_cpython_wrapper=True, **options)
+    with_entry.dispatcher = without.dispatcher  # type: ignore[attr-defined]
+    return with_entry
+
+
 def inlined(function: Function) -> Function:
     """Let functions which are `in_place` call a function compiled; Python calls it as it is."""
     options = {"_nrt": False, "forceinline": True, "no_cpython_wrapper": True}

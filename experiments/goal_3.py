@@ -106,20 +106,22 @@ def train_supervised(training: Training) -> None:
     tensors = trainer.network.tensors
     zeros = ({name: np.zeros_like(t) for name, t in tensors.items()} for _ in range(3))
     parts = [tensors, *zeros]
-    network, gradient, mean, square = networks_of(trainer.environment, parts, SUPERVISED_BATCH)
+    windows, networks = networks_of(trainer.environment, parts, SUPERVISED_BATCH)
+    network, gradient, *_ = networks
+    moved = [each.weights for each in networks]
     steps = training.parameters.steps
     for number in range(steps):
         drawn = random.integers(len(cell), size=SUPERVISED_BATCH)
-        look(network)
-        evaluate(network, scenario[drawn], cell[drawn])
+        look(network, windows)
+        evaluate(network, windows, scenario[drawn], cell[drawn])
         # -log of the probability that softmax(Q) gives to the best moves, and its gradient by Q
         best_BA = best_SCA[scenario[drawn], cell[drawn]]
         gradient.q[:] = softmax(network.q, axis=1)
         gradient.q[:] -= softmax(np.where(best_BA, network.q, -np.inf), axis=1)
         gradient.q[:] /= SUPERVISED_BATCH
-        differentiate(network, gradient, SUPERVISED_BATCH)
+        differentiate(network, windows, gradient, SUPERVISED_BATCH)
         rate = SUPERVISED_LEARNING_RATE * (1 - 0.95 * number / steps)
-        adam(network, gradient, mean, square, rate, number + 1)
+        adam(*moved, rate, number + 1)
     write_atomically(path, trainer.model_bytes())
 
 

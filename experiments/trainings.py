@@ -21,7 +21,7 @@ from ddqn_planner.training.environment import GridVectorEnvironment, Scenario, p
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.propagation import value_iteration
 from ddqn_planner.training.run import TrainingRun
-from ddqn_planner.training.shared_background import evaluate, look, network_of, windows_of
+from ddqn_planner.training.shared_background import evaluate, look, network_of
 from ddqn_planner.training.trainer import Trainer
 
 SCENARIO: Final = paper_scenario()
@@ -201,19 +201,16 @@ def rollouts(planner: Planner, environment: GridVectorEnvironment) -> NDArray[np
         return np.array([[p.length if p.cells else np.nan for p in each] for each in plans])
     # All maps at once, and the paths' cells alone: whole fields take 10 to 20 times as long.
     maps, background = np.arange(len(environment.start)), environment.background
-    windows, of_model = (
-        windows_of(background.astype(np.float64), environment.shape),
-        planner.network,
-    )
+    of_model, exact = planner.network, background.astype(np.float64)
     tensors = [of_model.tensors[name] for name in of_model.shapes(of_model.sizes)]
-    network = network_of(tensors, windows, len(maps))
-    look(network)
+    windows, network = network_of(exact, environment.shape, tensors, len(maps))
+    look(network, windows)
     lengths = np.zeros((2, len(maps)))
     for length, is_masked in zip(lengths, (True, False), strict=True):
         cell, visited = environment.start.copy(), np.zeros(background.shape, np.bool_)
         while (on_way := np.isfinite(length) & (cell != environment.goal)).any():
             visited[maps, cell] = True
-            evaluate(network, maps, cell)
+            evaluate(network, windows, maps, cell)
             q, legal = network.q.astype(np.float32), environment.legal[maps, :, cell]
             action = np.where(legal | (not is_masked), q, -np.inf).argmax(axis=1)
             cell = np.where(on_way & legal[maps, action], environment.next_cell[action, cell], cell)

@@ -26,7 +26,9 @@ Integers = NDArray[np.int64]
 
 # Sums in any order, so that eight are added at once; NaN and infinity as ever.
 FLAGS = {"reassoc": True, "contract": True, "arcp": True, "nsz": True}  # a set has no fixed order
-compiled = partial(compiling.compiled, fastmath=FLAGS)
+compiled, inner = (partial(each, fastmath=FLAGS) for each in (compiling.compiled, compiling.inner))
+inner_in_place = partial(inner, _nrt=False)  # without counts of references, as it makes no array
+
 
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, np.float32(1e-8)  # Adam's, as torch has them
 LEAST = np.float32(1e-30)  # mean of a gradient: less moves no weight
@@ -41,13 +43,17 @@ Numbers: Any = namedtuple("Numbers", [*NUMBERS])  # type: ignore[misc]
 
 
 class Windows(NamedTuple):
-    """What the convolution sees of the maps without a robot."""
+    """What the convolution sees of the maps without a robot, and of B states."""
 
     common: Floats  # (L, 9): each window as most maps have it
     own: Floats  # (S, L, 9): as each map has it
     differing: Integers  # the windows of map 0 that are not the common ones, those of map 1, ...
     ends: Integers  # (S + 1,): those of map s are from ends[s] to before ends[s + 1]
     shape: tuple[int, int]  # (H, W)
+    patch: Floats  # (B * D, 9): each state's windows that are not the common ones
+    changed: Integers  # (B * D,): which they are
+    first: Integers  # (B + 1,): those of state n are from first[n] to before first[n + 1]
+    before: Floats  # (B * D, F): their convolution before ReLU by the network that was asked last
 
 
 class Network(NamedTuple):
@@ -62,13 +68,8 @@ class Network(NamedTuple):
     last_bias: Floats
     after: Floats  # (L, F): the convolution after ReLU
     output: Floats  # (U,): of the layer after the convolution
-    patch: Floats  # (B * D, 9): each state's windows that are not the common ones
-    changed: Integers  # (B * D,): which they are
-    first: Integers  # (B + 1,): those of state n are from first[n] to before first[n + 1]
-    own_before: Floats  # (B * D, F): their convolution before ReLU
     own_output: Floats  # (B, U): of the layer after it
     q: Floats  # (B, 8)
-    windows: Windows
     eight: tuple[int, ...]  # of 8 zeros where U is 8: a known number of turns is twice as fast
 
 
@@ -77,66 +78,91 @@ def arrays_of(
 ) -> tuple[Any, Any, Any]:
     """Return what `play` takes of a training: its game, what it learns, and its robots."""
     e, p = environment, environment.parameters
-    online, target, mean, square = parts
-    gradient = {name: np.zeros_like(tensor) for name, tensor in online.items()}
-    all_parts = online, target, gradient, mean, square
-    networks = networks_of(environment, all_parts, max(p.batch_size, p.environments))
+    gradient = {name: np.zeros_like(tensor) for name, tensor in parts[0].items()}
+    all_parts, most = (*parts[:2], gradient, *parts[2:]), max(p.batch_size, p.environments)
+    windows, (*networks, mean, square) = networks_of(e, all_parts, most)
     kind = ("double_dqn", "dqn", "printed").index(p.target)
     numbers = Numbers(*(as_number(getattr(p, name)) for name, as_number in NUMBERS.items()))
-    robots = e.scenario, e.cell, e.steps, e.visited, e.total_reward, e.terminated, e.truncated
+    drawn, actions = ReplayBuffer(p.batch_size).transitions, np.zeros_like(e.cell)
+    learning = numbers, kind, windows, *networks, mean.weights, square.weights, drawn
+    robots = e.cell, actions, e.steps, e.visited, e.total_reward, e.terminated, e.truncated
     game = e.legal, e.rewards, e.next_cell, e.goal
-    return game, (numbers, kind, networks, replay.transitions), robots
+    return game, (*learning, replay.transitions), (e.scenario, *robots)
 
 
 def networks_of(
     environment: GridVectorEnvironment, parts: Iterable[Tensors], batch: int
-) -> tuple[Network, ...]:
+) -> tuple[Windows, tuple[Network, ...]]:
     """Return networks of the paper's tensors, which from now on are parts of them."""
-    windows = windows_of(environment.background, environment.shape)
     networks = []
     for tensors in parts:
-        network: Any = network_of([*tensors.values()], windows, batch)
-        for (name, tensor), array in zip(tensors.items(), network[1:], strict=False):
+        given = environment.background, environment.shape, [*tensors.values()], batch
+        windows, network = network_of(*given)
+        for (name, tensor), array in zip(tensors.items(), network[1:7], strict=False):
             tensors[name] = array.T.reshape(tensor.shape)
         networks.append(network)
-    return tuple(networks)
+    return windows, tuple(networks)
 
 
-def windows_of(background_SC: Floats, shape: tuple[int, int]) -> Windows:
-    """Cut backgrounds of maps of shape (H, W) into windows."""
-    cut_L9 = window_cells(shape)
+def network_of(
+    background_SC: Floats, shape: tuple[int, int], tensors: Sequence[Floats], batch: int
+) -> tuple[Windows, Network]:
+    """Cut backgrounds of maps into windows, and copy a model's tensors, for B states.
+
+    The network computes as exactly as the backgrounds tell.
+    """
+    cut_L9, zeros = window_cells(shape), partial(np.zeros, dtype=background_SC.dtype)
     background_SC = np.pad(background_SC, [(0, 0), (0, 1)])  # 0 outside the map
     own = background_SC[:, cut_L9]
     common = np.sort(background_SC, axis=0)[len(own) // 2][cut_L9]
     scenario, differing = np.nonzero((own != common).any(axis=2))
     ends = np.searchsorted(scenario, np.arange(len(own) + 1))
-    return Windows(common, own, differing, ends, shape)
-
-
-def network_of(tensors: Sequence[Floats], windows: Windows, batch: int) -> Network:
-    """Return a network for B states with a copy of a model's tensors, as exact as the windows."""
+    rows, filters = batch * (4 + int(np.diff(ends).max())), len(tensors[0])
+    numbers = np.zeros(rows, np.int64), np.zeros(batch + 1, np.int64)
+    seen = zeros((rows, 9)), *numbers, zeros((rows, filters))
     turned = [t.T if t.ndim < 3 else t.reshape(-1, 9).T for t in tensors]
     turned += [np.zeros((0, 8)), np.zeros(0)][: 6 - len(turned)]
-    zeros: Any = partial(np.zeros, dtype=windows.own.dtype)
-    weights = np.concatenate([array.ravel() for array in turned], dtype=windows.own.dtype)
-    ends = np.cumsum([array.size for array in turned])[:-1]
-    parts = [p.reshape(t.shape) for p, t in zip(np.split(weights, ends), turned, strict=True)]
-    of_all = len(windows.common), len(tensors[0])
-    units, rows = len(tensors[3]), batch * (4 + int(np.diff(windows.ends).max()))
-    common = zeros(of_all), zeros(units), zeros((rows, 9))
-    numbers = np.zeros(rows, np.int64), np.zeros(batch + 1, np.int64)
-    own = zeros((rows, of_all[1])), zeros((batch, units))
-    q, eight = (zeros((batch, 8)), ()) if len(tensors) > 4 else (own[1], (0,) * 8)
-    return Network._make([weights, *parts, *common, *numbers, *own, q, windows, eight])
+    weights = np.concatenate([array.ravel() for array in turned], dtype=own.dtype)
+    parts = np.split(weights, np.cumsum([array.size for array in turned])[:-1])
+    layers: Any = [part.reshape(t.shape) for part, t in zip(parts, turned, strict=True)]
+    units = len(tensors[3])
+    own_output = zeros((batch, units))
+    q, eight = (zeros((batch, 8)), ()) if len(tensors) > 4 else (own_output, (0,) * 8)
+    of_all = zeros((len(common), filters)), zeros(units)
+    network = Network._make([weights, *layers, *of_all, own_output, q, eight])
+    return Windows(common, own, differing, ends, shape, *seen), network
 
 
-@compiled
-def look(network: Any) -> None:
+@inner_in_place
+def put(values: Any, array: Any) -> None:
+    """Copy values into an array (N,)."""
+    for n in range(array.size):
+        array[n] = values[n]
+
+
+@inner_in_place
+def add(values: Any, array: Any) -> None:
+    """Add values to an array (N,)."""
+    for n in range(array.size):
+        array[n] += values[n]
+
+
+@inner_in_place
+def greatest(values: Any) -> int:
+    """Return the first action of the greatest value (8,)."""
+    best = 0
+    for action in range(1, values.size):
+        best = action if values[action] > values[best] else best
+    return best
+
+
+@inner_in_place
+def look(network: Any, windows: Any) -> None:
     """Compute what a network makes of the common windows."""
     layer, after, output = network.layer, network.after, network.output
     count, filters = after.shape
-    convolve(network.kernel, network.kernel_bias, network.windows.common, count, after)
-    output[:] = network.layer_bias
+    convolve(network.kernel, network.kernel_bias, windows.common, count, after)
+    put(network.layer_bias, output)
     for f in range(filters):
         for window in range(count):
             feature = after[window, f] = max(after[window, f], np.float32(0))
@@ -145,7 +171,7 @@ def look(network: Any) -> None:
                     output[u] += feature * layer[f * count + window, u]
 
 
-@compiled
+@inner_in_place
 def convolve(kernel: Any, bias: Any, patch: Any, count: int, before: Any) -> None:
     """Compute the convolution of so many windows."""
     for row in range(count):
@@ -158,18 +184,18 @@ def convolve(kernel: Any, bias: Any, patch: Any, count: int, before: Any) -> Non
                     before[row, f] += seen * kernel[at, f]
 
 
-@compiled
-def evaluate(network: Any, scenario: Any, cell: Any) -> None:
+@inner_in_place
+def evaluate(network: Any, windows: Any, scenario: Any, cell: Any) -> None:
     """Compute Q of robots in cells (B,) of maps (B,)."""
-    see(network, scenario, cell)
+    see(windows, scenario, cell)
     layer, last, output, q = network.layer, network.last, network.own_output, network.q
-    first, after, before = network.first, network.after, network.own_before
+    first, changed, after, before = windows.first, windows.changed, network.after, windows.before
     (count, filters), units = after.shape, network.output.size
-    convolve(network.kernel, network.kernel_bias, network.patch, first[cell.size], before)
+    convolve(network.kernel, network.kernel_bias, windows.patch, first[cell.size], before)
     for n in range(cell.size):
-        output[n] = network.output
+        put(network.output, output[n])
         for row in range(first[n], first[n + 1]):
-            window, seen = network.changed[row], np.float32(0)
+            window, seen = changed[row], np.float32(0)
             for f in range(filters):
                 seen += abs(max(before[row, f], np.float32(0)) - after[window, f])
             for f in range(filters if seen != 0 else 0):
@@ -178,16 +204,17 @@ def evaluate(network: Any, scenario: Any, cell: Any) -> None:
                     for u in range(len(network.eight) or units):
                         output[n, u] += change * layer[f * count + window, u]
         if not len(network.eight):
-            q[n] = network.last_bias
+            put(network.last_bias, q[n])
             for u in range(units):
                 for action in range(8 if output[n, u] > 0 else 0):  # most are not
                     q[n, action] += output[n, u] * last[u, action]
 
 
-@compiled
-def see(network: Any, scenario: Any, cell: Any) -> None:
+@inner_in_place
+def see(windows: Any, scenario: Any, cell: Any) -> None:
     """Cut the windows that are not the common ones of maps (B,) with robots in cells (B,)."""
-    windows, changed, patch, first = network.windows, network.changed, network.patch, network.first
+    changed, patch, first = windows.changed, windows.patch, windows.first
+    differing, ends = windows.differing, windows.ends
     own, (height, width), end = windows.own, windows.shape, 0
     for n in range(cell.size):
         y, x = divmod(cell[n], width)
@@ -199,8 +226,8 @@ def see(network: Any, scenario: Any, cell: Any) -> None:
                 patch[end, 3 * (y + 1 - 2 * row) + x + 1 - 2 * column] = ROBOT
                 end += 1
         with_robot = end
-        for number in range(windows.ends[scenario[n]], windows.ends[scenario[n] + 1]):
-            window, is_new = windows.differing[number], True
+        for number in range(ends[scenario[n]], ends[scenario[n] + 1]):
+            window, is_new = differing[number], True
             for other in range(first[n], with_robot):
                 is_new &= changed[other] != window
             if is_new:
@@ -218,24 +245,22 @@ def play(game: Any, learning: Any, robots: Any, random: Any, counters: Any, unti
     The counters are steps, updates and replayed transitions.
     """
     legal, rewards, next_cell, goal = game
-    numbers, _, networks, replay = learning
-    scenario, cell, episode_steps, visited, total_reward, terminated, truncated = robots
+    numbers, _, windows, online, target, _, _, _, _, replay = learning
+    scenario, cell, actions, episode_steps, visited, total_reward, terminated, truncated = robots
     exploration, sampling = random
-    online, target = networks[:2]
-    look(online)
-    look(target)
+    look(online, windows)
+    look(target, windows)
     count, is_over = cell.size, False
-    actions = np.empty(count, np.int64)
     until = min(until, counters[0] + count * max(1, WINDOWS // len(online.after)))
     while counters[0] < until and not is_over:
         share = min(counters[0] / numbers.epsilon_steps, 1.0)
         epsilon = numbers.epsilon_start + share * (numbers.epsilon_end - numbers.epsilon_start)
         for n in range(count):
             actions[n] = exploration.integers(0, 8)
-        evaluate(online, scenario, cell)
+        evaluate(online, windows, scenario, cell)
         for n in range(count):
             if exploration.random() >= epsilon:
-                actions[n] = online.q[n].argmax()
+                actions[n] = greatest(online.q[n])
         for n in range(count):
             at = scenario[n], actions[n], cell[n]
             after = next_cell[actions[n], cell[n]] if legal[at] else cell[n]
@@ -256,58 +281,59 @@ def play(game: Any, learning: Any, robots: Any, random: Any, counters: Any, unti
             update(learning, sampling, counters)
 
 
-@compiled
+@inner
 def update(learning: Any, sampling: Any, counters: Any) -> None:
     """Make one Double DQN update with a batch from the replay buffer, see `double_dqn_gradient`."""
-    numbers, kind, (online, target, gradient, mean, square), replay = learning
-    slots = np.empty(numbers.batch_size, np.int64)
-    for n in range(slots.size):
-        slots[n] = sampling.integers(0, min(counters[2], replay.cell.size))
-    scenario, next_cell = replay.scenario[slots], replay.next_cell[slots]
-    evaluate(online, scenario, next_cell)
-    evaluate(target, scenario, next_cell)
-    y = replay.reward[slots]
-    for n in range(slots.size):
-        best = (target.q if kind == DQN else online.q)[n].argmax()
-        next_q = (online.q if kind == PRINTED else target.q)[n, best]
-        y[n] += replay.discount[slots[n]] * next_q
-    evaluate(online, scenario, replay.cell[slots])
+    numbers, kind, windows, online, target, gradient, mean, square, batch, replay = learning
+    size = batch.cell.size
+    for n in range(size):
+        slot = sampling.integers(0, min(counters[2], replay.cell.size))
+        batch.scenario[n], batch.cell[n] = replay.scenario[slot], replay.cell[slot]
+        batch.action[n], batch.next_cell[n] = replay.action[slot], replay.next_cell[slot]
+        batch.reward[n], batch.discount[n] = replay.reward[slot], replay.discount[slot]
+    evaluate(online, windows, batch.scenario, batch.next_cell)
+    evaluate(target, windows, batch.scenario, batch.next_cell)
+    for n in range(size):
+        best = greatest(target.q[n] if kind == DQN else online.q[n])
+        next_q = online.q[n, best] if kind == PRINTED else target.q[n, best]
+        batch.reward[n] += batch.discount[n] * next_q  # the target y
+    evaluate(online, windows, batch.scenario, batch.cell)
     gradient.q[:] = 0
-    for n in range(slots.size):
-        action = replay.action[slots[n]]
-        gradient.q[n, action] = 2 * (online.q[n, action] - y[n]) / slots.size
-    differentiate(online, gradient, slots.size)
+    for n in range(size):
+        action = batch.action[n]
+        gradient.q[n, action] = 2 * (online.q[n, action] - batch.reward[n]) / size
+    differentiate(online, windows, gradient, size)
     counters[1] += 1
-    adam(online, gradient, mean, square, numbers.learning_rate, counters[1])
-    look(online)
+    adam(online.weights, gradient.weights, mean, square, numbers.learning_rate, counters[1])
+    look(online, windows)
     if counters[1] % numbers.target_interval == 0:
-        target.weights[:] = online.weights
-        look(target)
+        put(online.weights, target.weights)
+        look(target, windows)
 
 
-@compiled
-def differentiate(network: Any, gradient: Any, count: int) -> None:
+@inner_in_place
+def differentiate(network: Any, windows: Any, gradient: Any, count: int) -> None:
     """Add to a loss's gradients, given that by Q of the states that a network has seen."""
     layer, layer_gradient, error = network.layer, gradient.layer, gradient.own_output
-    after, before, own_before = network.after, gradient.after, gradient.own_before
+    # Where the convolution of a state's windows is read, its gradient is written.
+    after, before, own_before = network.after, gradient.after, windows.before
     gradient.output[:] = 0
     before[:] = 0  # by what is before ReLU
-    (windows, filters), units = after.shape, network.output.size
+    (total, filters), units = after.shape, network.output.size
     for n in range(count):
         if not len(network.eight):
-            gradient.last_bias[:] += gradient.q[n]
+            add(gradient.q[n], gradient.last_bias)
             for u in range(units):
                 output, error[n, u] = max(network.own_output[n, u], np.float32(0)), 0
                 for action in range(8 if output > 0 else 0):
                     gradient.last[u, action] += gradient.q[n, action] * output
                     error[n, u] += gradient.q[n, action] * network.last[u, action]
-        for u in range(units):
-            gradient.output[u] += error[n, u]
-        for row in range(network.first[n], network.first[n + 1]):
-            window = network.changed[row]
+        add(error[n], gradient.output)
+        for row in range(windows.first[n], windows.first[n + 1]):
+            window = windows.changed[row]
             for f in range(filters):
-                feature, through = max(network.own_before[row, f], np.float32(0)), np.float32(0)
-                change, number = feature - after[window, f], f * windows + window
+                feature, through = max(own_before[row, f], np.float32(0)), np.float32(0)
+                change, number = feature - after[window, f], f * total + window
                 if feature != 0 or change != 0:  # most features are 0, with the robot and without
                     for u in range(len(network.eight) or units):
                         layer_gradient[number, u] += change * error[n, u]
@@ -315,20 +341,20 @@ def differentiate(network: Any, gradient: Any, count: int) -> None:
                     if after[window, f] > 0:
                         before[window, f] -= through
                 own_before[row, f] = through if feature > 0 else np.float32(0)
-    for window in range(windows):
+    for window in range(total):
         for f in range(filters):
-            feature, number = after[window, f], f * windows + window
+            feature, number = after[window, f], f * total + window
             if feature > 0:
                 for u in range(len(network.eight) or units):
                     layer_gradient[number, u] += feature * gradient.output[u]
                     before[window, f] += layer[number, u] * gradient.output[u]
-    gradient.layer_bias[:] += gradient.output
-    add_kernel(gradient.kernel, gradient.kernel_bias, network.windows.common, windows, before)
-    rows = network.first[count]
-    add_kernel(gradient.kernel, gradient.kernel_bias, network.patch, rows, own_before)
+    add(gradient.output, gradient.layer_bias)
+    add_kernel(gradient.kernel, gradient.kernel_bias, windows.common, total, before)
+    rows = windows.first[count]
+    add_kernel(gradient.kernel, gradient.kernel_bias, windows.patch, rows, own_before)
 
 
-@compiled
+@inner_in_place
 def add_kernel(kernel: Any, bias: Any, patch: Any, count: int, before: Any) -> None:
     """Add to the gradients of kernel and bias, given that of the convolution of windows."""
     for row in range(count):
@@ -341,13 +367,12 @@ def add_kernel(kernel: Any, bias: Any, patch: Any, count: int, before: Any) -> N
                     kernel[at, f] += seen * before[row, f]
 
 
-@compiled
-def adam(online: Any, gradient: Any, mean: Any, square: Any, rate: float, updates: int) -> None:
+@inner_in_place
+def adam(weights: Any, slopes: Any, means: Any, squares: Any, rate: float, updates: int) -> None:
     """Take Adam's step number `updates` (Kingma and Ba 2015, with torch's place of epsilon)."""
     step = np.float32(rate / (1 - BETA_1**updates))
     root = np.float32(1 / np.sqrt(1 - BETA_2**updates))
     one, two = np.float32(1 - BETA_1), np.float32(1 - BETA_2)
-    weights, slopes, means, squares = online.weights, gradient.weights, mean.weights, square.weights
     for number in range(weights.size):
         slope, average = slopes[number], means[number]
         average += one * (slope - average)

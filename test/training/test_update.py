@@ -187,18 +187,19 @@ def test_weights_whose_gradients_fade_move_as_those_of_torch(small: Scenario) ->
     trainer = Trainer([small], MoveRule.ROBOT_SAFE, parameters, seed=2)
     zeros = ({name: 0 * t for name, t in trainer.network.tensors.items()} for _ in range(3))
     parts = trainer.network.tensors, *zeros
-    online, gradient, *moments = networks_of(trainer.environment, parts, batch=1)
+    windows, (online, gradient, *moments) = networks_of(trainer.environment, parts, batch=1)
+    moved = [each.weights for each in (online, gradient, *moments)]
     weight = torch.tensor(online.weights)
     optimiser = torch.optim.Adam([weight], 0.01)
     for update in range(1, 701):
         if update in (1, 700):  # until the last one, Adam's mean of the first fades to 0
-            look(online)
-            evaluate(online, np.array([0]), np.array([0]))
+            look(online, windows)
+            evaluate(online, windows, np.array([0]), np.array([0]))
             gradient.q[0] = 1
-            differentiate(online, gradient, 1)
+            differentiate(online, windows, gradient, 1)
         weight.grad = torch.tensor(gradient.weights)
         optimiser.step()
-        adam(online, gradient, *moments, 0.01, update)
+        adam(*moved, 0.01, update)
         assert not gradient.weights.any()
     torch.testing.assert_close(torch.tensor(online.weights), weight)
 
