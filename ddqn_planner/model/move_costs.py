@@ -132,35 +132,32 @@ def read_cells(
     A patch has bit 3 y + x where its cell (x, y) is occupied.
     """
     occupied = _with_border(occupancy, 1).view(np.uint8)
+    occupied.flags.writeable = False  # as costs are: numba compiles once for both
     patch = np.full(occupied.shape, OUTSIDE, np.uint16)
-    value = np.full(occupied.shape if cost is not None else (0, 0), VALUES - 1, np.uint8)
-    of_cells = value if cost is None else cost.view(np.uint8)
-    lowest = _read_cells(occupied, of_cells, patch, value)
+    if cost is None:
+        _read_cells(occupied, occupied, patch, patch.view(np.uint8), False)
+        return patch.ravel(), np.empty(0, np.uint8), OCCUPIED
+    value = np.full(occupied.shape, VALUES - 1, np.uint8)
+    lowest = _read_cells(occupied, cost.view(np.uint8), patch, value, True)
     return patch.ravel(), value.ravel(), int(lowest)
 
 
 @in_place
-def _read_cells(
-    occupied: NDArray[np.uint8],
-    cost: NDArray[np.uint8],
-    patch: NDArray[np.uint16],
-    value: NDArray[np.uint8],
-) -> Any:
+def _read_cells(occupied: Any, cost: Any, patch: Any, value: Any, has_costs: bool) -> Any:
     """Write patches and values of the cells inside the border; return the least cost."""
     lowest, one, closed = np.uint8(OCCUPIED), np.uint8(1), np.uint8(OCCUPIED)
     for y in range(1, patch.shape[0] - 1):
+        below, here, above = occupied[y - 1], occupied[y], occupied[y + 1]
+        costs, values = cost[y - 1], value[y]
         for x in range(1, patch.shape[1] - 1):
-            below, here, above = occupied[y - 1], occupied[y], occupied[y + 1]
             bits = below[x - 1] + 2 * below[x] + 4 * below[x + 1]
             bits += 8 * here[x - 1] + 16 * here[x] + 32 * here[x + 1]
             bits += 64 * above[x - 1] + 128 * above[x] + 256 * above[x + 1]
             patch[y, x] = bits
-        if value.size:
-            here, of_row, values = occupied[y], cost[y - 1], value[y]
-            for x in range(of_row.size):
+            if has_costs:
                 # An unknown cell has a cost of 255 here, and an occupied one 0.
-                of_cell = np.uint8(of_row[x] + here[x + 1] * closed)
-                values[x + 1] = of_cell + one
+                of_cell = np.uint8(costs[x - 1] + here[x] * closed)
+                values[x] = of_cell + one
                 lowest = of_cell if of_cell < lowest else lowest
     return lowest
 
