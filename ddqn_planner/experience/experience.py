@@ -33,7 +33,8 @@ EXPERIENCE = "experience.npz"  # the name of the file in a folder
 OPTIONS = ("nominal_speed", "robot_width", "half_life", "max_pause")
 
 LATEST = 1e12  # seconds of a clock: a pose of a later time is not believed
-WINDOW = 0.25  # metres at nominal speed, in whose time poses are averaged
+WINDOW, LONGEST_WINDOW = 0.125, 0.3  # metres at nominal speed, in whose time poses are averaged:
+LEFT_NOISE = 0.015  # metres that may be left of the noise of poses, or else it hides slowness
 STAND_DISTANCE = 0.1  # metres within which a robot stands
 STAND = 1.5  # metres at nominal speed: a robot that drives needs less time to leave a place
 FAST_STEP = 0.1  # of the log speed, by which the fastest move that a map knows of becomes faster
@@ -132,13 +133,14 @@ class Experience:
     def _measured(self, time: Float64, position: Float64) -> Visits:
         """Return the visits of a drive."""
         speed, side = self.learned_speed, self.evidence.side
-        seconds, at = averaged(time, position, WINDOW / speed)
+        window = _window(time, position, speed)
+        seconds, at = averaged(time, position, window)
         speeds = np.hypot(*np.diff(at, axis=0).T) / np.abs(np.diff(seconds))
         usual = float(np.median(speeds)) if len(speeds) else 0.0
         max_speed, step = 3 * max(self.nominal_speed, speed, usual), max(side, WINDOW) / 2
         steps, waits = [np.zeros((0, 3))], [np.zeros((0, 3))]
         for part in _believed_parts(time, position, max_speed, self.max_pause):
-            seconds, at = averaged(time[part], position[part], WINDOW / speed)
+            seconds, at = averaged(time[part], position[part], window)
             # Standing at the ends of a drive is no waiting on the way.
             way = np.array(ways(at, STAND_DISTANCE)[1:], dtype=np.int64)
             if not len(way):
@@ -367,6 +369,17 @@ def _believed_parts(
         if end - first > 1 and math.dist(position[first], position[last]) <= way:
             last = end - 1
             yield slice(first, end)
+
+
+def _window(time: Float64, position: Float64, speed: float) -> float:
+    """Return in how many seconds poses are averaged: longer if they have more noise."""
+    bends = np.hypot(*np.diff(position, 2, axis=0).T)
+    if not len(bends):
+        return WINDOW / speed
+    # The median length of second differences of normal noise is 2.88 times its deviation.
+    count = (float(np.median(bends)) / 2.88 / LEFT_NOISE) ** 2
+    least = count * float(np.median(np.abs(np.diff(time)))) * speed
+    return min(max(least, WINDOW), LONGEST_WINDOW) / speed
 
 
 def averaged(time: Float64, position: Float64, window: float) -> tuple[Float64, Float64]:
