@@ -33,7 +33,7 @@ EXPERIENCE = "experience.npz"  # the name of the file in a folder
 OPTIONS = ("nominal_speed", "robot_width", "half_life", "max_pause")
 
 LATEST = 1e12  # seconds of a clock: a pose of a later time is not believed
-WINDOW, LONGEST_WINDOW = 0.125, 0.3  # metres at nominal speed, in whose time poses are averaged:
+WINDOW, LONGEST_WINDOW = 0.15, 0.3  # metres at nominal speed, in whose time poses are averaged:
 LEFT_NOISE = 0.015  # metres that may be left of the noise of poses, or else it hides slowness
 STAND_DISTANCE = 0.1  # metres within which a robot stands
 STAND = 1.5  # metres at nominal speed: a robot that drives needs less time to leave a place
