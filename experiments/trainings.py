@@ -21,7 +21,7 @@ from ddqn_planner.training.environment import GridVectorEnvironment, Scenario, p
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.propagation import value_iteration
 from ddqn_planner.training.run import TrainingRun
-from ddqn_planner.training.shared_background import evaluate, look, network_of
+from ddqn_planner.training.shared_background import evaluate, look, network_of, windows_of
 from ddqn_planner.training.trainer import Trainer
 
 SCENARIO: Final = paper_scenario()
@@ -203,7 +203,8 @@ def rollouts(planner: Planner, environment: GridVectorEnvironment) -> NDArray[np
     maps, background = np.arange(len(environment.start)), environment.background
     of_model, exact = planner.network, background.astype(np.float64)
     tensors = [of_model.tensors[name] for name in of_model.shapes(of_model.sizes)]
-    windows, network = network_of(exact, environment.shape, tensors, len(maps))
+    windows = windows_of(exact, environment.shape, len(tensors[0]), len(maps))
+    network = network_of(tensors, windows)
     look(network, windows)
     lengths = np.zeros((2, len(maps)))
     for length, is_masked in zip(lengths, (True, False), strict=True):

@@ -33,8 +33,8 @@ EXPERIENCE = "experience.npz"  # the name of the file in a folder
 OPTIONS = ("nominal_speed", "robot_width", "half_life", "max_pause")
 
 LATEST = 1e12  # seconds of a clock: a pose of a later time is not believed
-WINDOW, LONGEST_WINDOW = 0.15, 0.3  # metres at nominal speed, in whose time poses are averaged:
-LEFT_NOISE = 0.015  # metres that may be left of the noise of poses, or else it hides slowness
+WINDOW, LONGEST_WINDOW = 0.15, 0.3  # metres at nominal speed, in whose time poses are averaged
+LEFT_NOISE = 0.015  # metres: the deviation of these means; more would hide slowness
 STAND_DISTANCE = 0.1  # metres within which a robot stands
 STAND = 1.5  # metres at nominal speed: a robot that drives needs less time to leave a place
 FAST_STEP = 0.1  # of the log speed, by which the fastest move that a map knows of becomes faster

@@ -74,7 +74,7 @@ class MoveCosts(NamedTuple):
         return after
 
     def on(self, grid: GridMap, patch: NDArray[Any] | None = None) -> MoveCosts:
-        """Return the costs on a map, of these patches, with its directions and expected times."""
+        """Return the costs on a map, whose patches may be known, with all of its layers."""
         value, least = self.value, self.least
         if patch is None:
             cost = grid.cost if self.terms.size else None

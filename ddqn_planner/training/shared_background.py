@@ -29,7 +29,6 @@ FLAGS = {"reassoc": True, "contract": True, "arcp": True, "nsz": True}  # a set 
 compiled, inner = (partial(each, fastmath=FLAGS) for each in (compiling.compiled, compiling.inner))
 inner_in_place = partial(inner, _nrt=False)  # without counts of references, as it makes no array
 
-
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, np.float32(1e-8)  # Adam's, as torch has them
 LEAST = np.float32(1e-30)  # mean of a gradient: less moves no weight
 DQN, PRINTED = 1, 2  # other targets than Double DQN's
@@ -94,43 +93,44 @@ def networks_of(
     environment: GridVectorEnvironment, parts: Iterable[Tensors], batch: int
 ) -> tuple[Windows, tuple[Network, ...]]:
     """Return networks of the paper's tensors, which from now on are parts of them."""
-    networks = []
+    parts, networks = list(parts), []
+    filters = len(next(iter(parts[0].values())))
+    windows = windows_of(environment.background, environment.shape, filters, batch)
     for tensors in parts:
-        given = environment.background, environment.shape, [*tensors.values()], batch
-        windows, network = network_of(*given)
+        network = network_of([*tensors.values()], windows)
         for (name, tensor), array in zip(tensors.items(), network[1:7], strict=False):
             tensors[name] = array.T.reshape(tensor.shape)
         networks.append(network)
     return windows, tuple(networks)
 
 
-def network_of(
-    background_SC: Floats, shape: tuple[int, int], tensors: Sequence[Floats], batch: int
-) -> tuple[Windows, Network]:
-    """Cut backgrounds of maps into windows, and copy a model's tensors, for B states.
-
-    The network computes as exactly as the backgrounds tell.
-    """
+def windows_of(background_SC: Floats, shape: tuple[int, int], filters: int, batch: int) -> Windows:
+    """Cut backgrounds of maps of shape (H, W) into windows, with room for B states."""
     cut_L9, zeros = window_cells(shape), partial(np.zeros, dtype=background_SC.dtype)
     background_SC = np.pad(background_SC, [(0, 0), (0, 1)])  # 0 outside the map
     own = background_SC[:, cut_L9]
     common = np.sort(background_SC, axis=0)[len(own) // 2][cut_L9]
     scenario, differing = np.nonzero((own != common).any(axis=2))
     ends = np.searchsorted(scenario, np.arange(len(own) + 1))
-    rows, filters = batch * (4 + int(np.diff(ends).max())), len(tensors[0])
+    rows = batch * (4 + int(np.diff(ends).max()))
     numbers = np.zeros(rows, np.int64), np.zeros(batch + 1, np.int64)
     seen = zeros((rows, 9)), *numbers, zeros((rows, filters))
+    return Windows(common, own, differing, ends, shape, *seen)
+
+
+def network_of(tensors: Sequence[Floats], windows: Windows) -> Network:
+    """Return a network with a copy of a model's tensors, as exact as the windows."""
     turned = [t.T if t.ndim < 3 else t.reshape(-1, 9).T for t in tensors]
     turned += [np.zeros((0, 8)), np.zeros(0)][: 6 - len(turned)]
-    weights = np.concatenate([array.ravel() for array in turned], dtype=own.dtype)
+    zeros: Any = partial(np.zeros, dtype=windows.own.dtype)
+    weights = np.concatenate([array.ravel() for array in turned], dtype=windows.own.dtype)
     parts = np.split(weights, np.cumsum([array.size for array in turned])[:-1])
     layers: Any = [part.reshape(t.shape) for part, t in zip(parts, turned, strict=True)]
-    units = len(tensors[3])
+    batch, units = len(windows.first) - 1, len(tensors[3])
+    of_common = zeros((len(windows.common), len(tensors[0]))), zeros(units)
     own_output = zeros((batch, units))
     q, eight = (zeros((batch, 8)), ()) if len(tensors) > 4 else (own_output, (0,) * 8)
-    of_all = zeros((len(common), filters)), zeros(units)
-    network = Network._make([weights, *layers, *of_all, own_output, q, eight])
-    return Windows(common, own, differing, ends, shape, *seen), network
+    return Network._make([weights, *layers, *of_common, own_output, q, eight])
 
 
 @inner_in_place
