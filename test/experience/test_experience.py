@@ -94,13 +94,15 @@ def test_places_with_and_without_waits_count_as_faster_the_less_of_them_is_known
 ) -> None:
     seconds, positions = straight((2, 5), (12, 5), slowness)
     seconds[len(seconds) // 2 :] += waited
-    experience = driven((seconds, positions), straight((2, 6), (12, 5)))
+    experience = driven(*[(seconds, positions)] * 6, straight((2, 6.5), (12, 6.5)))
     maps = [experience.apply(HALL, explored) for explored in (0.0, share)]
     expected, hoped = (np.log(grid.slowness * grid.seconds_per_cell) for grid in maps)
-    uncertainty = experience.uncertainty(HALL)
-    unknown = uncertainty / uncertainty.max()
-    np.testing.assert_allclose(expected - hoped, math.log(1 + share) * unknown, atol=0.021)
-    assert at(HALL, unknown, 7, 5) < 0.7
+    hope = (expected - hoped) / math.log(1 + share)
+    of_a_step = 0.021 / math.log(1 + share)  # in which slowness is told
+    often, once, never = (at(HALL, hope, 7, y) for y in (5, 6.5, 9))
+    assert never == pytest.approx(1, abs=of_a_step)
+    assert 0.5 - of_a_step < once < 0.95 + of_a_step
+    assert often < 0.3 + of_a_step
 
 
 def test_waiting_counts_as_time_and_standing_before_a_drive_does_not() -> None:
