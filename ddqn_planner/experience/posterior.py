@@ -48,6 +48,7 @@ class Posterior:
         self.nearest = np.where(away <= 1.5 * self.size, self.place[y, x], -1)
         count = len(self.middle)
         self.links = _links_of(self.place, self.size, count)
+        self.linked = self.links.sum(axis=1)
         # The solution of linear equations: real, what was seen beyond what is expected; imaginary,
         # the share that is known.
         self.solution = np.zeros(count, dtype=np.complex128)
@@ -55,12 +56,12 @@ class Posterior:
         self.foretold = np.zeros(count)  # by the prior
         self.steps: Float64 | None = None
 
-    def deviation(self, seconds: Float64, places: NDArray[np.int32]) -> float:
+    def deviation(self, seconds: Float64, places: Int64) -> float:
         """Return the standard deviation of the log time of a way, by its seconds in places."""
         unknown = float(seconds @ self.unknown[places] / seconds.sum())
         return math.hypot(DRIVE_NOISE, UNSURE * unknown)
 
-    def places_at(self, position: Float64) -> NDArray[np.int32]:
+    def places_at(self, position: Float64) -> Int64:
         """Return the place of each position (N, 2), the nearest within a place's side, or -1."""
         cells, inside = cells_of(position, self.grid)
         x, y = cells.T
@@ -90,10 +91,9 @@ class Posterior:
         # The equations map the same error everywhere to its product with these, and greater errors
         # to greater residuals: residuals up to that product prove that no error is greater.
         most = (ACCURACY * (kappa + visits)) ** 2
-        diagonal = kappa + self.links.sum(axis=1) + visits
-        residual = right + self.links @ self.solution - diagonal * self.solution
+        diagonal = kappa + self.linked + visits
         links = self.links.indptr, self.links.indices, self.links.data
-        _relax(*links, diagonal, most, residual, self.solution)
+        _relax(*links, diagonal, most, right, self.solution)
         # Of each place: the share of its log slowness that was seen, that of its standard deviation
         # which is left, and expected seconds over those at nominal speed, with waits.
         self.known = np.clip(self.solution.imag, 0, 1)
@@ -142,7 +142,7 @@ class Posterior:
         return np.append(values, occupied).astype(np.float32).take(self.place, mode="wrap")
 
 
-def _places_of(grid: GridMap, size: int) -> tuple[NDArray[np.int32], Int64]:
+def _places_of(grid: GridMap, size: int) -> tuple[Int64, Int64]:
     """Return the place of each cell, and a cell (x, y) of each place, near its block's middle."""
     from scipy.ndimage import label
 
@@ -150,7 +150,7 @@ def _places_of(grid: GridMap, size: int) -> tuple[NDArray[np.int32], Int64]:
     rows, columns = (np.arange(cells) + np.arange(cells) // size for cells in grid.occupancy.shape)
     apart = np.zeros((rows[-1] + 1, columns[-1] + 1), dtype=np.bool_)
     apart[np.ix_(rows, columns)] = ~grid.occupancy
-    place = label(apart, output=np.int32)[0][np.ix_(rows, columns)] - 1
+    place = label(apart, output=np.int64)[0][np.ix_(rows, columns)] - 1
     y, x = np.nonzero(place >= 0)
     middle = (size - 1) / 2
     order = np.argsort(np.hypot(x % size - middle, y % size - middle), kind="stable")
@@ -158,7 +158,7 @@ def _places_of(grid: GridMap, size: int) -> tuple[NDArray[np.int32], Int64]:
     return place, cells[np.unique(place[y, x][order], return_index=True)[1]]
 
 
-def _links_of(place: NDArray[np.int32], size: int, count: int) -> Any:
+def _links_of(place: Int64, size: int, count: int) -> Any:
     """Return how strongly places are linked, by the share of a block's side that they have."""
     from scipy.sparse import csr_array
 
@@ -173,7 +173,11 @@ def _links_of(place: NDArray[np.int32], size: int, count: int) -> Any:
 @in_place
 def _relax(*arrays: Any) -> None:
     """Solve (diagonal - links) x = right by residuals, until the square of none is too great."""
-    begins, to, weights, diagonal, most, residual, x = arrays
+    begins, to, weights, diagonal, most, residual, x = arrays  # the residual is at first the right
+    for place in range(x.size):
+        residual[place] -= diagonal[place] * x[place]
+        for link in range(begins[place], begins[place + 1]):
+            residual[place] += weights[link] * x[to[link]]
     is_solved = False
     while not is_solved:
         is_solved = True

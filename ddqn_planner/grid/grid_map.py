@@ -281,9 +281,10 @@ class GridMap:
         return digest.hexdigest()[:16]
 
     @cached_property
-    def _occupied(self) -> int:
-        """How many cells are: other in most maps, and quicker than to compare them."""
-        return int(np.count_nonzero(self.occupancy))
+    def _sums(self) -> tuple[int, float]:
+        """Of occupied cells, and of some slowness: other in most maps, and quicker to compare."""
+        slowness = 0.0 if self.slowness is None else float(self.slowness[::16].sum())
+        return int(np.count_nonzero(self.occupancy)), slowness
 
     def same_cells(self, other: GridMap) -> bool:
         """Return whether all cells of two maps are equal, wherever the maps lie."""
@@ -291,7 +292,7 @@ class GridMap:
         boxes = self.patches_since(other)
         if boxes is not None:
             return not any(self.differs(other, box).any() for box in reversed(boxes))
-        if self._occupied != other._occupied:
+        if self._sums != other._sums:
             return False
         layers = ((getattr(self, name), getattr(other, name)) for name in LAYERS)
         return all(mine is its or np.array_equal(mine, its) for mine, its in layers)

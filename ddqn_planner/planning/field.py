@@ -185,8 +185,9 @@ class DistanceField(QField):
         # Moves of the cells around may differ, too, but there are none on the map's border.
         width, last = self.costs.width, self.costs.patch.size - self.costs.width - 1
         around = (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel()
-        changed = np.unique(self._number(cells.T)[:, None] + around).astype(np.int32)
-        changed = changed[(changed > width) & (changed < last)]
+        changed = (around[:, None] + self._number(cells.T)).astype(np.int32)
+        changed = np.sort(changed[(changed > width) & (changed < last)])
+        changed = changed[np.diff(changed, prepend=0) > 0]  # a fifth of the time of `np.unique`
         # For one start, repair and new field take turns, each time with four times the limit: the
         # quicker one wins. The older field then begins anew, or else stays as it is.
         most = max(REPAIRED, int(REPAIRED_SHARE * self.grid.occupancy.size))

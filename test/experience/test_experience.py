@@ -94,7 +94,7 @@ def test_places_with_and_without_waits_count_as_faster_the_less_of_them_is_known
 ) -> None:
     seconds, positions = straight((2, 5), (12, 5), slowness)
     seconds[len(seconds) // 2 :] += waited
-    experience = driven(*[(seconds, positions)] * 6, straight((2, 6.5), (12, 6.5)))
+    experience = driven(*[(seconds, positions)] * 12, straight((2, 6.5), (12, 6.5)))
     maps = [experience.apply(HALL, explored) for explored in (0.0, share)]
     expected, hoped = (np.log(grid.slowness * grid.seconds_per_cell) for grid in maps)
     hope = (expected - hoped) / math.log(1 + share)
