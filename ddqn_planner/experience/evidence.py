@@ -28,6 +28,7 @@ KNOWN = 0.7  # weight of visits from which a place is known
 
 PART, SURPRISE = 8, 3.5  # so many places have changed if they are off by more deviations
 USUAL = 4.0  # from bound to bound of drives' errors; where it is more, so is a surprise
+UNUSUAL, OF_DRIVES = 2.5, 0.95  # it is also more than so many times this quantile of the last ones
 PART_NOISE = 0.12  # of their mean log slowness, as each way through a place is another
 CHANGED = 0.01  # share of all evidence that is left then: where one place changed, others did
 
@@ -66,6 +67,7 @@ class Evidence:
         self.driven = 0.0
         self.table = np.zeros((0, len(COLUMNS)))
         self.errors: list[float] = []  # of the last drives' log times, in standard deviations
+        self.surprises: list[float] = []  # the greatest of each of the last drives, likewise
         self.posterior: Posterior | None = None  # over the last map
         self._fit()
 
@@ -94,16 +96,18 @@ class Evidence:
         """Return whether a part of a drive was other than all before."""
         weight, sum_of_log = self.table[rows, :2].T
         known = np.flatnonzero(weight >= KNOWN)
-        # Up a ramp a drive takes longer than down, and nothing has changed.
-        low, _, high = self.quantiles()
-        most = SURPRISE * max((high - low) / USUAL, 1)
+        found = [0.0]
         for part in np.array_split(known, max(1, len(known) // PART)):
             if len(part) >= PART / 2:
                 surprise = (log[part] - sum_of_log[part] / weight[part]).mean()
                 variance = NOISE * (1 + 1 / weight[part]).mean() / len(part) + PART_NOISE**2
-                if abs(surprise) > most * math.sqrt(variance):
-                    return True
-        return False
+                found.append(abs(float(surprise)) / math.sqrt(variance))
+        # Up a ramp each drive takes longer than down, and nothing has changed.
+        low, _, high = self.quantiles()
+        usual = UNUSUAL * float(np.quantile([*self.surprises, *[1.0] * ASSUMED], OF_DRIVES))
+        if len(found) > 1:
+            self.surprises = [*self.surprises, max(found)][-KEPT:]
+        return max(found) > max(SURPRISE * max(float(high - low) / USUAL, 1), usual)
 
     def _squares(self, position: Float64) -> NDArray[np.complex128]:
         """Return the square of the world of each position (N, 2)."""
@@ -191,6 +195,7 @@ class Evidence:
         rows = self._rows(other.table[:, 5:])
         self.table[rows, :4] += other.table[:, :4]
         self.errors = [*self.errors, *other.errors][-KEPT:]
+        self.surprises = [*self.surprises, *other.surprises][-KEPT:]
         self.driven += other.driven
         self.use_prior(other.prior if self.prior is None else self.prior)
 
@@ -202,9 +207,10 @@ class Evidence:
         self._fit()
 
     def restore(self, *arrays: NDArray[Any]) -> None:
-        """Take the table, the driven time and the errors of a file; a ValueError if they lie."""
-        given = table, driven, errors = [array.astype(np.float64) for array in arrays]
-        shapes = (len(table), len(COLUMNS)), (), (errors.size,)
+        """Take table, driven time, errors and surprises of a file; a ValueError if they lie."""
+        given = [array.astype(np.float64) for array in arrays]
+        table, driven, errors, surprises = given
+        shapes = (len(table), len(COLUMNS)), (), (errors.size,), (surprises.size,)
         possible = shapes == tuple(array.shape for array in given)
         possible = possible and all(np.isfinite(array).all() for array in given)
         if possible:
@@ -213,5 +219,6 @@ class Evidence:
             possible &= bool(np.abs(table[:, 5:]).max(initial=0) <= FARTHEST)
         if not possible:
             raise ValueError("its evidence cannot be true")
-        self.table, self.driven, self.errors = table, float(driven), [*errors]
+        self.table, self.driven = table, float(driven)
+        self.errors, self.surprises = errors.tolist(), surprises.tolist()
         self._fit()

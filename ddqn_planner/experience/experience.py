@@ -300,7 +300,8 @@ class Experience:
         prior = self.prior._asdict() if self.prior is not None else {}
         arrays: dict[str, Any] = {PRIOR + name: array for name, array in prior.items()}
         options, kept = list(self.options.values()), self.evidence
-        arrays |= {"evidence": kept.table, "driven": kept.driven, "errors": kept.errors}
+        arrays |= {"evidence": kept.table, "driven": kept.driven}
+        arrays |= {"errors": kept.errors, "surprises": kept.surprises}
         np.savez(content, version=VERSION, options=options, **arrays)
         return content.getvalue()
 
@@ -328,7 +329,9 @@ class Experience:
                 age = (arrays["driven"] - table[:, 5:]) / experience.half_life
                 faded = table[:, :2] * 0.5**age
                 arrays["evidence"] = np.hstack([faded, np.zeros((len(faded), 3)), table[:, 3:5]])
-            experience.evidence.restore(arrays["evidence"], arrays["driven"], arrays["errors"])
+            arrays.setdefault("surprises", np.zeros(0))  # older files have none
+            kept = (arrays[name] for name in ("evidence", "driven", "errors", "surprises"))
+            experience.evidence.restore(*kept)
             prior = {n.removeprefix(PRIOR): a for n, a in arrays.items() if n.startswith(PRIOR)}
             experience.evidence.prior = Prior.from_arrays(prior) if prior else None
         except Exception as error:  # broken bytes make zipfile and NumPy raise many kinds of errors

@@ -208,6 +208,25 @@ def test_what_is_slow_in_one_direction_alone_is_no_change() -> None:
     assert (experience.evidence.table[: len(elsewhere), 0] > 0.9 * elsewhere).all()
 
 
+def test_where_parts_of_drives_often_surprise_a_surprise_is_no_change() -> None:
+    def drive(slowness: float) -> Poses:
+        """Six rows of the hall, of which a part of one may be slow."""
+        legs = [(straight((2, y), (12, y)), straight((12, y), (2, y)))[y % 2] for y in range(2, 8)]
+        position = np.concatenate([leg[1] for leg in legs])
+        is_slow = (np.abs(position - (7.5, 4)) < (1.5, 0.1)).all(axis=1)
+        return np.cumsum(np.where(is_slow, slowness, 1) * 0.1), position
+
+    experience = Experience(SPEED)
+    for number in range(60):
+        experience.apply(HALL)
+        if number == 20:
+            experience.record(*straight((2, 9.5), (12, 9.5)))
+            row, weight = len(experience.evidence.table) - 1, experience.evidence.table[-1, 0]
+        experience.record(*drive(4 if number % 4 == 0 else 1))
+        experience = Experience.from_bytes(experience.to_bytes())
+    assert experience.evidence.table[row, 0] > 0.8 * weight
+
+
 def test_one_outlier_is_bounded() -> None:
     usual = straight((2, 5), (12, 5))
     seconds = usual[0].copy()

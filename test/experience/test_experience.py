@@ -270,6 +270,7 @@ def test_every_broken_file_is_named(path: Path) -> None:
         ("evidence", np.zeros((39, 5))),
         ("evidence", np.zeros((39, 7))),
         ("evidence", np.full((1, 7), 1e9)),
+        ("surprises", [math.nan]),
         ("errors", np.array([print], dtype=object)),  # nothing is unpickled
     ],
 )
