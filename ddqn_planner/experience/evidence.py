@@ -28,7 +28,7 @@ KNOWN = 0.7  # weight of visits from which a place is known
 
 PART, SURPRISE = 8, 3.5  # so many places have changed if they are off by more deviations
 USUAL = 4.0  # from bound to bound of drives' errors; where it is more, so is a surprise
-UNUSUAL, OF_DRIVES = 2.5, 0.95  # it is also more than so many times this quantile of the last ones
+UNUSUAL, OF_DRIVES = 2.5, 0.95  # and by so many times this quantile of drives' greatest surprises
 PART_NOISE = 0.12  # of their mean log slowness, as each way through a place is another
 CHANGED = 0.01  # share of all evidence that is left then: where one place changed, others did
 
@@ -96,7 +96,7 @@ class Evidence:
         """Return whether a part of a drive was other than all before."""
         weight, sum_of_log = self.table[rows, :2].T
         known = np.flatnonzero(weight >= KNOWN)
-        found = [0.0]
+        found = []
         for part in np.array_split(known, max(1, len(known) // PART)):
             if len(part) >= PART / 2:
                 surprise = (log[part] - sum_of_log[part] / weight[part]).mean()
@@ -105,9 +105,9 @@ class Evidence:
         # Up a ramp each drive takes longer than down, and nothing has changed.
         low, _, high = self.quantiles()
         usual = UNUSUAL * float(np.quantile([*self.surprises, *[1.0] * ASSUMED], OF_DRIVES))
-        if len(found) > 1:
+        if found:
             self.surprises = [*self.surprises, max(found)][-KEPT:]
-        return max(found) > max(SURPRISE * max(float(high - low) / USUAL, 1), usual)
+        return max(found, default=0) > max(SURPRISE * max(float(high - low) / USUAL, 1), usual)
 
     def _squares(self, position: Float64) -> NDArray[np.complex128]:
         """Return the square of the world of each position (N, 2)."""

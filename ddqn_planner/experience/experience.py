@@ -38,7 +38,7 @@ LEFT_NOISE = 0.015  # metres: the deviation of these means; more would hide slow
 STAND_DISTANCE = 0.1  # metres within which a robot stands
 STAND = 1.5  # metres at nominal speed: a robot that drives needs less time to leave a place
 FAST_STEP = 0.1  # of the log speed, by which the fastest move that a map knows of becomes faster
-SURE, NEW = 0.05, 0.3  # shares of unknown: up to the first nothing is hoped, from the second on all
+SURE, NEW = 0.05, 0.3  # where less is unknown, nothing is hoped; where more, all of the share
 CORRECTION = 0.25  # metres by which a localisation may move a pose at once: the drive goes on
 RELOCATION = 1.0  # a jump by this many metres more puts the robot at a place not believed
 MEMORY = 60.0  # seconds over which a robot whose pose is not believed counts as driving on
@@ -225,7 +225,7 @@ class Experience:
         posterior = evidence.over(grid)
         fastest = FAST_STEP * min(0, math.floor(evidence.fastest / FAST_STEP + 0.5))
         fastest -= share
-        hope = share * np.clip((posterior.unknown - SURE) / (NEW - SURE), 0, 1)
+        hope = np.interp(posterior.unknown, (SURE, NEW), (0, share))
         slowness = posterior.paint(hope, fastest)
         seconds_per_cell = grid.resolution / self.nominal_speed * math.exp(fastest)
         return grid.with_layers(slowness=slowness, seconds_per_cell=seconds_per_cell)

@@ -173,7 +173,8 @@ def _links_of(place: Int64, size: int, count: int) -> Any:
 @in_place
 def _relax(*arrays: Any) -> None:
     """Solve (diagonal - links) x = right by residuals, until the square of none is too great."""
-    begins, to, weights, diagonal, most, residual, x = arrays  # the residual is at first the right
+    begins, to, weights, diagonal, most, residual, x = arrays
+    # The residual is given as the right side.
     for place in range(x.size):
         residual[place] -= diagonal[place] * x[place]
         for link in range(begins[place], begins[place + 1]):

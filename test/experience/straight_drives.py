@@ -27,6 +27,13 @@ def straight(
     return began + seconds, np.array(start) * (1 - share) + np.array(end) * share
 
 
+def uneven(x: np.ndarray, slowness: np.ndarray, rate: float = 10.0) -> Poses:
+    """A drive along y = 5.1, of some slowness from each x (N,) to the next."""
+    at_x = np.append(0, np.cumsum(np.diff(x) / SPEED * slowness[:-1]))
+    seconds = np.arange(0, at_x[-1], 1 / rate)
+    return seconds, np.column_stack([np.interp(seconds, at_x, x), np.full(len(seconds), 5.1)])
+
+
 def driven(*drives: Poses, **options: float) -> Experience:
     """What drives teach."""
     experience = Experience(SPEED, **options)

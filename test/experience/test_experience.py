@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from experience.straight_drives import HALL, SPEED, Poses, at, driven, straight
+from experience.straight_drives import HALL, SPEED, Poses, at, driven, straight, uneven
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -49,10 +49,7 @@ def test_noise_of_the_pose_hardly_matters(seed: int) -> None:
 @pytest.mark.parametrize("rate", [10, 50])
 def test_places_side_by_side_keep_their_own_slowness(rate: float) -> None:
     x, random = np.linspace(2, 12, 2001), np.random.default_rng(0)
-    slow = x // 0.25 % 2 == 1
-    at_x = np.append(0, np.cumsum(np.diff(x) / SPEED * np.where(slow, 3, 1)[:-1]))
-    seconds = np.arange(0, at_x[-1], 1 / rate)
-    positions = np.column_stack([np.interp(seconds, at_x, x), np.full(len(seconds), 5.1)])
+    seconds, positions = uneven(x, np.where(x // 0.25 % 2 == 1, 3, 1), rate)
     noisy = (positions + random.normal(0, 0.02, positions.shape) for _ in range(20))
     slowness = driven(*((seconds, each) for each in noisy)).slowness(HALL)
     of_places = [at(HALL, slowness, place, 5.1) for place in np.arange(3.125, 11, 0.25)]
@@ -62,15 +59,9 @@ def test_places_side_by_side_keep_their_own_slowness(rate: float) -> None:
 
 
 def test_much_noise_of_the_pose_hides_no_slowness() -> None:
-    x, random, experience = (
-        np.linspace(1, 14, 2601),
-        np.random.default_rng(0),
-        Experience(SPEED, 0.2),
-    )
-    slow = (x > 5) & (x < 9)
-    at_x = np.append(0, np.cumsum(np.diff(x) / SPEED * np.where(slow, 4, 1)[:-1]))
-    seconds = np.arange(0, at_x[-1], 0.1)
-    positions = np.column_stack([np.interp(seconds, at_x, x), np.full(len(seconds), 5.1)])
+    x, random = np.linspace(1, 14, 2601), np.random.default_rng(0)
+    seconds, positions = uneven(x, np.where((x > 5) & (x < 9), 4, 1))
+    experience = Experience(SPEED, 0.2)
     for number in range(10):
         way, clock = (positions[::-1], -seconds[::-1]) if number % 2 else (positions, seconds)
         experience.record(clock, way + random.normal(0, 0.05, way.shape))
@@ -115,12 +106,11 @@ def test_places_with_and_without_waits_count_as_faster_the_less_of_them_is_known
     experience = driven(*[(seconds, positions)] * 12, straight((2, 6.5), (12, 6.5)))
     maps = [experience.apply(HALL, explored) for explored in (0.0, share)]
     expected, hoped = (np.log(grid.slowness * grid.seconds_per_cell) for grid in maps)
-    hope = (expected - hoped) / math.log(1 + share)
-    of_a_step = 0.021 / math.log(1 + share)  # in which slowness is told
-    often, once, never = (at(HALL, hope, 7, y) for y in (5, 6.5, 9))
-    assert never == pytest.approx(1, abs=of_a_step)
-    assert 0.5 - of_a_step < once < 0.95 + of_a_step
-    assert often < 0.3 + of_a_step
+    uncertainty = experience.uncertainty(HALL)
+    hope = np.interp(uncertainty / uncertainty.max(), (0.05, 0.3), (0, math.log(1 + share)))
+    np.testing.assert_allclose(expected - hoped, hope, atol=0.021)
+    often, once, never = (at(HALL, hope, 7, y) / hope.max() for y in (5, 6.5, 9))
+    assert often < 0.3 < 0.4 < once < 0.95 < never
 
 
 def test_waiting_counts_as_time_and_standing_before_a_drive_does_not() -> None:
