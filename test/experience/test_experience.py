@@ -107,9 +107,13 @@ def test_places_with_and_without_waits_count_as_faster_the_less_of_them_is_known
     maps = [experience.apply(HALL, explored) for explored in (0.0, share)]
     expected, hoped = (np.log(grid.slowness * grid.seconds_per_cell) for grid in maps)
     uncertainty = experience.uncertainty(HALL)
-    hope = np.interp(uncertainty / uncertainty.max(), (0.05, 0.3), (0, math.log(1 + share)))
-    np.testing.assert_allclose(expected - hoped, hope, atol=0.021)
-    often, once, never = (at(HALL, hope, 7, y) / hope.max() for y in (5, 6.5, 9))
+    # Two solutions of the posterior may differ by 0.02, and slowness is told in steps.
+    unknown = (uncertainty / uncertainty.max()) ** 2 + np.array([-0.02, 0, 0.02])[:, None, None]
+    all_of_it = math.log(1 + share)
+    less, hope, more = np.interp(np.sqrt(unknown.clip(0)), (0.05, 0.3), (0, all_of_it))
+    assert (less - 0.021 <= expected - hoped).all()
+    assert (expected - hoped <= more + 0.021).all()
+    often, once, never = (at(HALL, hope, 7, y) / all_of_it for y in (5, 6.5, 9))
     assert often < 0.3 < 0.4 < once < 0.95 < never
 
 
