@@ -106,15 +106,12 @@ def test_places_with_and_without_waits_count_as_faster_the_less_of_them_is_known
     experience = driven(*[(seconds, positions)] * 12, straight((2, 6.5), (12, 6.5)))
     maps = [experience.apply(HALL, explored) for explored in (0.0, share)]
     expected, hoped = (np.log(grid.slowness * grid.seconds_per_cell) for grid in maps)
-    uncertainty = experience.uncertainty(HALL)
-    # Two solutions of the posterior may differ by 0.02, and slowness is told in steps.
-    unknown = (uncertainty / uncertainty.max()) ** 2 + np.array([-0.02, 0, 0.02])[:, None, None]
-    all_of_it = math.log(1 + share)
-    less, hope, more = np.interp(np.sqrt(unknown.clip(0)), (0.05, 0.3), (0, all_of_it))
-    assert (less - 0.021 <= expected - hoped).all()
-    assert (expected - hoped <= more + 0.021).all()
-    often, once, never = (at(HALL, hope, 7, y) / all_of_it for y in (5, 6.5, 9))
-    assert often < 0.3 < 0.4 < once < 0.95 < never
+    hope = (expected - hoped) / math.log(1 + share)
+    of_a_step = 0.021 / math.log(1 + share)  # in which slowness is told
+    often, once, never = (at(HALL, hope, 7, y) for y in (5, 6.5, 9))
+    assert never == pytest.approx(1, abs=of_a_step)
+    assert 0.4 - of_a_step < once < 0.95 + of_a_step
+    assert often < 0.3 + of_a_step
 
 
 def test_waiting_counts_as_time_and_standing_before_a_drive_does_not() -> None:
