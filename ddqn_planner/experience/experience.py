@@ -21,6 +21,7 @@ from ddqn_planner.experience.prior import Prior
 from ddqn_planner.files import as_path, differences, locked, write_atomically
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import POSITIVE, Cells, as_number, cells_inside, numbers
+from ddqn_planner.grid.grid_map import Exploration
 from ddqn_planner.grid.moves import cells_along
 
 Float32 = NDArray[np.float32]
@@ -38,7 +39,6 @@ LEFT_NOISE = 0.015  # metres: the deviation of these means; more would hide slow
 STAND_DISTANCE = 0.1  # metres within which a robot stands
 STAND = 1.5  # metres at nominal speed: a robot that drives needs less time to leave a place
 FAST_STEP = 0.1  # of the log speed, by which the fastest move that a map knows of becomes faster
-SURE, NEW = 0.05, 0.3  # where less is unknown, nothing is hoped; where more, all of the share
 CORRECTION = 0.25  # metres by which a localisation may move a pose at once: the drive goes on
 RELOCATION = 1.0  # a jump by this many metres more puts the robot at a place not believed
 MEMORY = 60.0  # seconds over which a robot whose pose is not believed counts as driving on
@@ -215,20 +215,27 @@ class Experience:
         grid : GridMap
             The map.
         exploration : float
-            0 or more. Places count as faster the less of them is known, at most by this share. So
-            plans lead where it may be faster, but no plan is expected to take longer than the best
-            one by more than this share.
+            0 or more. Plans lead where it may be faster: places count as faster by a standard
+            deviation. But no plan is expected to take longer than the best one by more than this
+            share. `Plan.cost` is what is expected.
         """
-        limits = 0.0, 10.0, "0 to 10"
-        exploration = as_number("exploration", exploration, *limits)
-        evidence, share = self.evidence, math.log(1 + exploration)
+        share = as_number("exploration", exploration, 0, 10, "0 to 10")
+        evidence = self.evidence
         posterior = evidence.over(grid)
         fastest = FAST_STEP * min(0, math.floor(evidence.fastest / FAST_STEP + 0.5))
-        fastest -= share
-        hope = np.interp(posterior.unknown, (SURE, NEW), (0, share))
-        slowness = posterior.paint(hope, fastest)
-        seconds_per_cell = grid.resolution / self.nominal_speed * math.exp(fastest)
-        return grid.with_layers(slowness=slowness, seconds_per_cell=seconds_per_cell)
+
+        def hoping(name: str, hope: Float64 | float, most: float) -> GridMap:
+            slowness = posterior.paint(name, hope, fastest - most)
+            seconds_per_cell = grid.resolution / self.nominal_speed * math.exp(fastest - most)
+            return grid.with_layers(slowness=slowness, seconds_per_cell=seconds_per_cell)
+
+        expected = hoping("expected", 0.0, 0.0)
+        if not share:
+            return expected
+        most, hope = math.log(1 + share), math.sqrt(evidence.variance) * posterior.unknown
+        safe = hoping("safe", np.minimum(hope, most), most)
+        bold = hoping("bold", hope, FAST_STEP * math.ceil(hope.max(initial=0) / FAST_STEP))
+        return expected.with_layers(exploration=Exploration(share, bold, safe))
 
     def slowness(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: expected seconds, with waits, over those at nominal speed."""

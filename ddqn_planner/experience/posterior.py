@@ -54,7 +54,7 @@ class Posterior:
         self.solution = np.zeros(count, dtype=np.complex128)
         self.prior: Prior | None = None
         self.foretold = np.zeros(count)  # by the prior
-        self.steps: Float64 | None = None
+        self.painted: dict[str, tuple[Float64, NDArray[np.float32]]] = {}  # steps, and the map
 
     def deviation(self, seconds: Float64, places: Int64) -> float:
         """Return the standard deviation of the log time of a way, by its seconds in places."""
@@ -125,17 +125,18 @@ class Posterior:
             values = (values + self.links @ values) / 5
         return values
 
-    def paint(self, hope: Float64, fastest: float) -> NDArray[np.float32]:
+    def paint(self, name: str, hope: Float64 | float, fastest: float) -> NDArray[np.float32]:
         """Return (H, W) float32: the slowness over that of the fastest place, which has this log.
 
-        Each place counts as faster by its hope (P,), a logarithm, too.
+        Each place counts as faster by its hope (P,), a logarithm, too. While it stays as it was
+        under this name, it is the same array.
         """
         log = np.log(self.slowness) - hope - fastest
         steps = np.rint(np.clip(log, 0, math.log(MAX_SLOWNESS)) / math.log(1 + STEP))
-        if self.steps is None or not np.array_equal(steps, self.steps):
+        if name not in self.painted or not np.array_equal(steps, self.painted[name][0]):
             of_places = np.exp(steps * math.log(1 + STEP))
-            self.steps, self.painted = steps, self.over(np.minimum(of_places, MAX_SLOWNESS), 1.0)
-        return self.painted
+            self.painted[name] = steps, self.over(np.minimum(of_places, MAX_SLOWNESS), 1.0)
+        return self.painted[name][1]
 
     def over(self, values: Float64, occupied: float) -> NDArray[np.float32]:
         """Return (H, W) float32: of each cell the value of its place."""

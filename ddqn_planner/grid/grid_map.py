@@ -6,7 +6,7 @@ import hashlib
 import math
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -199,6 +199,14 @@ class GridMap:
         """Return the same map with other expected times."""
         return replace(self, slowness=slowness, seconds_per_cell=seconds_per_cell)
 
+    def with_times_of(self, other: GridMap) -> GridMap:
+        """Return the same map with the expected times of another, and those that are hoped for."""
+        hopes = other.exploration
+        if hopes is not None:
+            hopes = Exploration(hopes.share, *(self.with_times_of(each) for each in hopes[1:]))
+        times = {name: getattr(other, name) for name in ("slowness", "seconds_per_cell")}
+        return self.with_layers(**times, exploration=hopes)
+
     def with_layers(self, **layers: Any) -> GridMap:
         """Return the same map with other layers, which are neither checked nor copied."""
         kept = {field.name: getattr(self, field.name) for field in fields(self)}
@@ -231,6 +239,11 @@ class GridMap:
         multiplier: NDArray[np.float32]
         multiplier = MULTIPLIERS.take(self.cost, mode="wrap")  # -1 finds the last one
         return multiplier if self.slowness is None else multiplier * self.slowness
+
+    @cached_property
+    def exploration(self) -> Exploration | None:
+        """What plans may hope for, see `Experience.apply`; a map with other layers has none."""
+        return None
 
     def labels(self, move_rule: MoveRule | str) -> NDArray[np.int32]:
         """Return (H, W) int32: each free cell's component, from 1 on, whatever is forbidden."""
@@ -349,6 +362,14 @@ class GridMap:
             origin_x + math.cos(yaw) * along_x - math.sin(yaw) * along_y,
             origin_y + math.sin(yaw) * along_x + math.cos(yaw) * along_y,
         )
+
+
+class Exploration(NamedTuple):
+    """The same map twice, where places count as faster the less of them is known."""
+
+    share: float  # by which a path may be expected to take longer than the best one
+    bold: GridMap  # by a standard deviation
+    safe: GridMap  # by the share at most, so that each plan keeps it
 
 
 def check_grid(grid: object, name: str = "grid") -> None:

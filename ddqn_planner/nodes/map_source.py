@@ -366,9 +366,8 @@ class ExpectedTimes:
             return grid
         if self._spread_on is None or not is_like(grid, self._spread_on):
             self._spread_on = grid
-        of_places = self._experience.apply(self._spread_on, self._node.value("exploration"))
-        slowness, seconds = of_places.slowness, of_places.seconds_per_cell
-        return grid.with_layers(slowness=slowness, seconds_per_cell=seconds)
+        exploration = self._node.value("exploration")
+        return grid.with_times_of(self._experience.apply(self._spread_on, exploration))
 
     def describe(self, outcome: Outcome) -> dict[str, str]:
         """Return how long a plan takes, unless its map is old or untimed."""

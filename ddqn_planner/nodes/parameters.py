@@ -53,7 +53,7 @@ PLANNER_PARAMETERS: Final = {
         0.3, "Seconds: greatest age of a transform, wait for one, silence of odometry", (0, 1000)
     ),
     "field_cache_bytes": Declared(
-        CACHE_BYTES, "Bytes for kept Q fields; the last two always stay", (0, 2**40)
+        CACHE_BYTES, "Bytes for kept Q fields; the last three always stay", (0, 2**40)
     ),
     "planner_id": Declared("GridBased", "What Nav2's requests may name, or leave empty"),
     "experience": Declared("", "What drives taught: a file or folder; '': none"),

@@ -30,7 +30,7 @@ VISITS = 8
 REPAIRED_SHARE = 0.02  # of the map's cells that a repair may take back
 CHANGED_SHARE = 0.02  # of the map's cells may have changed: with more, a new field is cheaper
 CACHE_BYTES = 2**23  # for a planner's Q fields: 3 of 500 x 500 cells, at 9 bytes per cell
-ALWAYS_KEPT = 2  # fields, whatever their size: on a large map, too, a robot drives to and fro
+ALWAYS_KEPT = 3  # fields, whatever their size: to and fro, or the three of `Exploration`
 SAME_PLACE = 0.01  # cells that a shift may be off whole ones: messages' resolution is float32
 
 

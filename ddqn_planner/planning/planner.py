@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
-from ddqn_planner.grid.arguments import as_cell, as_flag, as_number, as_pose, listed
+from ddqn_planner.grid.arguments import Cells, as_cell, as_flag, as_number, as_pose, listed
 from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
 from ddqn_planner.planning.field import FieldCache, Goals, QField
@@ -26,7 +26,7 @@ from ddqn_planner.planning.plan import (
     joined,
 )
 from ddqn_planner.planning.pose_planner import Pose, PosePlanner, PoseRequest
-from ddqn_planner.planning.segments import cost_along, straightened
+from ddqn_planner.planning.segments import SAME_COST, cost_along, straightened
 
 AnyPlan = TypeVar("AnyPlan", bound=Plan)
 
@@ -230,6 +230,8 @@ class Planner:
         """Yield None before each slow step, and last the plan of `plan_poses`."""
         if self.pose_planner is None:
             raise ValueError("the model knows no body; give one of ddqn-planner train-robot")
+        if (hopes := request.grid.exploration) is not None:
+            request = replace(request, grid=hopes.safe)
         return self.pose_planner.steps(request)
 
     def _answer(self, grid: GridMap, start: Cell, goals: list[Cell], how: tuple[Any, ...]) -> Plan:
@@ -254,12 +256,32 @@ class Planner:
     def steps(self, request: PlanRequest) -> Iterator[Plan | None]:
         """Yield None before each slow step (a part of a field, a search), and last the plan."""
         ms, began = 0.0, time.perf_counter()
-        for plan in self._find(request):
+        for plan in self._explore(request) if request.grid.exploration else self._find(request):
             ms += 1e3 * (time.perf_counter() - began)
             if plan is not None:
                 vars(plan)["field_ms"] = ms - plan.rollout_ms  # frozen, but nobody else has it yet
             yield plan
             began = time.perf_counter()
+
+    def _explore(self, request: PlanRequest) -> Iterator[Plan | None]:
+        """Do the work of `steps` on a map with hopes: a bold plan if it keeps the share."""
+        grid, rule, hopes = request.grid, request.move_rule, request.grid.exploration
+        assert hopes is not None
+        plan = yield from self._found(replace(request, grid=hopes.bold))
+        if plan.path.size and plan.extra_cost is None:  # one under way was judged when it was new
+            best = yield from self._found(replace(request, under_way=()))
+            longest = (1 + hopes.share) * (best.cost or math.inf) * SAME_COST
+            if _cost(plan.path, grid, rule) > longest:
+                plan = yield from self._found(replace(request, grid=hopes.safe))
+        yield replace(plan, cost=_cost(plan.path, grid, rule)) if plan.path.size else plan
+
+    def _found(self, request: PlanRequest) -> Generator[None, None, Plan]:
+        """Return what `_find` yields last, after None before each slow step."""
+        for plan in self._find(request):
+            if plan is not None:
+                return plan
+            yield
+        raise AssertionError("there was no plan")
 
     def _refusal(self, request: PlanRequest, free: Goals) -> PlanStatus | None:
         """Return why there is no path, where one look at start and free goals says so."""
@@ -346,9 +368,14 @@ def _dressed(request: PlanRequest, found: Plan, way_out: tuple[Cell, ...], began
         if not np.array_equal(path, np.asarray(request.under_way)[-len(path) :]):
             extra_cost = None  # only from the first free cell on it is the one kept
     if grid.has_costs:
-        cost = cost_along(path, grid, rule) * (grid.seconds_per_cell or 1.0)
+        cost = _cost(path, grid, rule)
     ms = 1e3 * (time.perf_counter() - began)
     return Plan(found.status, path, found.method, rule, cost, goal, extra_cost, 0.0, ms)
+
+
+def _cost(path: Cells, grid: GridMap, rule: MoveRule) -> float:
+    """Return what a path costs: seconds, on a map of expected times."""
+    return cost_along(path, grid, rule) * (grid.seconds_per_cell or 1.0)
 
 
 def last_step(steps: Iterator[AnyPlan | None]) -> AnyPlan:

@@ -104,14 +104,19 @@ def test_places_with_and_without_waits_count_as_faster_the_less_of_them_is_known
     seconds, positions = straight((2, 5), (12, 5), slowness)
     seconds[len(seconds) // 2 :] += waited
     experience = driven(*[(seconds, positions)] * 12, straight((2, 6.5), (12, 6.5)))
-    maps = [experience.apply(HALL, explored) for explored in (0.0, share)]
-    expected, hoped = (np.log(grid.slowness * grid.seconds_per_cell) for grid in maps)
-    hope = (expected - hoped) / math.log(1 + share)
-    of_a_step = 0.021 / math.log(1 + share)  # in which slowness is told
-    often, once, never = (at(HALL, hope, 7, y) for y in (5, 6.5, 9))
-    assert never == pytest.approx(1, abs=of_a_step)
-    assert 0.4 - of_a_step < once < 0.95 + of_a_step
-    assert often < 0.3 + of_a_step
+    grid = experience.apply(HALL, share)
+    assert grid.exploration is not None
+    expected, bold, safe = (
+        np.log(each.slowness * each.seconds_per_cell) for each in (grid, *grid.exploration[1:])
+    )
+    of_a_step = 0.021  # in which slowness is told
+    most = math.sqrt(experience.evidence.variance), math.log(1 + share)
+    for hoped, unseen in zip((bold, safe), most, strict=True):
+        often, once, never = (at(HALL, expected - hoped, 7, y) for y in (5, 6.5, 9))
+        assert 0.8 * unseen - of_a_step < never < unseen + of_a_step
+        assert 0.2 * unseen - of_a_step < once < 0.95 * unseen + of_a_step
+        assert often < 0.4 * unseen + of_a_step
+    np.testing.assert_array_equal(grid.slowness, experience.apply(HALL).slowness)
 
 
 def test_waiting_counts_as_time_and_standing_before_a_drive_does_not() -> None:

@@ -8,6 +8,7 @@ import pytest
 from networks import robot_model
 
 from ddqn_planner import GridMap, Planner
+from ddqn_planner.grid.grid_map import Exploration
 from ddqn_planner.planning import PlanStatus
 from ddqn_planner.planning.planner import last_step
 from ddqn_planner.planning.pose_planner import PoseRequest
@@ -50,6 +51,16 @@ def test_a_robot_a_little_beside_its_path_keeps_it(
     for farther in ((0, 0.11, 0), (0, 0.06, 0.5)):
         start = path.poses[20] + farther
         assert plan(planner, grid, start, **under_way).status is PlanStatus.START_OCCUPIED
+
+
+def test_a_body_explores_within_the_share_alone(planner: Planner, corridor: GridMap) -> None:
+    random = np.random.default_rng(0)
+    slowness = random.uniform(4, 8, (3, *corridor.occupancy.shape)).astype(np.float32)
+    expected, bold, safe = (corridor.with_slowness(each, 1.0) for each in slowness)
+    timed = expected.with_layers(exploration=Exploration(0.1, bold, safe))
+    paths = [plan(planner, grid, START, bound=1.0) for grid in (timed, safe, bold)]
+    assert np.array_equal(paths[0].poses, paths[1].poses)
+    assert paths[0].cost == paths[1].cost != paths[2].cost
 
 
 def test_it_keeps_no_path_that_is_blocked_or_leads_elsewhere(

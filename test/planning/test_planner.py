@@ -18,11 +18,13 @@ from strategies import GRIDS, RULES, Data, Place, cells_of
 
 from ddqn_planner import GridMap, MoveRule, Plan, inflate
 from ddqn_planner.grid import MOVES, Cell, legal_moves, path_cost, path_length, shortest_distances
+from ddqn_planner.grid.grid_map import Exploration
 from ddqn_planner.model import AnyMapQNetwork, ModelMetadata
 from ddqn_planner.planning import PlanMethod, Planner, PlanRequest, PlanStatus, QField, simplify
 from ddqn_planner.planning.field import DistanceField
 from ddqn_planner.planning.plan import ROUNDING
 from ddqn_planner.planning.planner import last_step
+from ddqn_planner.planning.segments import cost_along
 
 
 def random_planner(height: int, width: int, seed: int) -> Planner:
@@ -208,14 +210,14 @@ def test_the_memory_for_fields_is_bounded_and_those_used_last_are_kept() -> None
     assert known == [first, *goals[-3:]]
     planner.fields.nbytes = 1
     last = GridMap(np.zeros((3, 3)), cost=np.ones((3, 3), np.int8))
-    planner.q_field(last, (0, 0))
-    for goal in ((0, 0), (2, 2), (0, 0)):  # two goals in turn, whatever the size of their fields
+    three = (0, 0), (2, 2), (1, 0)
+    for goal in (*three, *three):  # in turn, whatever the size of their fields
         found = known_field(planner, last, goal, rule)
         assert planner.q_field(last, goal) is known_field(planner, last, goal, rule)
     assert found is not None
     assert not any(known_field(planner, grid, goal, rule) for goal in grid.free_cells())
     planner.q_field(last, (1, 1))
-    assert known_field(planner, last, (2, 2), rule) is None
+    assert known_field(planner, last, (0, 0), rule) is None
 
 
 def test_maps_on_which_there_was_no_path_are_not_kept() -> None:
@@ -384,6 +386,53 @@ def test_a_robot_between_two_docks_keeps_to_one_of_them(has_costs: bool) -> None
     assert last_step(planner.steps(replace(request, switch_threshold=0.2))).goal == right
     taken = replace(request, grid=grid.with_patch([[True]], *left), switch_threshold=10.0)
     assert last_step(planner.steps(taken)).goal == right
+
+
+def explored(grid: GridMap, share: float, *slowness: Any) -> GridMap:
+    """Return a map with expected times, and those that a bold plan and a safe one hope for."""
+    expected, bold, safe = (grid.with_slowness(np.array(each, "f4"), 0.5) for each in slowness)
+    return expected.with_layers(exploration=Exploration(share, bold, safe))
+
+
+@given(GRIDS, RULES, st.booleans(), st.floats(0.01, 1), st.integers(0, 2**32 - 1))
+def test_what_is_hoped_for_leads_unless_it_is_expected_to_take_longer_than_the_share(
+    place: Place, rule: MoveRule, simplified: bool, share: float, seed: int
+) -> None:
+    (grid, start), random = place, np.random.default_rng(seed)
+    goal = grid.free_cells()[random.integers(len(grid.free_cells()))]
+    expected = random.uniform(4, 12, grid.occupancy.shape)
+    safe = expected / random.uniform(1, 1 + share, expected.shape)
+    timed = explored(grid, share, expected, expected / random.uniform(1, 4, expected.shape), safe)
+    assert timed.exploration is not None
+    maps = timed, timed, *timed.exploration[1:]
+    plan, best, bold, safe_plan = (
+        ANY_MAP.plan(each, start, goal, rule, simplified=simplified)
+        for each in (maps[0], timed.with_layers(), *maps[2:])
+    )
+    assert {each.status for each in (best, bold, safe_plan)} == {plan.status}
+    if plan.status is PlanStatus.SUCCEEDED:
+        costs = [0.5 * cost_along(each.path, timed, rule) for each in (plan, bold, best)]
+        assert plan.cost == pytest.approx(costs[0])
+        is_bold = costs[1] <= (1 + share) * costs[2] * (1 + 1e-9)
+        assert plan.cells == (bold if is_bold else safe_plan).cells
+        assert simplified or costs[0] <= (1 + share) * costs[2] * (1 + 1e-6)
+
+
+def test_a_robot_that_explores_drives_on_where_the_rest_alone_would_take_too_long() -> None:
+    occupancy = np.zeros((3, 21), dtype=np.bool_)
+    occupancy[1, 1:10] = occupancy[1, 11:20] = True  # two lanes, with a door in the middle
+    expected = np.full(occupancy.shape, 2.0)
+    expected[2, 11:] = 2.3
+    bold = np.where(expected > 2, 1.0, expected)
+    bold[2, :11] = 1.9
+    timed = explored(GridMap(occupancy), 0.1, expected, bold, expected)
+    request = PlanRequest(timed, (0, 1), ((20, 1),), MoveRule.ROBOT_SAFE)
+    first = last_step(ANY_MAP.steps(request))
+    assert (15, 2) in first.cells
+    at_door = replace(request, start=(10, 1))
+    kept = last_step(ANY_MAP.steps(replace(at_door, under_way=first.path)))
+    assert kept.cells[-9:] == first.cells[-9:]
+    assert (15, 0) in last_step(ANY_MAP.steps(at_door)).cells
 
 
 @given(GRIDS, RULES, st.booleans(), st.sampled_from([0.0, 2.0]), st.data())
