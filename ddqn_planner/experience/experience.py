@@ -217,7 +217,7 @@ class Experience:
         exploration : float
             0 or more. Plans lead where it may be faster: places count as faster by a standard
             deviation. But no plan is expected to take longer than the best one by more than this
-            share. `Plan.cost` is what is expected.
+            share. `Plan.cost` is what is expected, and for a robot with a body what is hoped for.
         """
         share = as_number("exploration", exploration, 0, 10, "0 to 10")
         evidence = self.evidence
