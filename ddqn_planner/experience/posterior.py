@@ -128,8 +128,8 @@ class Posterior:
     def paint(self, name: str, hope: Float64 | float, fastest: float) -> NDArray[np.float32]:
         """Return (H, W) float32: the slowness over that of the fastest place, which has this log.
 
-        Each place counts as faster by its hope (P,), a logarithm, too. While it stays as it was
-        under this name, it is the same array.
+        Each place counts as faster by its hope (P,), a logarithm, too. If nothing changed since the
+        last call with this name, the array is the same one.
         """
         log = np.log(self.slowness) - hope - fastest
         steps = np.rint(np.clip(log, 0, math.log(MAX_SLOWNESS)) / math.log(1 + STEP))

@@ -404,10 +404,10 @@ def test_what_is_hoped_for_leads_unless_it_is_expected_to_take_longer_than_the_s
     safe = expected / random.uniform(1, 1 + share, expected.shape)
     timed = explored(grid, share, expected, expected / random.uniform(1, 4, expected.shape), safe)
     assert timed.exploration is not None
-    maps = timed, timed, *timed.exploration[1:]
+    without_hope = timed.with_layers()
     plan, best, bold, safe_plan = (
         ANY_MAP.plan(each, start, goal, rule, simplified=simplified)
-        for each in (maps[0], timed.with_layers(), *maps[2:])
+        for each in (timed, without_hope, *timed.exploration[1:])
     )
     assert {each.status for each in (best, bold, safe_plan)} == {plan.status}
     if plan.status is PlanStatus.SUCCEEDED:
@@ -425,7 +425,7 @@ def test_a_robot_that_explores_drives_on_where_the_rest_alone_would_take_too_lon
     expected[2, 11:] = 2.3
     bold = np.where(expected > 2, 1.0, expected)
     bold[2, :11] = 1.9
-    timed = explored(GridMap(occupancy), 0.1, expected, bold, expected)
+    timed = explored(GridMap(occupancy), 0.1, expected, bold, expected / 1.1)
     request = PlanRequest(timed, (0, 1), ((20, 1),), MoveRule.ROBOT_SAFE)
     first = last_step(ANY_MAP.steps(request))
     assert (15, 2) in first.cells
