@@ -223,11 +223,7 @@ class DistanceField(QField):
     @cached_property
     def value(self) -> NDArray[np.float32]:
         """(H, W) float32: the greatest Q of a legal move, and at the goal the greatest of all."""
-        with self._lock:
-            self.grow()
-            distance = self.known.distance.reshape(-1, self.costs.width)[1:-1, 1:-1]
-            value = np.negative(distance, dtype=np.float32, casting="same_kind")
-        np.copyto(value, -np.inf, where=value == 0)  # sooner than by an index; goals are 0 too
+        value = self._layer(kernels.value_of, np.full(self.costs.patch.size, -np.inf, np.float32))
         greatest = value.max()
         for x, y in self.goals:
             value[y, x] = greatest

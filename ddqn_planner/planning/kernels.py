@@ -169,7 +169,9 @@ def _grow(distance: Any, state: Any, queue: Any, how: Any, costs: Any) -> tuple[
                     cost *= terms[place + value[previous]] + terms[place + last]
                 known = distance[previous] if distance[previous] > 0 else np.inf
                 better |= np.uint64(here + cost < known) << action
-            x, y = np.int64(cell) % width - start_x, np.int64(cell) // width - start_y
+            # Divisions of 32 bits take half as long.
+            x = np.int64(np.uint32(cell) % np.uint32(width)) - start_x
+            y = np.int64(np.uint32(cell) // np.uint32(width)) - start_y
             while better:
                 action = FIRST[better]
                 better &= better - ONE
@@ -295,6 +297,14 @@ def _roll_out(distance: Any, cell: int, path: Any, toward: Any, costs: Any) -> i
         x, y = x + MOVE_X[best], y + MOVE_Y[best]
         cell += MOVE_Y[best] * width + MOVE_X[best]
     return number
+
+
+@in_place
+def value_of(distance: Any, value: Any, _: Any) -> None:
+    """Write minus the distance of each reached cell but the goals: (C,) float32."""
+    for cell in range(distance.size):
+        if distance[cell] > AT_GOAL:
+            value[cell] = -distance[cell]
 
 
 @in_place
