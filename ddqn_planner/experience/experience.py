@@ -146,10 +146,10 @@ class Experience:
             way = np.array(ways(at, STAND_DISTANCE)[1:], dtype=np.int64)
             if not len(way):
                 continue
-            leaves = way[1:] - 1
-            stood = seconds[leaves] - seconds[way[:-1]]
+            stood = seconds[way[1:] - 1] - seconds[way[:-1]]
             stood[stood < STAND / speed] = 0
-            waited = np.column_stack([at[leaves], stood])
+            # A robot waits for what is ahead, often where ways part: no other way waits for it.
+            waited = np.column_stack([at[way[1:]], stood])
             waits.append(waited[(stood > 0) & (stood <= self.max_pause)])
             steps.append(_steps(np.diff(seconds[way]) - stood, at[way], step))
         rows = np.concatenate(steps)

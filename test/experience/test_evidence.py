@@ -270,6 +270,24 @@ def test_a_wait_is_not_spread_along_the_way_or_to_other_ways() -> None:
         assert at(HALL, slowness, x, y) < 1.3
 
 
+def test_where_ways_part_a_wait_belongs_to_the_one_that_is_taken() -> None:
+    seconds, positions = straight((2.1, 5.1), (7.1, 5.1))
+    after, turned = straight((7.1, 5.1), (7.1, 9.1), began=30.0)
+    stood = np.arange(10.1, 30, 0.1)
+    there = np.repeat(positions[-1:], len(stood), axis=0)
+    waits = np.concatenate([seconds, stood, after]), np.concatenate([positions, there, turned])
+    corridors = np.ones((40, 60), dtype=bool)
+    corridors[19:22, 8:50] = corridors[19:38, 27:30] = False
+    grid, begin = GridMap(corridors, 0.25), (8, 20)
+    experience = Experience(SPEED)
+    for number in range(24):
+        experience.record(*(straight((2.1, 5.1), (12.1, 5.1)) if number % 6 == 1 else waits))
+    ways = [begin, (28, 20), (28, 36)], [begin, (48, 20)]
+    turning, ahead = (experience.expected_time(grid, way).seconds for way in ways)
+    assert turning == pytest.approx(38, rel=0.1)
+    assert ahead < turning - 3  # and not more than it, as if all waited
+
+
 def test_a_wait_beside_a_wall_costs_nothing_behind_it() -> None:
     experience = driven(straight((2, 5), (12, 5)))
     experience.record_failure((5, 5.1))
