@@ -110,7 +110,8 @@ def _is_free(x: int, y: int, occupancy: Any) -> bool:
 @inlined
 def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -> float:
     """Return the cost of a segment, infinity if it is not legal from a share of it on."""
-    occupancy, forbidden, _, _, cuts_corners, is_unit = layers
+    occupancy, forbidden, cost, slowness, cuts_corners, is_unit = layers
+    has_costs = cost.size + slowness.size > 0
     dx, dy = last_x - x, last_y - y
     step_x, step_y = (dx > 0) - (dx < 0), (dy > 0) - (dy < 0)
     width, height = abs(dx), abs(dy)
@@ -133,13 +134,15 @@ def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -
         if at_column == at_row and until < whole and not cuts_corners:
             blocked |= occupancy[y, x + step_x] | occupancy[y + step_y, x]
         legal = until <= ignored or not blocked
-        total += (until - at) * multiplier_at(x, y, layers)
+        if has_costs:
+            total += (until - at) * multiplier_at(x, y, layers)
         at = until
         if at_column == until:
             x, at_column = x + step_x, at_column + 2 * height
         if at_row == until:
             y, at_row = y + step_y, at_row + 2 * width
-    return length * total / whole if legal else np.inf
+    length *= total / whole if has_costs else 1.0
+    return length if legal else np.inf
 
 
 @in_place
@@ -193,6 +196,7 @@ def _move_corners(path: Any, count: int, costs: Any, layers: Any) -> tuple[int, 
     """Move or leave out corners while it costs less; return the cells left, and if any moved."""
     occupancy, _, cost, slowness, cuts_corners, is_unit = layers
     has_costs, is_better, corner = cost.size + slowness.size > 0, False, 1
+    moved_by = -1  # the action by which the corner has just moved: it alone is tried again
     while corner < count - 1:
         x, y = path[corner - 1, 0], path[corner - 1, 1]
         at_x, at_y = path[corner, 0], path[corner, 1]
@@ -204,8 +208,9 @@ def _move_corners(path: Any, count: int, costs: Any, layers: Any) -> tuple[int, 
         is_right = (x == at_x or next_x == at_x) and (y == at_y or next_y == at_y)
         is_least = is_right and occupancy[inner_y, inner_x] and not (has_costs or cuts_corners)
         # To the next one, which leaves it out; by a cell; by two, past an obstacle of one cell.
-        least, is_moved = before * SAME_COST, False
-        for action in range(-1, 0 if is_least else 8):
+        tried, moved_by, is_left_out = moved_by, -1, False
+        least = before * SAME_COST if tried < 0 else before / SAME_COST
+        for action in range(tried, tried + 1 if tried >= 0 else -1 if is_least else 8):
             to_x, to_y = at_x + MOVES[action, 0], at_y + MOVES[action, 1]
             if action < 0:
                 to_x, to_y = next_x, next_y
@@ -214,22 +219,26 @@ def _move_corners(path: Any, count: int, costs: Any, layers: Any) -> tuple[int, 
             first = _length(abs(to_x - x), abs(to_y - y), is_unit)
             second = _length(abs(next_x - to_x), abs(next_y - to_y), is_unit)
             if first + second < least and _is_free(to_x, to_y, occupancy):
-                second = _cost(to_x, to_y, next_x, next_y, 0.0, layers)
+                if action >= 0:
+                    second = _cost(to_x, to_y, next_x, next_y, 0.0, layers)
                 if first + second < least:
                     first = _cost(x, y, to_x, to_y, 0.0, layers)
                 if first + second < least:
-                    least, is_moved = first + second, True
+                    least, moved_by, is_left_out = first + second, action, action < 0
                     path[corner, 0], path[corner, 1] = to_x, to_y
                     costs[corner], costs[corner + 1] = first, second
+            if is_left_out:
+                break
             if action < 0:
-                if is_moved:
-                    break
                 least = before / SAME_COST
-        if is_moved and path[corner, 0] == next_x and path[corner, 1] == next_y:
-            count -= 1
+        if path[corner, 0] == next_x and path[corner, 1] == next_y:
+            is_left_out, moved_by, count = True, -1, count - 1
             for cell in range(corner + 1, count):
                 path[cell, 0], path[cell, 1] = path[cell + 1, 0], path[cell + 1, 1]
                 costs[cell] = costs[cell + 1]
-        is_better |= is_moved
-        corner = corner + 1 if not is_moved else corner - 1 if corner > 1 else 1
+        is_better |= is_left_out or moved_by >= 0
+        if is_left_out or (moved_by < 0 <= tried):
+            corner = corner - 1 if corner > 1 else 1
+        elif moved_by < 0:
+            corner += 1
     return count, is_better

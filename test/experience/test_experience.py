@@ -331,6 +331,18 @@ def test_what_was_merged_is_as_if_one_robot_had_driven_all() -> None:
     np.testing.assert_allclose(one.slowness(HALL), together.slowness(HALL), rtol=0.1)
 
 
+def test_one_that_knows_nothing_knows_all_of_another_after_a_merge() -> None:
+    other = Experience(SPEED)
+    for slowness in (1, 2, 1, 3):
+        other.apply(HALL)  # with a map, drives tell how sure expected times are
+        other.record(*straight((2, 5), (12, 5), slowness))
+    assert other.evidence.errors
+    assert other.evidence.surprises
+    one = Experience(SPEED)
+    one.merge(other)
+    assert one.to_bytes() == other.to_bytes()
+
+
 def test_a_file_of_an_older_version_is_read(path: Path) -> None:
     with np.load(path) as arrays:
         old = dict(arrays)
