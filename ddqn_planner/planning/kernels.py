@@ -286,7 +286,7 @@ def _roll_out(distance: Any, cell: int, path: Any, toward: Any, costs: Any) -> i
         # Of steps as good as each other, the nearest to the straight line from the start.
         enough, least, best = distance[cell] * SAME, np.inf, -1
         for action in range(8):
-            after = distance[cell + MOVE_Y[action] * width + MOVE_X[action]]
+            after = distance[np.uint64(cell + MOVE_Y[action] * width + MOVE_X[action])]
             if 0 < after < enough:
                 ahead_x, ahead_y = x + MOVE_X[action] - from_x, y + MOVE_Y[action] - from_y
                 aside = abs(ahead_x * (to_y - from_y) - ahead_y * (to_x - from_x))

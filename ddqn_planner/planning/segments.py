@@ -97,8 +97,9 @@ def _length(width: int, height: int, is_unit: bool) -> float:
 def multiplier_at(x: int, y: int, layers: Any) -> Any:
     """Return the cost multiplier of a cell, see `GridMap.cost_multiplier`."""
     _, _, cost, slowness, _, _ = layers
-    multiplier = np.float64(MULTIPLIERS[cost[y, x]]) if cost.size else 1.0
-    return multiplier * slowness[y, x] if slowness.size else multiplier
+    column, row = np.uint64(x), np.uint64(y)
+    multiplier = np.float64(MULTIPLIERS[cost[row, column]]) if cost.size else 1.0
+    return multiplier * slowness[row, column] if slowness.size else multiplier
 
 
 @inlined
@@ -128,11 +129,13 @@ def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -
     while at < whole and legal:
         until = at_column if at_column < at_row else at_row
         until = until if until < whole else whole
-        blocked = occupancy[y, x]
+        column, row = np.uint64(x), np.uint64(y)  # unsigned: no index counts from the end
+        blocked = occupancy[row, column]
         if forbidden.size and until < whole:
-            blocked |= (forbidden[y, x] & takes) != 0
+            blocked |= (forbidden[row, column] & takes) != 0
         if at_column == at_row and until < whole and not cuts_corners:
-            blocked |= occupancy[y, x + step_x] | occupancy[y + step_y, x]
+            blocked |= occupancy[row, np.uint64(x + step_x)]
+            blocked |= occupancy[np.uint64(y + step_y), column]
         legal = until <= ignored or not blocked
         if has_costs:
             total += (until - at) * multiplier_at(x, y, layers)
@@ -143,6 +146,18 @@ def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -
             y, at_row = y + step_y, at_row + 2 * width
     length *= total / whole if has_costs else 1.0
     return length if legal else np.inf
+
+
+@inlined
+def _is_right_angle(
+    x: int, y: int, at_x: int, at_y: int, to_x: int, to_y: int, layers: Any
+) -> bool:
+    """Return whether a way has a right angle around an occupied cell: nothing is shorter."""
+    occupancy, _, cost, slowness, cuts_corners, _ = layers
+    dx, dy = x + to_x - 2 * at_x, y + to_y - 2 * at_y
+    inner = occupancy[at_y + (dy > 0) - (dy < 0), at_x + (dx > 0) - (dx < 0)]
+    is_right = (x == at_x or to_x == at_x) and (y == at_y or to_y == at_y)
+    return is_right and inner and cost.size + slowness.size == 0 and not cuts_corners
 
 
 @in_place
@@ -172,8 +187,13 @@ def _pull(path: Any, costs: Any, until: Any, backward: bool, layers: Any) -> int
         least = until[reached] - until[first] if until.size else least
         # How much longer it can be is found by doubling and halving. Half of 3 is 1, so that some
         # cells are passed over: with corners at the very last ones seen, a path is longer.
-        step, doubling = 3, True
-        while step > 0 and reached < last:
+        # Around a right angle the very next cell is not seen.
+        step, doubling, shortest = 3, True, 1
+        if reached < last:
+            at_x, at_y = path[reached, 0], path[reached, 1]
+            to_x, to_y = path[reached + 1, 0], path[reached + 1, 1]
+            shortest = 2 if _is_right_angle(x, y, at_x, at_y, to_x, to_y, layers) else 1
+        while step >= shortest and reached < last:
             following = min(reached + step, last)
             from_x, from_y, to_x, to_y = x, y, path[following, 0], path[following, 1]
             if backward:
@@ -183,7 +203,7 @@ def _pull(path: Any, costs: Any, until: Any, backward: bool, layers: Any) -> int
             if until.size:
                 joins = cost <= SAME_COST * (until[following] - until[first])
             if joins:
-                reached, least = following, cost
+                reached, least, shortest = following, cost, 1
             doubling = doubling and joins
             step = 2 * step if doubling else step // 2
         first, number = reached, number + 1
@@ -194,19 +214,14 @@ def _pull(path: Any, costs: Any, until: Any, backward: bool, layers: Any) -> int
 @in_place
 def _move_corners(path: Any, count: int, costs: Any, layers: Any) -> tuple[int, bool]:
     """Move or leave out corners while it costs less; return the cells left, and if any moved."""
-    occupancy, _, cost, slowness, cuts_corners, is_unit = layers
-    has_costs, is_better, corner = cost.size + slowness.size > 0, False, 1
+    occupancy, is_unit, is_better, corner = layers[0], layers[-1], False, 1
     moved_by = -1  # the action by which the corner has just moved: it alone is tried again
     while corner < count - 1:
         x, y = path[corner - 1, 0], path[corner - 1, 1]
         at_x, at_y = path[corner, 0], path[corner, 1]
         next_x, next_y = path[corner + 1, 0], path[corner + 1, 1]
         before = costs[corner] + costs[corner + 1]
-        # Around an occupied cell, as in a maze, nothing is shorter than a right angle.
-        dx, dy = x + next_x - 2 * at_x, y + next_y - 2 * at_y
-        inner_x, inner_y = at_x + (dx > 0) - (dx < 0), at_y + (dy > 0) - (dy < 0)
-        is_right = (x == at_x or next_x == at_x) and (y == at_y or next_y == at_y)
-        is_least = is_right and occupancy[inner_y, inner_x] and not (has_costs or cuts_corners)
+        is_least = _is_right_angle(x, y, at_x, at_y, next_x, next_y, layers)
         # To the next one, which leaves it out; by a cell; by two, past an obstacle of one cell.
         tried, moved_by, is_left_out = moved_by, -1, False
         least = before * SAME_COST if tried < 0 else before / SAME_COST
