@@ -39,8 +39,9 @@ demo-driving: setup
 demo-training: setup
 	$(BIN)/python examples/demo_training.py $(STEPS)
 
-# One process per core; each has its nodes in a ROS domain of its own.
-PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+# One process more than cores, as nodes wait, but four at most; each has a ROS domain of its own.
+PROCESSES := $(shell cores=$$(nproc); echo $$((cores < 4 ? cores + 1 : 4)))
+PYTEST := $(BIN)/python -m pytest --numprocesses $(PROCESSES) --dist loadfile --no-loadscope-reorder
 
 test: setup
 	$(PYTEST)
