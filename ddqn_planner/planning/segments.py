@@ -152,7 +152,7 @@ def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -
 def _is_right_angle(
     x: int, y: int, at_x: int, at_y: int, to_x: int, to_y: int, layers: Any
 ) -> bool:
-    """Return whether a way has a right angle around an occupied cell: nothing is shorter."""
+    """Return if a way is surely the least: a right angle around an occupied cell, no costs."""
     occupancy, _, cost, slowness, cuts_corners, _ = layers
     dx, dy = x + to_x - 2 * at_x, y + to_y - 2 * at_y
     inner = occupancy[at_y + (dy > 0) - (dy < 0), at_x + (dx > 0) - (dx < 0)]

@@ -318,6 +318,23 @@ def test_a_path_turns_at_the_corner_and_not_behind_it() -> None:
         assert path_length(simplify(cells, grid, rule)) < 1.03 * least
 
 
+@pytest.mark.parametrize("turns", range(4))
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_right_angle_is_kept_around_an_obstacle_alone(turns: int, mirrored: bool) -> None:
+    occupied = np.zeros((14, 14), dtype=np.bool_)
+    occupied[[2, 2, 4, 5], [5, 7, 7, 7]] = True  # at a corner, but not inside it
+    number = np.arange(196).reshape(14, 14)
+    if mirrored:
+        occupied, number = occupied[:, ::-1], number[:, ::-1]
+    grid, places = GridMap(np.rot90(occupied, turns)), np.rot90(number, turns)
+    bend = ((1, 3), (6, 3), (6, 6), (9, 6), (12, 6))
+    found = (np.argwhere(places == 14 * y + x)[0, ::-1].tolist() for x, y in bend)
+    path = [(x, y) for x, y in found]
+    simple = check_simplified(path, grid, MoveRule.ROBOT_SAFE)
+    check_corners(simple, grid, MoveRule.ROBOT_SAFE)
+    assert path[1] not in simple
+
+
 @pytest.mark.parametrize("layer", ["cost", "slowness"])
 def test_a_bend_around_an_obstacle_moves_away_from_a_costly_cell(layer: str) -> None:
     costs = np.zeros((9, 9), np.int8) if layer == "cost" else np.ones((9, 9), np.float32)
