@@ -25,6 +25,7 @@ from ddqn_planner.planning.plan import (
     PosePlan,
     joined,
 )
+from ddqn_planner.planning.pose_paths import cost_of_poses
 from ddqn_planner.planning.pose_planner import Pose, PosePlanner, PoseRequest
 from ddqn_planner.planning.segments import SAME_COST, cost_along, straightened
 
@@ -230,9 +231,17 @@ class Planner:
         """Yield None before each slow step, and last the plan of `plan_poses`."""
         if self.pose_planner is None:
             raise ValueError("the model knows no body; give one of ddqn-planner train-robot")
-        if (hopes := request.grid.exploration) is not None:
-            request = replace(request, grid=hopes.safe)
-        return self.pose_planner.steps(request)
+        hopes = request.grid.exploration
+        used = request.grid if hopes is None else hopes.safe
+        for plan in self.pose_planner.steps(replace(request, grid=used)):
+            if plan is not None and hopes is not None and len(plan.poses) > 1:
+                # What is expected, not what is hoped for.
+                seconds, hoped = (
+                    cost_of_poses(plan.poses, grid) * (grid.seconds_per_cell or 1.0)
+                    for grid in (request.grid, used)
+                )
+                plan = replace(plan, cost=(plan.cost or 0.0) * seconds / hoped)
+            yield plan
 
     def _answer(self, grid: GridMap, start: Cell, goals: list[Cell], how: tuple[Any, ...]) -> Plan:
         """Check what a user asks for, and plan."""

@@ -11,6 +11,7 @@ from ddqn_planner import GridMap, Planner
 from ddqn_planner.grid.grid_map import Exploration
 from ddqn_planner.planning import PlanStatus
 from ddqn_planner.planning.planner import last_step
+from ddqn_planner.planning.pose_paths import cost_of_poses
 from ddqn_planner.planning.pose_planner import PoseRequest
 
 CELL = 0.1
@@ -53,14 +54,19 @@ def test_a_robot_a_little_beside_its_path_keeps_it(
         assert plan(planner, grid, start, **under_way).status is PlanStatus.START_OCCUPIED
 
 
-def test_a_body_explores_within_the_share_alone(planner: Planner, corridor: GridMap) -> None:
+def test_a_body_explores_within_the_share_alone(planner: Planner) -> None:
     random = np.random.default_rng(0)
-    slowness = random.uniform(4, 8, (3, *corridor.occupancy.shape)).astype(np.float32)
-    expected, bold, safe = (corridor.with_slowness(each, 1.0) for each in slowness)
+    slowness = random.uniform(4, 8, (3, 20, 40)).astype(np.float32)
+    slowness[0] *= 1.1
+    hall = GridMap(np.zeros((20, 40)), CELL)
+    expected, bold, safe = (hall.with_slowness(each, 1.0) for each in slowness)
     timed = expected.with_layers(exploration=Exploration(0.1, bold, safe))
     paths = [plan(planner, grid, START, bound=1.0) for grid in (timed, safe, bold)]
     assert np.array_equal(paths[0].poses, paths[1].poses)
-    assert paths[0].cost == paths[1].cost != paths[2].cost
+    assert not np.array_equal(paths[0].poses, paths[2].poses)
+    costs = [cost_of_poses(paths[0].poses, grid) for grid in (expected, safe)]
+    assert paths[0].cost == pytest.approx(paths[1].cost * costs[0] / costs[1])
+    assert costs[0] > 1.05 * costs[1]
 
 
 def test_it_keeps_no_path_that_is_blocked_or_leads_elsewhere(
