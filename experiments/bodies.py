@@ -28,6 +28,7 @@ from ddqn_planner import GridMap, Planner, load_map
 from ddqn_planner.grid import MOVES, Cell, MoveRule
 from ddqn_planner.grid.footprint import read_footprint
 from ddqn_planner.grid.motions import HEADINGS, Motion, Motions, make_motions
+from ddqn_planner.grid.moves import UPHILL, actions_along
 from ddqn_planner.model import ModelMetadata, RobotNetwork, package_version
 from ddqn_planner.planning.plan import PosePlan
 from ddqn_planner.warm_up import warm_up
@@ -123,17 +124,18 @@ def worlds(maps: Path | None, random: np.random.Generator) -> dict[str, GridMap]
 
 
 @cache
-def ways(motions: Motions) -> list[dict[Cell, float]]:
-    """Return the cells that the origin passes on each primitive, and its shares, from points."""
+def ways(motions: Motions) -> list[dict[Cell, NDArray[np.float64]]]:
+    """Return the cells that the origin passes on each primitive, from points: share, x, y."""
     found = []
     for poses in motions.poses:
         at = np.linspace(0, len(poses) - 1, 1001)
         way = np.column_stack([np.interp(at, range(len(poses)), poses[:, i]) for i in (0, 1)])
         length = np.hypot(*np.diff(way, axis=0).T) + 1e-12
-        shares: dict[Cell, float] = {}
-        for cell, part in zip(np.floor((way[1:] + way[:-1]) / 2 + 0.5), length, strict=True):
+        parts = np.column_stack([length / length.sum(), np.diff(way, axis=0)])
+        shares: dict[Cell, NDArray[np.float64]] = {}
+        for cell, part in zip(np.floor((way[1:] + way[:-1]) / 2 + 0.5), parts, strict=True):
             key = int(cell[0]), int(cell[1])
-            shares[key] = shares.get(key, 0) + part / length.sum()
+            shares[key] = shares.get(key, 0) + part
         found.append(shares)
     return found
 
@@ -151,7 +153,14 @@ def least_costs(
         for y, x in np.argwhere(swept[number]):
             hit |= occupied[y : y + height, x : x + width]
         y, x = np.nonzero(~hit)
-        factor = sum(part * multiplier[y + up, x + over] for (over, up), part in way.items())
+        factor = np.zeros(len(x))
+        for (over, up), (share, *moved) in way.items():
+            part = share * multiplier[y + up, x + over]
+            if grid.uphill is not None and np.any(moved):
+                part = (
+                    part * UPHILL[grid.uphill[y + up, x + over], actions_along(np.array([moved]))]
+                )
+            factor += part
         allowed = np.ones(len(x), np.bool_)
         for here, after in pairwise(way):
             if grid.forbidden is not None:

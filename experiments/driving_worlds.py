@@ -46,7 +46,7 @@ HELD_OUT: Final = (
     *("warehouse-waits", "warehouse-clearance", "blobs-noise", "blobs-discs", "blobs-ramps"),
     *("small_rooms-sills", "office-checkerboard", "office-crowds"),
 )
-HELD_OUT_SEED: Final = 13_000  # their first one
+HELD_OUT_SEED: Final = 14_000  # their first one
 ON_FILES: Final = ("mixture", "discs", "waits", "clearance", "noise")  # what is slow on ROS maps
 
 

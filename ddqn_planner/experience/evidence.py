@@ -8,11 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.experience.posterior import FEW_PLACES, NOISE, Posterior
+from ddqn_planner.experience.directions import NOISE, RISES, climbs_of, squares_of
+from ddqn_planner.experience.posterior import FEW_PLACES, Posterior
 from ddqn_planner.experience.prior import Prior
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
 from ddqn_planner.grid.grid_map import check_grid
+from ddqn_planner.grid.moves import MOVES, UPHILL
 
 Float64 = NDArray[np.float64]
 
@@ -51,6 +53,7 @@ class Visits(NamedTuple):
     position: Float64  # (V, 2)
     seconds: Float64  # (V,): without waits
     metres: Float64  # (V,)
+    toward: NDArray[np.int64]  # (V,): the action of its direction, in a frame that is not turned
     waits: Float64  # (W, 3): x, y, seconds
 
 
@@ -66,6 +69,8 @@ class Evidence:
         self.prior: Prior | None = None
         self.driven = 0.0
         self.table = np.zeros((0, len(COLUMNS)))
+        # The first two columns of the visits in each direction of `MOVES`.
+        self.directed = np.zeros((0, 2, len(MOVES)), np.float32)
         self.errors: list[float] = []  # of the last drives' log times, in standard deviations
         self.surprises: list[float] = []  # the greatest of each of the last drives, likewise
         self.posterior: Posterior | None = None  # over the last map
@@ -77,29 +82,39 @@ class Evidence:
         weight, slowness = visits.metres / self.side, visits.seconds / visits.metres
         log = np.log(np.clip(slowness * self.nominal_speed, 1 / MAX_SLOWNESS, MAX_SLOWNESS))
         rows, waited = self._rows(visits.position), self._rows(visits.waits[:, :2])
-        if self._has_changed(rows, log):
-            self.table[:, :4] *= CHANGED
+        if self._has_changed(rows, log, visits.toward):
+            self._fade(CHANGED)
         np.add.at(self.table[:, 3], waited, visits.waits[:, 2])
         # Only passages from the first wait on tell how long a wait is.
         away = visits.position[:, None] - self.table[self.table[:, 3] > 0, 5:]
         is_near = np.hypot(away[..., 0], away[..., 1]).min(axis=1, initial=np.inf) <= 4 * self.side
         seen = weight[:, None] * np.column_stack([np.ones(len(log)), log, is_near])
         np.add.at(self.table[:, :3], rows, seen)
+        for column in (0, 1):
+            np.add.at(self.directed[:, column], (rows, visits.toward), seen[:, column])
         self.table[waited, 2] = np.maximum(self.table[waited, 2], 1)
         self.table[:, 2:4] /= np.maximum(self.table[:, 2:3] / MOST_PASSAGES, 1)
         seconds = float(visits.seconds.sum() + visits.waits[:, 2].sum())
         self.driven += seconds
-        self.table[:, :4] *= 0.5 ** (seconds / self.half_life)
+        self._fade(0.5 ** (seconds / self.half_life))
         self._fit()
 
-    def _has_changed(self, rows: NDArray[np.int64], log: Float64) -> bool:
+    def _fade(self, share: float) -> None:
+        """Let all evidence count less."""
+        self.table[:, :4] *= share
+        self.directed *= share
+
+    def _has_changed(self, rows: Any, log: Float64, toward: Any) -> bool:
         """Return whether a part of a drive was other than all before."""
-        weight, sum_of_log = self.table[rows, :2].T
+        weight = self.table[rows, 0]
         known = np.flatnonzero(weight >= KNOWN)
+        steepest, rise = self.climbs.at(squares_of(self.table[rows, 5:]))
+        surprises = log - rise * RISES[toward, steepest]
+        surprises[known] -= self.flat[rows[known]] / weight[known]
         found = []
         for part in np.array_split(known, max(1, len(known) // PART)):
             if len(part) >= PART / 2:
-                surprise = (log[part] - sum_of_log[part] / weight[part]).mean()
+                surprise = surprises[part].mean()
                 variance = NOISE * (1 + 1 / weight[part]).mean() / len(part) + PART_NOISE**2
                 found.append(abs(float(surprise)) / math.sqrt(variance))
         # Up a ramp each drive takes longer than down, and nothing has changed.
@@ -125,11 +140,20 @@ class Evidence:
             places = self.posterior.places_at(fresh[:, 5:])
             fresh[:, 4] = np.append(self.posterior.foretold, 0)[places]
         self.table = np.concatenate([self.table, fresh])
+        none = np.zeros((len(new), 2, len(MOVES)), np.float32)
+        self.directed = np.concatenate([self.directed, none])
         return np.argsort(np.argsort(first))[rows[known:]]
 
     def _fit(self) -> None:
         """Learn what all places have in common, how they differ, and what the prior is worth."""
-        weight, sum_of_log, *_, foretold = self.table[self.table[:, 0] >= 0.2, :5].T
+        square = squares_of(self.table[:, 5:])
+        self.climbs = climbs_of(square, self.directed)
+        # The sums of the log slowness, as if nobody had driven uphill.
+        steepest, rise = self.climbs.at(square)
+        climbed = (self.directed[:, 0] * RISES[steepest]).sum(axis=1)
+        self.flat = self.table[:, 1] - rise * climbed
+        used = self.table[:, 0] >= 0.2
+        weight, sum_of_log, foretold = self.table[used, 0], self.flat[used], self.table[used, 4]
         log = sum_of_log / weight
         columns = np.column_stack([np.ones(len(log)), foretold])
         self.variance = VARIANCE  # of the log slowness of places
@@ -164,6 +188,8 @@ class Evidence:
         if free.sum() >= SHORTEST:
             nominal = visits.metres[free] / self.nominal_speed
             expected = nominal * self.posterior.slowness[places[free]]
+            toward = (visits.toward[free] - self.posterior.turned) % len(MOVES)
+            expected *= UPHILL[self.posterior.uphill[places[free]], toward]
             seconds = visits.seconds[free].sum() + visits.waits[:, 2].sum()
             deviation = self.posterior.deviation(expected, places[free])
             self.errors.append(math.log(seconds / expected.sum()) / deviation)
@@ -194,6 +220,7 @@ class Evidence:
         """Add what other evidence has."""
         rows = self._rows(other.table[:, 5:])
         self.table[rows, :4] += other.table[:, :4]
+        self.directed[rows] += other.directed
         self.errors = [*self.errors, *other.errors][-KEPT:]
         self.surprises = [*self.surprises, *other.surprises][-KEPT:]
         self.driven += other.driven
@@ -207,18 +234,23 @@ class Evidence:
         self._fit()
 
     def restore(self, *arrays: NDArray[Any]) -> None:
-        """Take table, driven time, errors and surprises of a file; a ValueError if they lie."""
+        """Take the table and all else of a file; a ValueError if that cannot be true."""
         given = [array.astype(np.float64) for array in arrays]
-        table, driven, errors, surprises = given
-        shapes = (len(table), len(COLUMNS)), (), (errors.size,), (surprises.size,)
+        table, directed, driven, errors, surprises = given
+        of_directions = len(table), 2, len(MOVES)
+        if not directed.size:  # older files have none
+            given[1] = directed = np.zeros(of_directions)
+        of_drives = (), (errors.size,), (surprises.size,)
+        shapes = (len(table), len(COLUMNS)), of_directions, *of_drives
         possible = shapes == tuple(array.shape for array in given)
         possible = possible and all(np.isfinite(array).all() for array in given)
         if possible:
-            possible = min(table[:, [0, 2, 3]].min(initial=0), float(driven)) >= 0
+            weights = table[:, [0, 2, 3]], directed[:, 0], driven
+            possible = min(float(array.min(initial=0)) for array in weights) >= 0
             possible &= len(np.unique(self._squares(table[:, 5:]))) == len(table)
             possible &= bool(np.abs(table[:, 5:]).max(initial=0) <= FARTHEST)
         if not possible:
             raise ValueError("its evidence cannot be true")
-        self.table, self.driven = table, float(driven)
+        self.table, self.directed, self.driven = table, directed.astype("f4"), float(driven)
         self.errors, self.surprises = errors.tolist(), surprises.tolist()
         self._fit()

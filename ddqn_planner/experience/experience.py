@@ -22,7 +22,7 @@ from ddqn_planner.files import as_path, differences, locked, write_atomically
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import POSITIVE, Cells, as_number, cells_inside, numbers
 from ddqn_planner.grid.grid_map import Exploration
-from ddqn_planner.grid.moves import cells_along
+from ddqn_planner.grid.moves import MOVES, UPHILL, actions_along, cells_along
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -31,6 +31,7 @@ Step: TypeAlias = Callable[[Evidence], None]
 VERSION = 3  # 2 was never released
 PRIOR = "prior_"  # before the names of its arrays in a file
 EXPERIENCE = "experience.npz"  # the name of the file in a folder
+ARRAYS = "evidence", "directed", "driven", "errors", "surprises"  # see `Evidence.restore`
 OPTIONS = ("nominal_speed", "robot_width", "half_life", "max_pause")
 
 LATEST = 1e12  # seconds of a clock: a pose of a later time is not believed
@@ -59,11 +60,11 @@ class ExpectedTime(NamedTuple):
 class Experience:
     """How long driving takes at places of the world, learned from poses of a robot.
 
-    A place has a slowness, that is seconds over those at nominal speed, and perhaps a wait, in
-    seconds a passage. The log slowness is a Gaussian Markov random field over the free places of a
-    map: near places are alike, but not through walls. What nobody drove is expected to be as slow
-    as what was driven, or as `prior` foretells from the map. All is kept by places of the world:
-    maps may grow, shift or come in another resolution. Memory grows with the driven area.
+    A place has a slowness, that is seconds over those at nominal speed, perhaps more of it in one
+    direction, and perhaps a wait, in seconds a passage. The log slowness is a Gaussian Markov
+    random field over the free places of a map: near places are alike, but not through walls. What
+    nobody drove is expected to be as slow as what was driven, or as `prior` foretells from the map.
+    All is kept by places of the world: maps may grow, shift or come in another resolution.
 
     Evidence fades with the time that the robot drives, and at once where places have changed.
 
@@ -139,7 +140,7 @@ class Experience:
         speeds = np.hypot(*np.diff(at, axis=0).T) / np.abs(np.diff(seconds))
         usual = float(np.median(speeds)) if len(speeds) else 0.0
         max_speed, step = 3 * max(self.nominal_speed, speed, usual), max(side, WINDOW) / 2
-        steps, waits = [np.zeros((0, 3))], [np.zeros((0, 3))]
+        steps, waits = [np.zeros((0, 5))], [np.zeros((0, 3))]
         for part in _believed_parts(time, position, max_speed, self.max_pause):
             seconds, at = averaged(time[part], position[part], window)
             # Standing at the ends of a drive is no waiting on the way.
@@ -158,7 +159,7 @@ class Experience:
         entered = np.flatnonzero((np.diff(squares, axis=0, prepend=np.nan) != 0).any(axis=1))
         count, sums = np.diff(entered, append=len(rows)), np.add.reduceat(rows, entered)
         middle, waited = sums[:, :2] / count[:, None], np.concatenate(waits)
-        return Visits(middle, sums[:, 2], step * count, waited)
+        return Visits(middle, sums[:, 2], step * count, actions_along(sums[:, 3:]), waited)
 
     def record_failure(self, position: Sequence[float]) -> None:
         """Learn that the robot failed at a place: it costs as much as a wait of `max_pause`."""
@@ -166,7 +167,8 @@ class Experience:
         if not (np.abs(point) < FARTHEST).all():
             raise ValueError(f"the position is {position!r}; give metres, at most {FARTHEST:g}")
         none, waits = np.zeros((0, 2)), np.array([[*point, self.max_pause]])
-        self._learn(partial(Evidence.add, visits=Visits(none, none[:, 0], none[:, 0], waits)))
+        visits = Visits(none, none[:, 0], none[:, 0], actions_along(none), waits)
+        self._learn(partial(Evidence.add, visits=visits))
 
     def _learn(self, step: Step) -> None:
         step(self.evidence)
@@ -208,26 +210,24 @@ class Experience:
     def apply(self, grid: GridMap, exploration: float = 0.0) -> GridMap:
         """Return a map whose moves cost expected time, so that `Plan.cost` is in seconds.
 
-        Costs of the map itself multiply it.
-
         Parameters
         ----------
         grid : GridMap
-            The map.
+            The map; its own costs multiply the time.
         exploration : float
             0 or more. Plans lead where it may be faster: places count as faster by a standard
             deviation. But no plan is expected to take longer than the best one by more than this
-            share. `Plan.cost` is what is expected, and for a robot with a body what is hoped for.
+            share. `Plan.cost` is what is expected.
         """
         share = as_number("exploration", exploration, 0, 10, "0 to 10")
-        evidence = self.evidence
-        posterior = evidence.over(grid)
+        evidence, posterior = self.evidence, self.evidence.over(grid)
+        uphill = posterior.layer("uphill", posterior.uphill, 0) if posterior.uphill.any() else None
         fastest = FAST_STEP * min(0, math.floor(evidence.fastest / FAST_STEP + 0.5))
 
         def hoping(name: str, hope: Float64 | float, most: float) -> GridMap:
             slowness = posterior.paint(name, hope, fastest - most)
-            seconds_per_cell = grid.resolution / self.nominal_speed * math.exp(fastest - most)
-            return grid.with_layers(slowness=slowness, seconds_per_cell=seconds_per_cell)
+            seconds = grid.resolution / self.nominal_speed * math.exp(fastest - most)
+            return grid.with_layers(slowness=slowness, seconds_per_cell=seconds, uphill=uphill)
 
         expected = hoping("expected", 0.0, 0.0)
         if not share:
@@ -238,9 +238,10 @@ class Experience:
         return expected.with_layers(exploration=Exploration(share, bold, safe))
 
     def slowness(self, grid: GridMap) -> Float32:
-        """Return (H, W) float32: expected seconds, with waits, over those at nominal speed."""
+        """Return (H, W) float32: seconds, with waits, over nominal ones; the mean of directions."""
         posterior = self.evidence.over(grid)
-        return posterior.over(posterior.slowness, 1.0)
+        of_directions = UPHILL[posterior.uphill, : len(MOVES)].mean(axis=1)
+        return posterior.over(posterior.slowness * of_directions, 1.0)
 
     def uncertainty(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: the standard deviation of the log slowness, most if unknown."""
@@ -268,10 +269,11 @@ class Experience:
         places = posterior.place[path[:, 1], path[:, 0]]
         slowness = posterior.slowness[places]
         seconds = metres / self.nominal_speed * (slowness[1:] + slowness[:-1]) / 2
+        seconds *= UPHILL[posterior.uphill[places[1:]], actions_along(np.diff(path, axis=0))]
         deviation = posterior.deviation(seconds, places[1:])
-        low, middle, high = np.exp(self.evidence.quantiles() * deviation)
-        total = float(seconds.sum())
-        return ExpectedTime(total * middle, total * low, total * high)
+        shares = np.exp(self.evidence.quantiles() * deviation)
+        low, middle, high = (float(seconds.sum()) * shares).tolist()
+        return ExpectedTime(middle, low, high)
 
     def save(self, path: str | Path) -> None:
         """Save to a file, atomically; an OSError leaves an old file unchanged.
@@ -307,8 +309,8 @@ class Experience:
         prior = self.prior._asdict() if self.prior is not None else {}
         arrays: dict[str, Any] = {PRIOR + name: array for name, array in prior.items()}
         options, kept = list(self.options.values()), self.evidence
-        arrays |= {"evidence": kept.table, "driven": kept.driven}
-        arrays |= {"errors": kept.errors, "surprises": kept.surprises}
+        tables = kept.table, kept.directed, kept.driven, kept.errors, kept.surprises
+        arrays |= dict(zip(ARRAYS, tables, strict=True))
         np.savez(content, version=VERSION, options=options, **arrays)
         return content.getvalue()
 
@@ -325,7 +327,7 @@ class Experience:
             if not is_zipfile(io.BytesIO(data)):
                 raise ValueError("it is no .npz file")
             with np.load(io.BytesIO(data), allow_pickle=False) as file:
-                arrays = dict(file)  # whose checksums are checked
+                arrays = dict.fromkeys(ARRAYS, np.zeros(0)) | dict(file)  # older ones lack some
             version = int(arrays["version"])
             if version not in (1, VERSION):
                 raise ValueError(f"it has version {version}, not {VERSION}")
@@ -336,9 +338,7 @@ class Experience:
                 age = (arrays["driven"] - table[:, 5:]) / experience.half_life
                 faded = table[:, :2] * 0.5**age
                 arrays["evidence"] = np.hstack([faded, np.zeros((len(faded), 3)), table[:, 3:5]])
-            arrays.setdefault("surprises", np.zeros(0))  # older files have none
-            kept = (arrays[name] for name in ("evidence", "driven", "errors", "surprises"))
-            experience.evidence.restore(*kept)
+            experience.evidence.restore(*(arrays[name] for name in ARRAYS))
             prior = {n.removeprefix(PRIOR): a for n, a in arrays.items() if n.startswith(PRIOR)}
             experience.evidence.prior = Prior.from_arrays(prior) if prior else None
         except Exception as error:  # broken bytes make zipfile and NumPy raise many kinds of errors
@@ -373,8 +373,7 @@ def _believed_parts(
 ) -> Iterator[slice]:
     """Yield the parts of a drive without jumps; after a far one, none until the pose is back."""
     elapsed, last = np.diff(time), 0
-    reach = max_speed * elapsed + CORRECTION
-    far = np.hypot(*np.diff(position, axis=0).T) > reach
+    far = np.hypot(*np.diff(position, axis=0).T) > max_speed * elapsed + CORRECTION
     breaks = np.flatnonzero((elapsed <= 0) | (elapsed > max_pause) | far) + 1
     for first, end in pairwise([0, *breaks.tolist(), len(time)]):
         way = max_speed * min(max(time[first] - time[last], 0), MEMORY) + RELOCATION
@@ -412,9 +411,10 @@ def ways(position: Float64, metres: float) -> list[int]:
 
 
 def _steps(seconds: Float64, position: Float64, step: float) -> Float64:
-    """Return the middle of each step of a way, and its seconds: (N, 3)."""
+    """Return the middle of each step of a way, its seconds, and itself: (N, 5)."""
     metres = np.hypot(*np.diff(position, axis=0).T)
     along, clock = (np.cumsum(np.append(0, values)) for values in (metres, seconds))
     ends = np.arange(0, along[-1], step)
-    x, y, at = (np.interp(ends, along, values) for values in (*position.T, clock))
-    return np.column_stack([(x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2, np.diff(at)])
+    points = np.column_stack([np.interp(ends, along, axis) for axis in (*position.T, clock)])
+    middle = (points[1:] + points[:-1]) / 2
+    return np.column_stack([middle[:, :2], np.diff(points, axis=0)[:, [2, 0, 1]]])

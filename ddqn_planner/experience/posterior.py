@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place
+from ddqn_planner.experience.directions import NOISE, squares_of
 from ddqn_planner.experience.prior import Prior, map_features
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
+from ddqn_planner.grid.moves import MOVES, STEEPER
 
 if TYPE_CHECKING:
     from ddqn_planner.experience.evidence import Evidence
@@ -21,11 +23,13 @@ Int64 = NDArray[np.int64]
 
 CORRELATION = 1.0  # metres: how far the slowness of a place tells of that of others
 STEP = 0.02  # slowness is told in steps of this share: fields need no repair for less
+STEPS = (1 + STEP) ** np.arange(1 + round(math.log(MAX_SLOWNESS) / math.log(1 + STEP)))
+STEPS = np.minimum(STEPS, MAX_SLOWNESS).astype(np.float32)
+STEEPEST = 15  # steps of `GridMap.uphill`: of more, fields would need more memory
 ACCURACY = 0.01  # of the log slowness: no place is farther from the solution of its equations
 OVER_RELAXATION = 1.4  # of the solver: neighbours agree sooner
 WAIT_PLACES = 0.1  # so many places around each one are assumed to be driven without a wait
 FEW_PLACES = 16.0  # it is assumed that so many were driven where nothing was slow
-NOISE = 0.1  # variance of the log slowness of one visit
 # Standard deviations of the log time of a drive: on ways that are known, and that are not.
 DRIVE_NOISE, UNSURE = 0.05, 0.42
 
@@ -54,7 +58,10 @@ class Posterior:
         self.solution = np.zeros(count, dtype=np.complex128)
         self.prior: Prior | None = None
         self.foretold = np.zeros(count)  # by the prior
-        self.painted: dict[str, tuple[Float64, NDArray[np.float32]]] = {}  # steps, and the map
+        squares = squares_of(np.column_stack(grid.centres(*self.middle.T)))
+        self.square, self.in_square = np.unique(squares, return_inverse=True)
+        self.turned = round(grid.origin[2] / (math.pi / 4))  # by so many actions
+        self.painted: dict[str, tuple[NDArray[Any], NDArray[Any]]] = {}  # steps, and the map
 
     def deviation(self, seconds: Float64, places: Int64) -> float:
         """Return the standard deviation of the log time of a way, by its seconds in places."""
@@ -78,7 +85,9 @@ class Posterior:
         places = self.places_at(evidence.table[:, 5:])
         inside = places >= 0
         sums = np.zeros((len(self.middle), 4))
-        np.add.at(sums, places[inside], evidence.table[inside, :4])
+        table = evidence.table[:, :4].copy()
+        table[:, 1] = evidence.flat
+        np.add.at(sums, places[inside], table[inside])
         weight, log, passed, waited = sums.T
         # A lattice whose links have strength 1 has about the variance ln(32 / kappa) / 4 pi;
         # 1 is added for cells of many metres, where that would be negative.
@@ -100,6 +109,10 @@ class Posterior:
         self.unknown = np.sqrt(1 - self.known)
         self.mean = self.expected + self.solution.real + evidence.surplus * (1 - self.known)
         self.slowness = np.exp(self.mean)
+        toward, rise = evidence.climbs.at(self.square)
+        steps = np.minimum(np.rint(rise / STEEPER), STEEPEST).astype(np.int64)
+        codes = np.where(steps > 0, len(MOVES) * steps + (toward - self.turned) % len(MOVES), 0)
+        self.uphill = codes.astype(np.uint8)[self.in_square]
         if waited.any():
             self.slowness += evidence.nominal_speed * self._waits(passed, waited, evidence.side)
 
@@ -128,14 +141,17 @@ class Posterior:
     def paint(self, name: str, hope: Float64 | float, fastest: float) -> NDArray[np.float32]:
         """Return (H, W) float32: the slowness over that of the fastest place, which has this log.
 
-        Each place counts as faster by its hope (P,), a logarithm, too. If nothing changed since the
-        last call with this name, the array is the same one.
+        Each place counts as faster by its hope (P,), a logarithm, too.
         """
         log = np.log(self.slowness) - hope - fastest
         steps = np.rint(np.clip(log, 0, math.log(MAX_SLOWNESS)) / math.log(1 + STEP))
-        if name not in self.painted or not np.array_equal(steps, self.painted[name][0]):
-            of_places = np.exp(steps * math.log(1 + STEP))
-            self.painted[name] = steps, self.over(np.minimum(of_places, MAX_SLOWNESS), 1.0)
+        return self.layer(name, STEPS.take(steps.astype(np.int64)), 1)
+
+    def layer(self, name: str, values: NDArray[Any], occupied: int) -> NDArray[Any]:
+        """Return (H, W): of each cell the value of its place; the same array while none changes."""
+        if name not in self.painted or not np.array_equal(values, self.painted[name][0]):
+            whole = np.append(values, values.dtype.type(occupied))
+            self.painted[name] = values, whole.take(self.place, mode="wrap")
         return self.painted[name][1]
 
     def over(self, values: Float64, occupied: float) -> NDArray[np.float32]:

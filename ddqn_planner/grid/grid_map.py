@@ -19,12 +19,13 @@ from ddqn_planner.grid.moves import MoveRule, flood, legal_moves
 MAX_COST_MULTIPLIER = 5.0
 """That of a cell of value 100 or unknown; as in Nav2's NavFn planner: 50 if free, at most 253."""
 
-LAYERS = "occupancy", "cost", "forbidden", "slowness"  # what its moves depend on
+LAYERS = "occupancy", "cost", "forbidden", "slowness", "uphill"  # what its moves depend on
 PATCHED = {"occupancy", "cost", "obstacles"}  # layers of which patches change some cells
 MAX_PATCHES = 512  # so many are known of a map, one after the other
 
-# Directions, costs and slowness of maps without. Not to be written to, as those of maps.
-NO_LAYERS = [np.frombuffer(b"", kind).reshape(0, 0) for kind in (np.uint8, np.int8, np.float32)]
+# Directions, costs, slowness and climbs of maps without. Not to be written to, as those of maps.
+DTYPES = np.uint8, np.int8, np.float32, np.uint8
+NO_LAYERS = [np.frombuffer(b"", dtype).reshape(0, 0) for dtype in DTYPES]
 
 # (101,): the multiplier of each cost, 0 to 100
 MULTIPLIERS = np.linspace(1, MAX_COST_MULTIPLIER, OCCUPIED + 1, dtype=np.float32)
@@ -60,6 +61,9 @@ class GridMap:
         The expected time in each cell over that at nominal speed, 1 to 100; it multiplies the cost.
     seconds_per_cell : float, optional
         The time for the length of a cell at nominal speed: with it, `Plan.cost` is in seconds.
+    uphill : (H, W) array of whole numbers 0..255, optional
+        Where driving in one direction takes longer: from a cell with 8 s + a, action a has the cost
+        of others times exp(0.15 s), and those beside it times exp(0.15 s cos(angle between them)).
     """
 
     occupancy: Occupancy
@@ -70,6 +74,7 @@ class GridMap:
     forbidden: NDArray[np.uint8] | None = None
     slowness: NDArray[np.float32] | None = None
     seconds_per_cell: float | None = None
+    uphill: NDArray[np.uint8] | None = None
 
     def __post_init__(self) -> None:
         occupancy = arguments.as_mask("occupancy", self.occupancy)
@@ -90,6 +95,11 @@ class GridMap:
             slowest = 1, arguments.MAX_SLOWNESS
             times = arguments.numbers("slowness", self.slowness, shape, "iuf", slowest, whole=False)
             self._set(slowness=times.astype(np.float32, order="C"))
+        if self.uphill is not None:
+            codes = arguments.numbers("uphill", self.uphill, shape, between=(0, 255))
+            self._set(uphill=codes.astype(np.uint8, order="C"))
+            if self.slowness is None:  # so there is one wherever moves take longer
+                self._set(slowness=np.ones(shape, np.float32))
         if (seconds := self.seconds_per_cell) is not None:
             seconds = as_number("seconds_per_cell", seconds, *POSITIVE, "more than 0")
             self._set(seconds_per_cell=seconds)
@@ -190,7 +200,8 @@ class GridMap:
         """Return the boxes, rows and columns, that `with_patch` replaced since an older map."""
         # None if it is no such map, or has other layers, or there were more than `MAX_PATCHES`.
         versions, (older_version, _) = [version for version, _ in self._history], older._history[-1]
-        has_same = self.forbidden is older.forbidden and self.slowness is older.slowness
+        names = "forbidden", "slowness", "uphill"
+        has_same = all(getattr(self, name) is getattr(older, name) for name in names)
         if not has_same or older_version not in versions:
             return None
         return [box for _, box in self._history[versions.index(older_version) + 1 :]]
@@ -204,7 +215,7 @@ class GridMap:
         hopes = other.exploration
         if hopes is not None:
             hopes = Exploration(hopes.share, *(self.with_times_of(each) for each in hopes[1:]))
-        times = {name: getattr(other, name) for name in ("slowness", "seconds_per_cell")}
+        times = {name: getattr(other, name) for name in ("slowness", "uphill", "seconds_per_cell")}
         return self.with_layers(**times, exploration=hopes)
 
     def with_layers(self, **layers: Any) -> GridMap:
@@ -260,7 +271,8 @@ class GridMap:
 
     def for_kernels(self, move_rule: MoveRule | str) -> tuple[Any, ...]:
         """Return what compiled code asks of the map; empty arrays for missing layers."""
-        rule, layers = MoveRule(move_rule), (self.forbidden, self.cost, self.slowness)
+        rule = MoveRule(move_rule)
+        layers = self.forbidden, self.cost, self.slowness, self.uphill
         known = [none if it is None else it for it, none in zip(layers, NO_LAYERS, strict=True)]
         return self.occupancy, *known, rule.cuts_corners, rule is MoveRule.UNIT
 
@@ -287,10 +299,10 @@ class GridMap:
         """Hexadecimal digest of size and cells; equal maps have the same digest."""
         digest = hashlib.sha256(f"{self.height}x{self.width}:".encode())
         digest.update(np.packbits(self.occupancy).tobytes())
-        layers = (b"", self.cost), (b"forbidden:", self.forbidden), (b"slowness:", self.slowness)
-        for name, layer in layers:
-            if layer is not None:
-                digest.update(name + layer.tobytes())
+        for name in LAYERS[1:]:
+            if (layer := getattr(self, name)) is not None:
+                digest.update(b"" if name == "cost" else f"{name}:".encode())
+                digest.update(layer.tobytes())
         return digest.hexdigest()[:16]
 
     @cached_property

@@ -18,6 +18,14 @@ MOVES: NDArray[np.int64] = np.array(
 )
 """(8, 2) int64: (dx, dy) of each action, counter-clockwise; action k points at k * pi / 4."""
 
+STEEPER = 0.15  # log cost of a move by each step of `GridMap.uphill`
+
+# (256, 9) float32: the factor of the cost of each action by `GridMap.uphill`, and of no move, 1.
+_turned = (np.arange(256)[:, None] - np.arange(8)) * np.pi / 4
+_steps = np.arange(256)[:, None] >> 3
+UPHILL = np.exp(STEEPER * _steps * np.maximum(np.cos(_turned), 0)).astype(np.float32)
+UPHILL = np.hstack([UPHILL, np.ones((256, 1), np.float32)])
+
 LENGTHS: NDArray[np.float64] = np.hypot(MOVES[:, 0], MOVES[:, 1])
 """(8,) float64: the length of each action in cells, 1 or sqrt(2)."""
 
@@ -72,13 +80,25 @@ def neighbours(shape: tuple[int, int]) -> NDArray[np.int64]:
     return np.stack([_shifted(padded, dx, dy).ravel() for dx, dy in MOVES.tolist()])
 
 
-def move_costs(multiplier: NDArray[np.float32], move_rule: MoveRule | str) -> NDArray[np.float64]:
+def move_costs(
+    multiplier: NDArray[np.float32],
+    move_rule: MoveRule | str,
+    uphill: NDArray[np.uint8] | None = None,
+) -> NDArray[np.float64]:
     """Return (8, H, W) float64: the length of each move times the mean multiplier of its cells."""
-    padded = np.pad(multiplier, 1, mode="edge").astype(np.float64)
-    target = np.stack([_shifted(padded, dx, dy) for dx, dy in MOVES.tolist()])
+    each = multiplier[None] if uphill is None else multiplier * UPHILL.T[: len(MOVES), uphill]
+    padded = np.pad(each, ((0, 0), (1, 1), (1, 1)), mode="edge").astype(np.float64)
+    moves = enumerate(MOVES.tolist())
+    target = np.stack([_shifted(padded[a % len(padded)], dx, dy) for a, (dx, dy) in moves])
     lengths = MoveRule(move_rule).lengths[:, None, None]
-    costs: NDArray[np.float64] = lengths * (multiplier + target) / 2
+    costs: NDArray[np.float64] = lengths * (each + target) / 2
     return costs
+
+
+def actions_along(vectors: NDArray[Any]) -> NDArray[np.int64]:
+    """Return the action whose direction is the nearest to that of each vector: (N, 2), (N,)."""
+    eighths: NDArray[np.float64] = np.arctan2(vectors[:, 1], vectors[:, 0]) / (np.pi / 4)
+    return np.rint(eighths).astype(np.int64) % len(MOVES)
 
 
 def path_length(cells: Cells, move_rule: MoveRule | str = MoveRule.ROBOT_SAFE) -> float:
@@ -88,10 +108,13 @@ def path_length(cells: Cells, move_rule: MoveRule | str = MoveRule.ROBOT_SAFE) -
 
 def path_cost(grid: GridMap, cells: Cells, move_rule: MoveRule | str) -> float:
     """Return the cost of a path of moves: see `move_costs`."""
-    x, y = np.asarray(cells, dtype=np.int64).reshape(-1, 2).T
+    path = np.asarray(cells, dtype=np.int64).reshape(-1, 2)
+    ends = np.stack([path[:-1], path[1:]])
+    x, y = ends.transpose(2, 0, 1)
     multiplier = grid.cost_multiplier[y, x].astype(np.float64)
-    of_moves = _segment_lengths(cells, move_rule) * (multiplier[1:] + multiplier[:-1]) / 2
-    return float(of_moves.sum())
+    if grid.uphill is not None:
+        multiplier *= UPHILL[grid.uphill[y, x], actions_along(np.diff(path, axis=0))]
+    return float((_segment_lengths(cells, move_rule) * multiplier.mean(axis=0)).sum())
 
 
 def _segment_lengths(cells: Cells, move_rule: MoveRule | str) -> NDArray[np.float64]:
@@ -150,12 +173,13 @@ def _dijkstra(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> Any:
     step = (MOVES[:, 1] * grid.width + MOVES[:, 0]).astype(np.int32)
     order = np.argsort(step)
     legal_NA = grid.legal_moves(move_rule)[order].reshape(len(MOVES), -1).T
-    cost_NA = move_costs(grid.cost_multiplier, move_rule)[order].reshape(len(MOVES), -1).T
+    costs = move_costs(grid.cost_multiplier, move_rule, grid.uphill)
+    cost_NA = costs[order].reshape(len(MOVES), -1).T
     next_NA = np.arange(len(legal_NA), dtype=np.int32)[:, None] + step[order]
     ends = np.cumsum(np.count_nonzero(legal_NA, axis=1), dtype=np.int32)
     rows = np.append(np.int32(0), ends)
     graph = csr_array((cost_NA[legal_NA], next_NA[legal_NA], rows), shape=(len(ends), len(ends)))
-    if grid.forbidden is not None:  # else every move is legal, and costs the same, both ways
+    if grid.forbidden is not None or grid.uphill is not None:  # else moves are alike both ways
         graph = graph.T
     return dijkstra(graph, indices=y * grid.width + x, return_predecessors=True)
 
@@ -163,7 +187,7 @@ def _dijkstra(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> Any:
 @inlined
 def is_legal(x: int, y: int, action: int, of_map: Any) -> Any:  # pragma: no cover
     """Return whether a move between free cells is legal, see `GridMap.for_kernels`."""
-    occupancy, forbidden, _, _, cuts_corners, _ = of_map
+    occupancy, forbidden, _, _, _, cuts_corners, _ = of_map
     if forbidden.size > 0 and forbidden[y, x] >> action & 1:
         return False
     to_x, to_y = x + MOVES[action, 0], y + MOVES[action, 1]

@@ -207,7 +207,7 @@ class DistanceField(QField):
         """Return what a kernel writes for each cell of the whole field: (..., H, W)."""
         with self._lock:
             self.grow()
-            write(self.known.distance, layer, self.costs[:6])
+            write(self.known.distance, layer, self.costs[:7])
         return layer.reshape(*layer.shape[:-1], -1, self.costs.width)[..., 1:-1, 1:-1]
 
     @cached_property

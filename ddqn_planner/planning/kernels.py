@@ -4,13 +4,15 @@
 # allocates, slices, and `min`, `max` and `int`. So arrays are passed in, empty ones for none.
 
 import math
+from functools import partial
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.compiled import in_place, inlined
+from ddqn_planner.compiled import in_place, inlined, inner
 from ddqn_planner.grid import MOVES, Cell
+from ddqn_planner.grid.moves import UPHILL
 from ddqn_planner.model.move_costs import VALUES, MoveCosts
 
 Distances = NDArray[np.float64]
@@ -45,14 +47,24 @@ class Known(NamedTuple):
     closed_is_final: bool = True
 
 
+# Not inlined: what few maps need must not slow the others down.
+@partial(inner, _nrt=False)
+def _uphill(cell: Any, after: Any, action: Any, multiplier: Any, uphill: Any) -> Any:
+    """Return the multipliers of an action's cells where it may lead uphill, added."""
+    here = np.float64(multiplier[cell]) * UPHILL[np.uint64(uphill[cell]), action]
+    return here + np.float64(multiplier[after]) * UPHILL[np.uint64(uphill[after]), action]
+
+
 # Kernels take the first fields of `MoveCosts` as a plain tuple, which numba knows sooner.
 @inlined
 def cost_of(cell: int, action: int, costs: Any) -> Any:
     """Return the cost of a move, infinite if it is not possible. See `MoveCosts`."""
-    patch, table, value, terms, multiplier, width = costs
+    patch, table, value, terms, multiplier, uphill, width = costs
     cost = table[ACTIONS * np.uint64(patch[np.uint64(cell)]) + np.uint64(action)]
     after = np.uint64(cell + MOVE_Y[action] * width + MOVE_X[action])
     if multiplier.size > 0:
+        if uphill.size > 0:
+            return cost * _uphill(np.uint64(cell), after, np.uint64(action), multiplier, uphill) / 2
         return cost * (np.float64(multiplier[np.uint64(cell)]) + multiplier[after]) / 2
     if terms.size > 0:
         place = np.uint64(action) * OF_ACTION
@@ -87,7 +99,7 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
         bucket, used = np.empty((ring, capacity), np.int32), np.zeros(ring, np.int64)
         how = start, bounds, buckets, limit, offsets
         queue = opened, order, bucket, used
-        taken, visited, is_full = _grow(distance, state, queue, how, costs[:6])
+        taken, visited, is_full = _grow(distance, state, queue, how, costs[:7])
         left = [bucket[slot, : used[slot]] for slot in used.nonzero()[0]]
         opened = np.concatenate([opened[taken:], *left])
         limit, capacity = limit - visited, 4 * capacity
@@ -124,7 +136,7 @@ def _remaining(x: int, y: int, bounds: Any) -> Any:
 @in_place
 def _grow(distance: Any, state: Any, queue: Any, how: Any, costs: Any) -> tuple[int, int, bool]:
     """Do the work of `grow`, with the open cells in their order, until a bucket may be full."""
-    patch, table, value, terms, _, width = costs
+    patch, table, value, terms, _, _, width = costs
     opened, order, bucket, used = queue
     start, bounds, buckets, limit, offsets = how
     start_y, start_x = start // width, start % width
@@ -216,7 +228,7 @@ def take_back(known: Known, costs: MoveCosts, changed: Cells, limit: int) -> Kno
     # Likhachev 2002, is the same for one start).
     lost, waiting = np.empty(limit, np.int32), np.empty(changed.size + 8 * limit, np.int32)
     waiting[: changed.size] = changed
-    number = _take_back(known.distance, known.state, changed, lost, waiting, costs[:6])
+    number = _take_back(known.distance, known.state, changed, lost, waiting, costs[:7])
     opened = np.concatenate([known.opened, waiting[: max(number, 0)]])
     return Known(known.distance, known.state, opened, False) if number >= 0 else None
 
@@ -271,7 +283,7 @@ def roll_out(distance: Distances, costs: MoveCosts, start: int, toward: Cell) ->
     """Return the (x, y) of greedy steps from a closed start to the goal, both too: (N, 2)."""
     most = 2 + int(1.01 * distance[start])  # no move costs less than 1; sums are rounded
     path: Cells = np.empty((min(most, distance.size), 2), np.int32)
-    return path[: _roll_out(distance, start, path, toward, costs[:6])]
+    return path[: _roll_out(distance, start, path, toward, costs[:7])]
 
 
 @in_place

@@ -19,6 +19,7 @@ from ddqn_planner.planning.segments import (
     legal_segments,
     multiplier_at,
     straightened,
+    uphill_at,
 )
 
 REACH = 5  # cells along an axis that a robot may be beside its path, and still come back to it
@@ -80,7 +81,10 @@ def _search(
             if not (0 <= to_x < width and 0 <= to_y < height) or visited[to_y, to_x]:
                 continue
             if not layers[0][to_y, to_x] and is_legal(x, y, action, layers):
-                both = multiplier_at(x, y, layers) + multiplier_at(to_x, to_y, layers)
+                dx, dy = to_x - x, to_y - y
+                both = multiplier_at(x, y, layers) * uphill_at(x, y, dx, dy, layers)
+                there = uphill_at(to_x, to_y, dx, dy, layers)
+                both += multiplier_at(to_x, to_y, layers) * there
                 through = cost + lengths[action] * both / 2
                 order = through - value[to_y, to_x]
                 if np.isnan(order):

@@ -11,9 +11,10 @@ from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.footprint import inside, outline
 from ddqn_planner.grid.grid_map import MULTIPLIERS
 from ddqn_planner.grid.motions import BEHIND, TURN, turn_between
+from ddqn_planner.grid.moves import UPHILL, actions_along
 from ddqn_planner.planning.plan import PlanStatus, PosePlan
 from ddqn_planner.planning.pose_world import body_costs, occupied_for_body
-from ddqn_planner.planning.segments import BITS
+from ddqn_planner.planning.segments import ACTIONS
 
 Float64 = NDArray[np.float64]
 Body = tuple[Float64, Float64]
@@ -94,8 +95,8 @@ def is_free(poses: Float64, grid: GridMap, body: Body) -> bool:
     if grid.forbidden is None:
         return True
     x, y = cells_of(path).T
-    leaves = BITS[np.clip(np.diff(y), -1, 1) + 1, np.clip(np.diff(x), -1, 1) + 1]
-    return not (grid.forbidden[y[:-1], x[:-1]] & leaves).any()
+    leaves = ACTIONS[np.clip(np.diff(y), -1, 1) + 1, np.clip(np.diff(x), -1, 1) + 1]
+    return not (grid.forbidden[y[:-1], x[:-1]] >> leaves & 1).any()
 
 
 def cells_of(path: Float64) -> NDArray[np.int32]:
@@ -117,6 +118,9 @@ def cost_of_poses(poses: Float64, grid: GridMap) -> float:
         spent *= MULTIPLIERS.take(cost[y, x], mode="wrap")
     if grid.slowness is not None:
         spent *= grid.slowness[y, x]
+    if grid.uphill is not None:
+        moves = np.where(length < 1e-6, 8, actions_along(steps))
+        spent *= UPHILL[grid.uphill[y, x], moves]
     return float(spent.sum())
 
 

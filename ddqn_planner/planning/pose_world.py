@@ -11,8 +11,9 @@ from ddqn_planner.grid.arguments import OCCUPIED
 from ddqn_planner.grid.copies import Box
 from ddqn_planner.grid.grid_map import MULTIPLIERS
 from ddqn_planner.grid.motions import HEADINGS, Motions, closer
+from ddqn_planner.grid.moves import UPHILL, actions_along
 from ddqn_planner.planning.field import changed_cells
-from ddqn_planner.planning.segments import BITS
+from ddqn_planner.planning.segments import ACTIONS
 
 SHIFT: Final = 2  # so many bits tell where in its tile a cell lies, along a side
 TILE: Final = 1 << SHIFT  # cells of a side
@@ -40,7 +41,7 @@ class Body(NamedTuple):
     row: NDArray[np.int64]  # (R, 2): y and x of the first of 64 swept cells in a row, or fewer
     bits: NDArray[np.uint64]  # (R,): which of them
     first: NDArray[np.int64]  # (P + 35,): where the rows of each begin
-    passed: NDArray[np.int64]  # (C, 3): x, y, bit of the action by which the origin leaves the cell
+    passed: NDArray[np.int64]  # (C, 4): x, y, how the origin leaves the cell, and moves in it
     share: NDArray[np.float32]  # (C,): which part of the cost counts in this cell
     first_passed: NDArray[np.int64]  # (P + 1,)
     reach: int  # cells that a primitive sweeps to any side of its begin or end, at most
@@ -53,6 +54,7 @@ class World(NamedTuple):
     cost: NDArray[np.int8]  # (H, W)
     slowness: NDArray[np.float32]  # (H, W)
     forbidden: NDArray[np.uint8]  # (H, W)
+    uphill: NDArray[np.uint8]  # (H, W)
     tile: NDArray[np.uint8]  # by tile: whether the body can reach an occupied cell, once known
     room: NDArray[np.uint8]  # by tile: whether the body may pass one of its cells, likewise
     height: int
@@ -72,7 +74,7 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
         around_end = np.roll(mask, (-y, -x), axis=(0, 1))
         standing[after] &= around_end
         either |= around_end
-        for over, up, _ in cells:
+        for over, up, *_ in cells:
             core[before] &= np.roll(mask, (-up, -over), axis=(0, 1))
     reach = int(np.abs(np.argwhere(either) - swept.shape[1] // 2).max())
     around = np.ones((1, 2 * reach + TILE + 1, 2 * reach + TILE + 1), dtype=np.bool_)
@@ -110,7 +112,7 @@ def rows_of(
 
 
 def _passed(poses: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the cells that the origin passes, with the action that leaves each; and its shares."""
+    """Return the cells that the origin passes, with two actions, 8 for none; and its shares."""
     way = closer(poses, FINE, 0.0)[:, :2]
     middle, length = (way[1:] + way[:-1]) / 2, np.hypot(*np.diff(way, axis=0).T)
     if not length.any():
@@ -119,7 +121,9 @@ def _passed(poses: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.f
     begins = np.flatnonzero(np.r_[True, (cells[1:] != cells[:-1]).any(axis=1)])
     share = np.add.reduceat(length, begins) / length.sum()
     x, y = np.diff(cells[begins], axis=0).T
-    return np.column_stack([cells[begins], [*BITS[y + 1, x + 1], 0]]), share
+    moved = way[np.append(begins[1:], len(way) - 1)] - way[begins]
+    moves = np.where(moved.any(axis=1), actions_along(moved), 8)
+    return np.column_stack([cells[begins], [*ACTIONS[y + 1, x + 1], 8], moves]), share
 
 
 def occupied_for_body(grid: GridMap) -> NDArray[np.bool_]:
@@ -168,6 +172,7 @@ def world_of(
         _layer(body_costs(grid), np.int8),
         _layer(grid.slowness, np.float32),
         _layer(grid.forbidden, np.uint8),
+        _layer(grid.uphill, np.uint8),
         tile,
         room,
         height,
@@ -239,8 +244,11 @@ def cost_of(x: int, y: int, number: int, world: Any, body: Any) -> Any:
     total = np.float32(0)
     for place in range(body.first_passed[number], body.first_passed[number + 1]):
         column, line = x + body.passed[place, 0], y + body.passed[place, 1]
-        total += body.share[place] * multiplier_in(column, line, world)
-        if world.forbidden.size > 0 and world.forbidden[line, column] & body.passed[place, 2]:
+        part = body.share[place] * multiplier_in(column, line, world)
+        if world.uphill.size > 0:
+            part *= UPHILL[world.uphill[line, column], body.passed[place, 3]]
+        total += part
+        if world.forbidden.size > 0 and world.forbidden[line, column] >> body.passed[place, 2] & 1:
             return np.float32(np.inf)
     # Rounded, the shares may be less than 1 together; what counts on the least cost relies on it.
     return cost * max(total, np.float32(1))

@@ -1,21 +1,24 @@
 """Straight segments between cells, and paths of few of them: string pulling, in compiled code."""
 
 import math
+from functools import partial
 from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.compiled import in_place, inlined
+from ddqn_planner.compiled import in_place, inlined, inner
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import Cells, cells_inside
 from ddqn_planner.grid.grid_map import MULTIPLIERS, check_grid
+from ddqn_planner.grid.moves import UPHILL
 
 Path: TypeAlias = NDArray[np.int32]  # (N, 2): cells, joined by moves or by segments
 LONG: Final = 400  # cells: a longer path is pulled once, as twice saves less than 0.1 %
 SAME_COST: Final = 1 + 1e-9  # a path may cost so much more, and still as much: sums are rounded
-BITS = np.zeros((3, 3), np.uint8)  # the action by which a step is taken, in a set of them
-BITS[MOVES[:, 1] + 1, MOVES[:, 0] + 1] = 1 << np.arange(8)
+ACTIONS = np.full((3, 3), 8)  # the action by which a step is taken, 8 for none
+ACTIONS[MOVES[:, 1] + 1, MOVES[:, 0] + 1] = np.arange(8)
+BITS = (1 << ACTIONS).astype(np.uint8)  # that action in a set of them
 
 
 def simplify(cells: Cells, grid: GridMap, move_rule: MoveRule | str) -> tuple[Cell, ...]:
@@ -96,10 +99,25 @@ def _length(width: int, height: int, is_unit: bool) -> float:
 @inlined
 def multiplier_at(x: int, y: int, layers: Any) -> Any:
     """Return the cost multiplier of a cell, see `GridMap.cost_multiplier`."""
-    _, _, cost, slowness, _, _ = layers
+    _, _, cost, slowness, _, _, _ = layers
     column, row = np.uint64(x), np.uint64(y)
     multiplier = np.float64(MULTIPLIERS[cost[row, column]]) if cost.size else 1.0
     return multiplier * slowness[row, column] if slowness.size else multiplier
+
+
+@partial(inner, _nrt=False)  # not inlined: what few maps need must not slow the others down
+def uphill_at(x: int, y: int, dx: int, dy: int, layers: Any) -> Any:
+    """Return the factor of a way's cost in a cell, see `GridMap.uphill`: between two actions'."""
+    uphill = layers[4]
+    if uphill.size == 0:
+        return 1.0
+    code, width, height = uphill[np.uint64(y), np.uint64(x)], abs(dx), abs(dy)
+    step_x, step_y = (dx > 0) - (dx < 0), (dy > 0) - (dy < 0)
+    diagonal = UPHILL[code, ACTIONS[step_y + 1, step_x + 1]]
+    straight = ACTIONS[step_y * (height >= width) + 1, step_x * (width >= height) + 1]
+    shorter, longer = (width, height) if width < height else (height, width)
+    share = shorter / longer if longer > 0 else 0.0
+    return share * diagonal + (1 - share) * UPHILL[code, straight]
 
 
 @inlined
@@ -111,7 +129,7 @@ def _is_free(x: int, y: int, occupancy: Any) -> bool:
 @inlined
 def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -> float:
     """Return the cost of a segment, infinity if it is not legal from a share of it on."""
-    occupancy, forbidden, cost, slowness, cuts_corners, is_unit = layers
+    occupancy, forbidden, cost, slowness, uphill, cuts_corners, is_unit = layers
     has_costs = cost.size + slowness.size > 0
     dx, dy = last_x - x, last_y - y
     step_x, step_y = (dx > 0) - (dx < 0), (dy > 0) - (dy < 0)
@@ -138,7 +156,8 @@ def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -
             blocked |= occupancy[np.uint64(y + step_y), column]
         legal = until <= ignored or not blocked
         if has_costs:
-            total += (until - at) * multiplier_at(x, y, layers)
+            part = (until - at) * multiplier_at(x, y, layers)
+            total += part * uphill_at(x, y, dx, dy, layers) if uphill.size else part
         at = until
         if at_column == until:
             x, at_column = x + step_x, at_column + 2 * height
@@ -153,7 +172,7 @@ def _is_right_angle(
     x: int, y: int, at_x: int, at_y: int, to_x: int, to_y: int, layers: Any
 ) -> bool:
     """Return if a way is surely the least: a right angle around an occupied cell, no costs."""
-    occupancy, _, cost, slowness, cuts_corners, _ = layers
+    occupancy, _, cost, slowness, _, cuts_corners, _ = layers
     dx, dy = x + to_x - 2 * at_x, y + to_y - 2 * at_y
     inner = occupancy[at_y + (dy > 0) - (dy < 0), at_x + (dx > 0) - (dx < 0)]
     is_right = (x == at_x or to_x == at_x) and (y == at_y or to_y == at_y)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import RULES, Data, Place, grids_with_costs, grids_with_directions
+from strategies import RULES, Data, Place, grids_uphill, grids_with_costs, grids_with_directions
 
 from ddqn_planner import GridMap, MoveRule
 from ddqn_planner.grid import LENGTHS, MAX_COST_MULTIPLIER, MOVES, neighbours, shortest_path
@@ -52,6 +52,16 @@ def test_neighbours_are_numbered_row_by_row_and_outside_comes_last(shape: tuple[
     numbers = np.pad(np.arange(size).reshape(shape), 1, constant_values=size)
     expected = [numbers[1 + y : 1 + y + height, 1 + x : 1 + x + width].ravel() for x, y in MOVES]
     np.testing.assert_array_equal(neighbours(shape), expected, strict=True)
+
+
+def test_a_move_uphill_costs_more_and_one_downhill_does_not() -> None:
+    uphill = np.zeros((1, 3))
+    uphill[0, 1] = 8 * 10 + 2  # toward greater y
+    cost = move_costs(np.ones((1, 3), np.float32), "unit", uphill.astype(np.uint8))[:, 0, 1]
+    steep, slanting = math.exp(1.5), math.exp(1.5 * math.cos(math.pi / 4))
+    # Each move counts half in the cell that it enters, which is flat or beyond the map's edge.
+    beside = [(1 + 1) / 2, (slanting + 1) / 2, steep, (slanting + 1) / 2, (1 + 1) / 2, 1, 1, 1]
+    assert cost == pytest.approx(beside)
 
 
 @given(grids_with_costs(), RULES)
@@ -102,11 +112,11 @@ def test_reachable_is_exact(place: Place, rule: MoveRule, has_directions: bool, 
         assert forward[y, x] == any(np.isfinite(distance[cell[::-1]]) for cell in cells)
 
 
-@given(grids_with_directions(), RULES, st.data())
+@given(grids_with_directions() | grids_uphill(), RULES, st.data())
 def test_distances_and_paths_are_exact(place: Place, rule: MoveRule, data: Data) -> None:
     grid, goal = place
     distance = shortest_distances(grid, goal, rule)
-    legal, cost = grid.legal_moves(rule), move_costs(grid.cost_multiplier, rule)
+    legal, cost = grid.legal_moves(rule), move_costs(grid.cost_multiplier, rule, grid.uphill)
     assert distance[goal[1], goal[0]] == 0
     assert np.isinf(distance[grid.occupancy]).all()
     for x, y in set(grid.free_cells()) - {goal}:

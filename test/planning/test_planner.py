@@ -71,7 +71,7 @@ def test_a_plan_is_the_cheapest(
     for start in data.draw(st.lists(st.sampled_from(grid.free_cells()), min_size=1, max_size=4)):
         plan = planner.plan(grid, start, goal, rule, method)
         assert (plan.method, plan.move_rule) == (PlanMethod.GREEDY, rule)
-        assert (plan.cost is None) == (grid.cost is None or not plan.cells)
+        assert (plan.cost is None) == (not grid.has_costs or not plan.cells)
         if np.isinf(exact[start[::-1]]):
             assert plan.status is PlanStatus.NO_PATH
             continue
@@ -339,7 +339,7 @@ def test_the_nearest_goal_is_cheapest(place: Place, rule: MoveRule, data: Data) 
         assert plan.goal == plan.cells[-1]
         assert plan.goal in free
         cost = plan.length if plan.cost is None else plan.cost
-        assert min(optimum) - 1e-9 <= cost <= 1.02 * min(optimum)
+        assert min(optimum) * (1 - 1e-6) <= cost <= 1.02 * min(optimum)
         singles = [new_planner().plan(grid, start, goal, rule) for goal in free]
         assert cost <= 1.02 * min(p.cost or p.length for p in singles if p.cells)
 
@@ -454,7 +454,7 @@ def test_a_path_through_goals_is_the_sum_of_its_pieces(
     assert list(plan.cells) == cells[:1] + [cell for last, cell in pairwise(cells) if last != cell]
     assert plan.goal == here
     assert plan.length == pytest.approx(sum(piece.length for piece in pieces))
-    assert (plan.cost is None) == (grid.cost is None)
+    assert (plan.cost is None) == (not grid.has_costs)
     if plan.cost is not None:
         assert plan.cost == pytest.approx(sum(piece.cost or 0 for piece in pieces))
 
