@@ -64,7 +64,8 @@ def cost_of(cell: int, action: int, costs: Any) -> Any:
     after = np.uint64(cell + MOVE_Y[action] * width + MOVE_X[action])
     if multiplier.size > 0:
         if uphill.size > 0:
-            return cost * _uphill(np.uint64(cell), after, np.uint64(action), multiplier, uphill) / 2
+            both = _uphill(np.uint64(cell), after, np.uint64(action), multiplier, uphill)
+            return np.float64(cost) * both / 2
         return cost * (np.float64(multiplier[np.uint64(cell)]) + multiplier[after]) / 2
     if terms.size > 0:
         place = np.uint64(action) * OF_ACTION

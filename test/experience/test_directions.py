@@ -92,7 +92,10 @@ def test_the_layer_is_the_same_while_nothing_was_learned() -> None:
     first, second = (ramp.apply(HALL, exploration=0.1) for _ in range(2))
     assert first.uphill is second.uphill
     assert first.exploration is not None
-    assert first.exploration.bold.uphill is first.exploration.safe.uphill is first.uphill
+    other = HALL.with_patch([[True]], 0, 0).with_times_of(first)
+    assert other.exploration is not None
+    for hopes in (first.exploration, other.exploration):
+        assert hopes.bold.uphill is hopes.safe.uphill is other.uphill is first.uphill
 
 
 def test_what_is_known_of_directions_fades_with_the_rest() -> None:

@@ -19,7 +19,13 @@ from strategies import GRIDS, RULES, Data, Place, cells_of
 from ddqn_planner import GridMap, MoveRule, PlanStatus
 from ddqn_planner.grid import Cell, copies, grid_map
 from ddqn_planner.grid.grid_map import LAYERS
-from ddqn_planner.grid.moves import MOVES, legal_moves, path_cost, shortest_distances
+from ddqn_planner.grid.moves import (
+    MOVES,
+    legal_moves,
+    move_costs,
+    path_cost,
+    shortest_distances,
+)
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning import field as fields
@@ -234,7 +240,9 @@ def test_a_map_made_of_others_is_as_new(place: Place, rule: MoveRule, data: Data
             grid = grid.with_patch([[not grid.occupancy[y, x]]], x, y, cost)
         elif data.draw(st.booleans()):
             slowness = (1 + random.random(grid.occupancy.shape)).astype(np.float32)
-            grid = grid.with_slowness(slowness, 1.0)
+            uphill = random.integers(0, 96, slowness.shape, np.uint8) if seed % 2 else None
+            kept = grid.slowness if seed % 3 and grid.slowness is not None else slowness
+            grid = grid.with_layers(slowness=kept, seconds_per_cell=1.0, uphill=uphill)
         else:
             grid = data.draw(changed_maps(grid))
         maps.append(grid)
@@ -248,8 +256,8 @@ def test_a_map_made_of_others_is_as_new(place: Place, rule: MoveRule, data: Data
         costs, new = (one.fields.costs(grid, rule) for one in (planner, new_planner()))
         assert costs is not None
         assert new is not None
-        for ours, expected in ((costs.patch, new.patch), (costs.value, new.value)):
-            np.testing.assert_array_equal(ours, expected)
+        for layer in ("patch", "value", "multiplier", "uphill"):
+            np.testing.assert_array_equal(getattr(costs, layer), getattr(new, layer))
         if data.draw(st.booleans(), label="compare"):
             assert_same(planner.q_field(grid, goal, rule), fresh_field(fresh, goal, rule))
 
@@ -270,6 +278,21 @@ def test_a_changed_map_uses_what_is_known_of_the_one_before() -> None:
     assert np.count_nonzero(older.known.distance) == 1  # it handed over its memory
     assert field.rollout(start) == fresh_field(changed, goal, MoveRule.ROBOT_SAFE).rollout(start)
     assert older.rollout(start).cells == before.cells  # and begins anew
+
+
+@given(GRIDS, RULES)
+def test_no_move_costs_more_than_the_highest_or_less_than_the_least(
+    place: Place, rule: MoveRule
+) -> None:
+    grid, _ = place
+    costs = ANY_MAP.network.move_costs(grid, rule)
+    assert costs is not None
+    exact = move_costs(grid.cost_multiplier, rule, grid.uphill)
+    legal = grid.legal_moves(rule)
+    assert exact.max(initial=0, where=legal) <= 1.01 * costs.highest
+    for first, bound in ((0, costs.straight), (1, costs.diagonal)):
+        least = exact[first::2].min(initial=np.inf, where=legal[first::2])
+        assert 1.01 * least >= costs.least * bound
 
 
 @pytest.mark.parametrize("slowness", [None, np.full((31, 31), 3)])

@@ -69,6 +69,8 @@ def pose_of(grid: GridMap, motions: Motions, state: State) -> Pose:
     layers=st.sampled_from([(), ("cost",), ("forbidden",), ("cost", "slowness"), ("uphill",)]),
     guided=st.booleans(),
 )
+@example(motion="differential", seed=1, layers=("uphill",), guided=False)
+@example(motion="ackermann", seed=2, layers=("cost", "uphill"), guided=True)
 def test_plans_cost_the_least_within_their_bound_also_after_repairs(
     motion: str, seed: int, layers: tuple[str, ...], guided: bool
 ) -> None:
