@@ -20,6 +20,7 @@ from strategies import (
     Data,
     Place,
     cells_of,
+    grids_uphill,
     grids_with_costs,
     grids_with_directions,
     grids_with_free_cell,
@@ -29,7 +30,6 @@ from ddqn_planner import GridMap, MoveRule, PlanStatus, inflate, simplify
 from ddqn_planner.grid import (
     MOVES,
     Cell,
-    legal_moves,
     path_cost,
     path_length,
     shortest_distances,
@@ -220,13 +220,13 @@ def test_a_path_pulled_straight_through_an_opening_is_a_new_one() -> None:
         assert extra_cost is None
 
 
-@given(grids_with_costs(), RULES, st.data())
+@given(grids_with_costs() | grids_uphill(), RULES, st.data())
 def test_a_search_finds_any_legal_path(place: Place, rule: MoveRule, data: Data) -> None:
     grid, goal = place
     start = data.draw(st.sampled_from(grid.free_cells()))
     shape, values = grid.occupancy.shape, st.floats(width=32)
     value = data.draw(numpy_st.arrays(np.float32, shape, elements=values))
-    legal = legal_moves(grid.occupancy, rule)
+    legal = grid.legal_moves(rule)
     distances = shortest_distances(grid, goal, rule)
 
     cells = search(start, goal, grid, rule, value)
