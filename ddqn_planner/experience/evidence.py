@@ -152,6 +152,7 @@ class Evidence:
         steepest, rise = self.climbs.at(square)
         climbed = (self.directed[:, 0] * RISES[steepest]).sum(axis=1)
         self.flat = self.table[:, 1] - rise * climbed
+        self.sums = self.table[:, 0], self.flat, *self.table[:, 2:4].T  # see `Posterior.update`
         used = self.table[:, 0] >= 0.2
         weight, sum_of_log, foretold = self.table[used, 0], self.flat[used], self.table[used, 4]
         log = sum_of_log / weight

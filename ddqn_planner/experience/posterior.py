@@ -84,11 +84,9 @@ class Posterior:
         self.expected = evidence.trust[0] + evidence.trust[1] * self.foretold
         places = self.places_at(evidence.table[:, 5:])
         inside = places >= 0
-        sums = np.zeros((len(self.middle), 4))
-        table = evidence.table[:, :4].copy()
-        table[:, 1] = evidence.flat
-        np.add.at(sums, places[inside], table[inside])
-        weight, log, passed, waited = sums.T
+        weight, log, passed, waited = sums = np.zeros((4, len(self.middle)))
+        for of_places, of_rows in zip(sums, evidence.sums, strict=True):
+            np.add.at(of_places, places[inside], of_rows[inside])
         # A lattice whose links have strength 1 has about the variance ln(32 / kappa) / 4 pi;
         # 1 is added for cells of many metres, where that would be negative.
         kappa = (self.spacing / CORRELATION) ** 2
@@ -96,7 +94,8 @@ class Posterior:
         visits = scale * weight
         # Half of the noise is added, as the mean of its exponential is more than 1.
         seen = scale * (log + weight * NOISE / 2)
-        right = seen - visits * self.expected + 1j * visits
+        right = np.empty(len(visits), np.complex128)
+        right.real, right.imag = seen - visits * self.expected, visits
         # The equations map the same error everywhere to its product with these, and greater errors
         # to greater residuals: residuals up to that product prove that no error is greater.
         most = (ACCURACY * (kappa + visits)) ** 2
