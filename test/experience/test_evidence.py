@@ -59,6 +59,7 @@ def test_experience_that_was_forgotten_is_not_taken_over() -> None:
 
 @settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1))
+@example(seed=275)  # drives that cross show a climb
 @example(seed=8894)  # a place has no neighbours
 def test_the_posterior_is_that_of_a_gaussian_markov_random_field(seed: int) -> None:
     random, drives = np.random.default_rng(seed), []
@@ -89,7 +90,8 @@ def test_the_posterior_is_that_of_a_gaussian_markov_random_field(seed: int) -> N
     precision *= np.log1p(32 / 0.25**2) / (4 * np.pi) / variance
     table, seen = experience.evidence.table, np.zeros(len(precision))
     cells = np.floor(table[:, 5:] / 0.25).astype(int)
-    for (x, y), (weight, log, *_) in zip(cells, table, strict=True):
+    # What drives in several directions show of climbs is taken off.
+    for (x, y), weight, log in zip(cells, table[:, 0], experience.evidence.flat, strict=True):
         precision[number[y, x], number[y, x]] += weight / NOISE
         seen[number[y, x]] += (log + weight * (NOISE / 2 - common)) / NOISE
     mean = common + np.linalg.solve(precision, seen) + surplus * (1 - posterior.known)
