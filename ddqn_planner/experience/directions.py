@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid.moves import MOVES
+from ddqn_planner.grid.moves import MOVES, RISES
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -19,9 +19,6 @@ ROW = np.array([1, 1 << 32])  # from the number of a square to that of the next 
 BESIDE = 0.5  # weight of what the squares around show
 ASSUMED = 2.0  # so many visits are assumed to show that it does not matter
 SURE = 12.0  # it matters if twice the logarithm of how much likelier that is, is more
-
-# (8, 8): the share of the rise in each direction, by the one in which it is steepest; MOVES' order.
-RISES: Final = np.maximum(np.cos(np.subtract.outer(np.arange(8), np.arange(8)) * np.pi / 4), 0)
 
 
 def squares_of(position: Float64) -> Squares:

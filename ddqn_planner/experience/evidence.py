@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.experience.directions import NOISE, RISES, climbs_of, squares_of
+from ddqn_planner.experience.directions import NOISE, climbs_of, squares_of
 from ddqn_planner.experience.posterior import FEW_PLACES, Posterior
 from ddqn_planner.experience.prior import Prior
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
 from ddqn_planner.grid.grid_map import check_grid
-from ddqn_planner.grid.moves import MOVES, UPHILL
+from ddqn_planner.grid.moves import MOVES, RISES, UPHILL
 
 Float64 = NDArray[np.float64]
 

@@ -20,10 +20,12 @@ MOVES: NDArray[np.int64] = np.array(
 
 STEEPER = 0.15  # log cost of a move by each step of `GridMap.uphill`
 
+# (8, 8): the share of a rise that each action climbs, by the action toward which it is steepest.
+RISES = np.maximum(np.cos(np.subtract.outer(np.arange(8), np.arange(8)) * np.pi / 4), 0)
+
 # (256, 9) float32: the factor of the cost of each action by `GridMap.uphill`, and of no move, 1.
-_turned = (np.arange(256)[:, None] - np.arange(8)) * np.pi / 4
-_steps = np.arange(256)[:, None] >> 3
-UPHILL = np.exp(STEEPER * _steps * np.maximum(np.cos(_turned), 0)).astype(np.float32)
+_codes = np.arange(256)
+UPHILL = np.exp(STEEPER * (_codes >> 3)[:, None] * RISES[_codes & 7]).astype(np.float32)
 UPHILL = np.hstack([UPHILL, np.ones((256, 1), np.float32)])
 
 LENGTHS: NDArray[np.float64] = np.hypot(MOVES[:, 0], MOVES[:, 1])
@@ -86,8 +88,10 @@ def move_costs(
     uphill: NDArray[np.uint8] | None = None,
 ) -> NDArray[np.float64]:
     """Return (8, H, W) float64: the length of each move times the mean multiplier of its cells."""
-    each = multiplier[None] if uphill is None else multiplier * UPHILL.T[: len(MOVES), uphill]
-    padded = np.pad(each, ((0, 0), (1, 1), (1, 1)), mode="edge").astype(np.float64)
+    each = multiplier[None].astype(np.float64)
+    if uphill is not None:
+        each = each * UPHILL.T[: len(MOVES), uphill]
+    padded = np.pad(each, ((0, 0), (1, 1), (1, 1)), mode="edge")
     moves = enumerate(MOVES.tolist())
     target = np.stack([_shifted(padded[a % len(padded)], dx, dy) for a, (dx, dy) in moves])
     lengths = MoveRule(move_rule).lengths[:, None, None]

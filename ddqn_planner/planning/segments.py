@@ -174,9 +174,9 @@ def _is_right_angle(
     """Return if a way is surely the least: a right angle around an occupied cell, no costs."""
     occupancy, _, cost, slowness, _, cuts_corners, _ = layers
     dx, dy = x + to_x - 2 * at_x, y + to_y - 2 * at_y
-    inner = occupancy[at_y + (dy > 0) - (dy < 0), at_x + (dx > 0) - (dx < 0)]
+    is_blocked = occupancy[at_y + (dy > 0) - (dy < 0), at_x + (dx > 0) - (dx < 0)]
     is_right = (x == at_x or to_x == at_x) and (y == at_y or to_y == at_y)
-    return is_right and inner and cost.size + slowness.size == 0 and not cuts_corners
+    return is_right and is_blocked and cost.size + slowness.size == 0 and not cuts_corners
 
 
 @in_place
