@@ -1,5 +1,6 @@
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -60,6 +61,15 @@ def plain_folder() -> Iterator[Path]:
     finally:
         os.seteuid(user)
         shutil.rmtree(folder)
+
+
+@pytest.fixture
+def often_switched() -> Iterator[None]:
+    """Let threads take turns 500 times as often: what is not safe fails in most runs."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    yield
+    sys.setswitchinterval(before)
 
 
 @pytest.fixture(scope="session")

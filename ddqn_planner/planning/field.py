@@ -85,8 +85,8 @@ class QField:
     @property
     def nbytes(self) -> int:
         """Memory of its arrays, with those that were asked for, bytes."""
-        arrays = [array for array in vars(self).values() if isinstance(array, np.ndarray)]
-        return sum(array.nbytes for array in arrays)
+        known = vars(self).copy().values()  # other threads add to it
+        return sum(array.nbytes for array in known if isinstance(array, np.ndarray))
 
     def unmasked(self) -> QField:
         """Return the field without action masking: a rollout is trapped by an illegal move."""

@@ -30,7 +30,7 @@ from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning import field as fields
 from ddqn_planner.planning import kernels
-from ddqn_planner.planning.field import DistanceField, network_field
+from ddqn_planner.planning.field import DistanceField, QField, network_field
 
 
 def fresh_field(grid: GridMap, goal: Cell, rule: MoveRule) -> DistanceField:
@@ -405,6 +405,7 @@ def test_maps_are_compared_where_one_is_the_other_shifted_by_whole_cells() -> No
         assert fields.shift_between(old, with_costs) is None
 
 
+@pytest.mark.usefixtures("often_switched")
 def test_threads_share_a_planner_while_the_map_changes() -> None:
     random = np.random.default_rng(1)
     grid = GridMap(generate_map("office", (60, 60), random))
@@ -422,3 +423,15 @@ def test_threads_share_a_planner_while_the_map_changes() -> None:
 
     with ThreadPoolExecutor(4) as threads:
         assert list(threads.map(count_wrong, range(4))) == [0, 0, 0, 0]
+
+
+@pytest.mark.usefixtures("often_switched")
+def test_threads_ask_a_field_for_what_others_compute() -> None:
+    q, legal = np.ones((8, 2, 2), np.float32), np.ones((8, 2, 2), np.bool_)
+    kept = [QField((0, 0), q, legal) for _ in range(5000)]
+
+    def ask(_: int) -> bool:
+        return all(field.nbytes and field.value.size and field.policy.size for field in kept)
+
+    with ThreadPoolExecutor(4) as threads:
+        assert all(threads.map(ask, range(4)))

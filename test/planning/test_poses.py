@@ -189,6 +189,7 @@ def test_what_the_map_tells_is_left_at_least(motion: str, seed: int) -> None:
             assert left <= best[row, column].min() + 1e-3
 
 
+@pytest.mark.usefixtures("often_switched")
 @pytest.mark.parametrize("seed", range(3))
 def test_requests_that_share_a_field_prove_their_own_bounds(seed: int) -> None:
     random = np.random.default_rng(seed)
