@@ -43,15 +43,20 @@ demo-training: setup
 PROCESSES := $(shell cores=$$(nproc); echo $$((cores < 4 ? cores + 1 : 4)))
 PYTEST := $(BIN)/python -m pytest --numprocesses $(PROCESSES) --dist loadfile --no-loadscope-reorder
 
-test: setup
+# Compiled before, by two processes at once: each process of the tests would compile it all.
+$(VENV)/compiled: $(VENV)/installed $(wildcard ddqn_planner/*.py ddqn_planner/*/*.py)
+	$(BIN)/ddqn-planner warm-up & $(BIN)/ddqn-planner warm-up differential_robot; wait
+	touch $@
+
+test: $(VENV)/compiled
 	$(PYTEST)
 
 # No ROS and nothing slow: for every save.
-test-fast: setup
+test-fast: $(VENV)/compiled
 	$(PYTEST) --ignore test/integration -m "not slow"
 
 # What measures has tests of its own: they train and drive for minutes.
-experiments-test: setup
+experiments-test: $(VENV)/compiled
 	$(PYTEST) --dist worksteal experiments/tests
 
 # The site, in docs/_build/html; a warning is an error.
