@@ -31,9 +31,7 @@ def plan(planner: Planner, grid: GridMap, start: Any, **how: Any) -> Any:
 
 @pytest.fixture
 def corridor() -> GridMap:
-    occupancy = np.ones((20, 40), np.bool_)
-    occupancy[8:13] = False
-    return GridMap(occupancy, CELL)
+    return GridMap(np.ones((20, 40)), CELL).with_patch(np.zeros((5, 40)), 0, 8)
 
 
 @pytest.mark.parametrize("seconds_per_cell", [None, 0.2])
@@ -83,7 +81,7 @@ def test_it_keeps_no_path_that_is_blocked_or_leads_elsewhere(
 ) -> None:
     poses = plan(planner, corridor, START, bound=1.0).poses
     aside = poses[20] + (0, 0.06, 0)
-    box = corridor.with_patch(np.ones((1, 1), np.bool_), 30, 10)
+    box = corridor.with_patch([[True]], 30, 10)
     assert plan(planner, box, aside, under_way=poses).status is PlanStatus.START_OCCUPIED
     elsewhere = plan(planner, corridor, aside, under_way=poses[:-10])
     assert elsewhere.status is PlanStatus.START_OCCUPIED
@@ -94,9 +92,8 @@ def test_a_robot_that_cannot_leave_its_own_cell_keeps_its_path(
 ) -> None:
     path = plan(planner, corridor, START, bound=1.0)
     column, line = corridor.world_to_cell(*path.poses[20, :2])
-    occupancy = corridor.occupancy.copy()
-    occupancy[line + 3, column - 2 : column + 4] = False  # a niche beside the corridor
-    grid, aside = corridor.with_layers(occupancy=occupancy), path.poses[20] + (0, 0.06, 0)
+    grid = corridor.with_patch(np.zeros((1, 6)), column - 2, line + 3)  # a niche beside it
+    aside = path.poses[20] + (0, 0.06, 0)
     assert plan(planner, grid, aside).status is PlanStatus.NO_PATH
     kept = plan(planner, grid, aside, under_way=path.poses)
     assert np.array_equal(kept.poses, path.poses[20:])

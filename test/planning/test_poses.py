@@ -57,9 +57,9 @@ def last_field(planner: PosePlanner) -> pose_field.PoseField:
     return [*planner._fields.values()][-1]
 
 
-def pose_of(grid: GridMap, motions: Motions, state: State) -> Pose:
-    x, y, heading = state
-    return (*grid.cell_to_world((x, y)), float(motions.angles[heading]) + grid.origin[2])
+def pose_of(grid: GridMap, state: State) -> Pose:
+    (x, y, heading), angles = state, robot("differential")[0].angles  # the same for all motions
+    return (*grid.cell_to_world((x, y)), float(angles[heading]) + grid.origin[2])
 
 
 @settings(max_examples=12)
@@ -86,7 +86,6 @@ def test_plans_cost_the_least_within_their_bound_also_after_repairs(
     }
     origin = (*random.uniform(-3, 3, 2), random.choice([0, 0.5]))
     grid = GridMap(occupancy, CELL, origin, **{name: given_layers[name] for name in layers})
-    motions, _ = robot(motion)
     states = [(*random.integers((width, height)).tolist(), h) for h in random.integers(16, size=7)]
     goal, *starts = ((x, y, int(heading)) for x, y, heading in states)
     body = planner(motion)
@@ -98,7 +97,7 @@ def test_plans_cost_the_least_within_their_bound_also_after_repairs(
             best = least_costs(grid, *robot(motion), goal)
             for x, y, heading in starts:
                 bound = float(random.choice([1.0, 1.05, 1.2, 2.0]))
-                start, end = (pose_of(grid, motions, s) for s in ((x, y, heading), goal))
+                start, end = (pose_of(grid, s) for s in ((x, y, heading), goal))
                 found = plan(body, grid, start, end, bound=bound)
                 if found.status in (PlanStatus.START_OCCUPIED, PlanStatus.GOAL_OCCUPIED):
                     continue
@@ -127,9 +126,9 @@ def test_what_the_map_tells_changes_no_least_path(seed: int, goals: int, monkeyp
     occupancy = np.zeros((120, 120), np.bool_)
     for x, y in random.integers(0, 110, (40, 2)):
         occupancy[y : y + 8, x : x + 8] = True
-    grid, (motions, _) = GridMap(occupancy, CELL), robot("differential")
+    grid = GridMap(occupancy, CELL)
     cells = random.permutation(np.argwhere(~occupancy))[:12].tolist()
-    poses = [pose_of(grid, motions, (x, y, heading)) for heading, (y, x) in enumerate(cells)]
+    poses = [pose_of(grid, (x, y, heading)) for heading, (y, x) in enumerate(cells)]
     costs: dict[int, list[float]] = {}
     for looks in (2**8, 2**30):
         monkeypatch.setattr(pose_field, "UNGUIDED", looks)
@@ -176,12 +175,12 @@ def test_what_the_map_tells_is_left_at_least(motion: str, seed: int) -> None:
         begin, gap = random.integers(2, 20), random.integers(3, 9)
         occupancy[:, wall] = True
         occupancy[begin : begin + gap, wall] = False
-    grid, (motions, swept) = GridMap(occupancy, CELL), robot(motion)
+    grid = GridMap(occupancy, CELL)
     x, y, heading = (int(random.integers(n)) for n in (44, 30, 16))
     body, world = planner(motion).body, world_of(grid)
     field = pose_field.PoseField(np.array([(43, 29, 0)]), grid, world, body)
     field._aim = field._aim._replace(x=x, y=y)
-    best = least_costs(grid, motions, swept, (x, y, heading))
+    best = least_costs(grid, *robot(motion), (x, y, heading))
     for shift in (2, 1):  # tiles of 4 cells, and of 2
         field._look_at_map(shift)
         for row, column, _ in np.argwhere(np.isfinite(best)):
@@ -195,15 +194,14 @@ def test_requests_that_share_a_field_prove_their_own_bounds(seed: int) -> None:
     random = np.random.default_rng(seed)
     occupancy = random.random((80, 120)) < 0.01
     occupancy[30:50, 50:70] = False  # around the goal
-    grid, (motions, swept) = GridMap(occupancy, CELL), robot("differential")
-    x, y, heading = 60, 40, int(random.integers(16))
-    best = least_costs(grid, motions, swept, (x, y, heading))
-    goal, body = pose_of(grid, motions, (x, y, heading)), planner("differential")
+    grid, goal_state = GridMap(occupancy, CELL), (60, 40, int(random.integers(16)))
+    best = least_costs(grid, *robot("differential"), goal_state)
+    goal, body = pose_of(grid, goal_state), planner("differential")
     starts = random.permutation(np.argwhere(np.isfinite(best)))[:60].tolist()
 
     def is_asked(state: list[int], bound: float) -> bool:
         row, column, turned = state
-        start = pose_of(grid, motions, (column, row, turned))
+        start = pose_of(grid, (column, row, turned))
         found, least = plan(body, grid, start, goal, bound=bound), best[row, column, turned]
         if np.abs(found.poses[0] - start)[:2].max() > 1e-6:
             return False  # it lies beside the path planned last
@@ -215,11 +213,8 @@ def test_requests_that_share_a_field_prove_their_own_bounds(seed: int) -> None:
 
 
 def test_a_second_look_sees_a_wall_that_is_thinner_than_a_tile(monkeypatch: Any) -> None:
-    motions, _ = robot("differential")
-    occupancy = np.zeros((120, 120), np.bool_)
-    occupancy[51] = True
-    grid = GridMap(occupancy, CELL)
-    start, goal = (pose_of(grid, motions, state) for state in ((60, 20, 0), (60, 100, 0)))
+    grid = GridMap(np.zeros((120, 120)), CELL).with_patch(np.ones((1, 120)), 0, 51)
+    start, goal = (pose_of(grid, state) for state in ((60, 20, 0), (60, 100, 0)))
     monkeypatch.setattr(pose_field, "UNGUIDED", 2**8)
     body = planner("differential")
     assert plan(body, grid, start, goal).status is PlanStatus.NO_PATH
@@ -232,12 +227,11 @@ def test_what_was_far_from_obstacles_is_looked_at_again_when_one_comes(
 ) -> None:
     monkeypatch.setattr(pose_field, "UNGUIDED", unguided)
     monkeypatch.setattr(pose_field, "LOST", 0)
-    motions, _ = robot("differential")
     occupancy = np.zeros((160, 260), np.bool_)
     occupancy[[50, 90], 60:160] = True  # a lane, which a block closes on its left
     grid = GridMap(occupancy, CELL)
     inside, start, goal = (
-        pose_of(grid, motions, state) for state in ((95, 65, 3), (20, 75, 1), (120, 70, 0))
+        pose_of(grid, state) for state in ((95, 65, 3), (20, 75, 1), (120, 70, 0))
     )
     block = grid.with_patch(np.ones((40, 20), np.bool_), 60, 50)
     body, costs = planner("differential"), []
@@ -252,9 +246,8 @@ def test_what_was_far_from_obstacles_is_looked_at_again_when_one_comes(
 
 @pytest.mark.parametrize("motion", sorted(BODIES))
 def test_a_box_on_the_path_is_driven_around_at_the_least_cost(motion: str) -> None:
-    motions, _ = robot(motion)
     grid, random = GridMap(np.zeros((70, 140), np.bool_), CELL), np.random.default_rng(3)
-    start, goal = (pose_of(grid, motions, state) for state in ((15, 20, 0), (125, 50, 0)))
+    start, goal = (pose_of(grid, state) for state in ((15, 20, 0), (125, 50, 0)))
     body = planner(motion)
     way = plan(body, grid, start, goal, bound=1.0)
     for ahead in random.integers(30, 80, 3):
@@ -299,9 +292,8 @@ def test_no_body_touches_an_occupied_cell(motion: str, seed: int) -> None:
 
 
 def test_a_plan_begins_and_ends_as_asked_and_the_rest_of_it_is_known() -> None:
-    motions, _ = robot("differential")
     grid = GridMap(np.zeros((40, 60), np.bool_), CELL, (1, 2, 0.5))
-    start, goal = (pose_of(grid, motions, state) for state in ((10, 10, 2), (50, 20, 7)))
+    start, goal = (pose_of(grid, state) for state in ((10, 10, 2), (50, 20, 7)))
     body = planner("differential")
     whole = plan(body, grid, start, goal)
     assert np.abs((whole.poses[[0, -1]] - [start, goal])[:, :2]).max() < 1e-9
@@ -316,13 +308,9 @@ def test_a_plan_begins_and_ends_as_asked_and_the_rest_of_it_is_known() -> None:
 
 
 def test_the_nearest_goal_counts_and_one_without_room_moves_within_the_tolerance() -> None:
-    motions, _ = robot("differential")
-    occupancy = np.zeros((30, 60), np.bool_)
-    occupancy[10, 40] = True
-    grid = GridMap(occupancy, CELL)
+    grid = GridMap(np.zeros((30, 60)), CELL).with_patch([[True]], 40, 10)
     start, near, far, occupied = (
-        pose_of(grid, motions, state)
-        for state in ((10, 10, 0), (20, 10, 0), (50, 10, 0), (40, 10, 0))
+        pose_of(grid, state) for state in ((10, 10, 0), (20, 10, 0), (50, 10, 0), (40, 10, 0))
     )
     body = planner("differential")
     assert plan(body, grid, start, far, near).goal == (20, 10)
@@ -333,15 +321,12 @@ def test_the_nearest_goal_counts_and_one_without_room_moves_within_the_tolerance
     assert plan(body, grid, (-1, 0, 0), near).status is PlanStatus.START_OUTSIDE_MAP
     assert plan(body, grid, near, (99, 0, 0)).status is PlanStatus.GOAL_OUTSIDE_MAP
     with pytest.raises(ValueError, match=r"learned cells of 0.1 m, and the map's have 0.05 m"):
-        plan(body, GridMap(occupancy, 0.05), start, near)
+        plan(body, GridMap(grid.occupancy, 0.05), start, near)
 
 
 def test_a_goal_may_move_as_far_as_one_likes() -> None:
-    motions, _ = robot("differential")
-    occupancy = np.zeros((60, 80), np.bool_)
-    occupancy[30, 40] = True
-    grid = GridMap(occupancy, CELL)
-    start, occupied = (pose_of(grid, motions, (x, 30, 0)) for x in (10, 40))
+    grid = GridMap(np.zeros((60, 80)), CELL).with_patch([[True]], 40, 30)
+    start, occupied = (pose_of(grid, (x, 30, 0)) for x in (10, 40))
     far = 2.2, math.pi  # more states than a field has room for at first
     moved = plan(planner("differential"), grid, start, occupied, tolerance=far, bound=1.0)
     assert (moved.goal, moved.length) == ((18, 30), pytest.approx(8))
@@ -369,9 +354,9 @@ def test_an_occupied_goal_moves_to_where_the_way_costs_the_least(
     cells = [(i, j) for j, i in np.ndindex(24, 30) if math.dist((i, j), (x, y)) <= far]
     ends = [(*cell, int(turned)) for cell in cells for turned in headings]
     best = least_costs(grid, motions, swept, *ends)
-    body, goal = planner(motion), pose_of(grid, motions, (x, y, heading))
+    body, goal = planner(motion), pose_of(grid, (x, y, heading))
     for row, column, turned in np.column_stack([random.integers(n, size=5) for n in best.shape]):
-        start = pose_of(grid, motions, (int(column), int(row), int(turned)))
+        start = pose_of(grid, (int(column), int(row), int(turned)))
         found = plan(body, grid, start, goal, tolerance=(metres, radians), bound=1.0)
         least = best[row, column, turned]
         if found.poses.size and abs(turn_between(found.poses[0, 2], start[2])) < 1e-6:
@@ -383,15 +368,14 @@ def test_an_occupied_goal_moves_to_where_the_way_costs_the_least(
 
 
 def test_a_body_that_cannot_leave_its_place_has_no_path() -> None:
-    motions, _ = robot("differential")
     occupancy = np.zeros((60, 60), np.bool_)
     occupancy[[20, 30], 20:31] = occupancy[20:31, [20, 30]] = True  # a closed room
     grid = GridMap(occupancy, CELL)
-    start, goal = (pose_of(grid, motions, state) for state in ((25, 25, 0), (50, 50, 0)))
+    start, goal = (pose_of(grid, state) for state in ((25, 25, 0), (50, 50, 0)))
     body = planner("differential")
     for pair in ((start, goal), (goal, start)):
         assert plan(body, grid, *pair).status is PlanStatus.NO_PATH
-    assert plan(body, grid, pose_of(grid, motions, (50, 10, 4)), goal).poses.size
+    assert plan(body, grid, pose_of(grid, (50, 10, 4)), goal).poses.size
 
 
 @settings(max_examples=12)
@@ -400,7 +384,7 @@ def test_the_rest_of_a_path_is_free_unless_a_box_stands_ahead(motion: str, seed:
     random = np.random.default_rng(seed)
     grid = GridMap(np.zeros((40, 60), np.bool_), CELL, (1, 2, float(random.choice([0, 0.5]))))
     states = [(*random.integers((8, 8), (52, 32)).tolist(), h) for h in random.integers(16, size=2)]
-    start, goal = (pose_of(grid, robot(motion)[0], (x, y, int(h))) for x, y, h in states)
+    start, goal = (pose_of(grid, (x, y, int(h))) for x, y, h in states)
     body = planner(motion)
     poses = plan(body, grid, start, goal).poses
     at, beside = random.integers(len(poses)), (*random.uniform(-0.02, 0.02, 2), 0.05)
@@ -429,27 +413,17 @@ def test_the_rest_of_a_path_is_free_unless_a_box_stands_ahead(motion: str, seed:
     leaves = any(a == (x, y) != b for a, b in pairwise(cells))
     closed = grid.with_layers(forbidden=forbidden)
     assert bool(len(body.rest_of(poses, tuple(poses[0]), closed))) != leaves
-    far = tuple(poses[0] + (3.0, 3.0, 0.0)), tuple(poses[0] + (0, 0, math.pi))
-    assert not len(body.rest_of(poses[:1], far[0], grid)) + len(
-        body.rest_of(poses[:1], far[1], grid)
-    )
+    for far in ((3.0, 3.0, 0.0), (0, 0, math.pi)):
+        assert not len(body.rest_of(poses[:1], tuple(poses[0] + far), grid))
 
 
 def test_a_path_is_kept_while_it_costs_hardly_more_and_leads_to_a_goal() -> None:
-    motions, _ = robot("differential")
-    occupancy = np.zeros((41, 60), np.bool_)
-    occupancy[10:31, 20:40] = True
-    start, goal, other = (
-        pose_of(GridMap(occupancy, CELL), motions, (x, 20, 0)) for x in (8, 52, 50)
-    )
+    hall = GridMap(np.zeros((41, 60)), CELL).with_patch(np.ones((21, 20)), 20, 10)
+    # The way below the obstacle is expensive, or the one above.
+    shape = 10, 20
+    below, above = (hall.with_patch(np.zeros(shape), 20, y, np.full(shape, 3)) for y in (0, 31))
+    start, goal, other = (pose_of(hall, (x, 20, 0)) for x in (8, 52, 50))
     body = planner("differential")
-
-    def costs(expensive: slice) -> GridMap:
-        cost = np.zeros(occupancy.shape, np.int8)
-        cost[expensive, 20:40] = 3
-        return GridMap(occupancy, CELL, cost=cost)
-
-    below, above = costs(slice(0, 20)), costs(slice(21, 41))
     first = plan(body, below, start, goal, bound=1.0)
     assert first.poses[:, 1].max() > 3
     how = {"under_way": first.poses, "bound": 1.0}
@@ -465,15 +439,12 @@ def test_a_path_is_kept_while_it_costs_hardly_more_and_leads_to_a_goal() -> None
 
 
 def test_cells_that_are_only_too_near_for_a_disc_are_free_at_the_highest_cost() -> None:
-    motions, _ = robot("differential")
     values = np.zeros((20, 60), np.int8)
     values[:, 30] = INSCRIBED
     grid, body = grid_from_costmap(values, CELL), planner("differential")
-    start, goal = (pose_of(grid, motions, (x, 10, 0)) for x in (8, 52))
+    start, goal = (pose_of(grid, (x, 10, 0)) for x in (8, 52))
     assert plan(body, grid, start, goal, bound=1.0).cost == pytest.approx(44 + 4)
-    free = grid.with_patch(
-        np.zeros((20, 1), np.bool_), 30, 0, obstacles=np.zeros((20, 1), np.bool_)
-    )
+    free = grid.with_patch(np.zeros((20, 1)), 30, 0, obstacles=np.zeros((20, 1)))
     assert plan(body, free, start, goal, bound=1.0).cost == pytest.approx(44)
     assert plan(body, grid, start, goal, bound=1.0).cost == pytest.approx(44 + 4)
     values[:, 30] = 100
