@@ -19,13 +19,7 @@ from strategies import GRIDS, RULES, Data, Place, cells_of
 from ddqn_planner import GridMap, MoveRule, PlanStatus
 from ddqn_planner.grid import Cell, copies, grid_map
 from ddqn_planner.grid.grid_map import LAYERS
-from ddqn_planner.grid.moves import (
-    MOVES,
-    legal_moves,
-    move_costs,
-    path_cost,
-    shortest_distances,
-)
+from ddqn_planner.grid.moves import MOVES, legal_moves, move_costs, path_cost, shortest_distances
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning import field as fields

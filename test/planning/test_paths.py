@@ -5,7 +5,6 @@ import math
 from collections.abc import Sequence
 from fractions import Fraction
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,14 +26,7 @@ from strategies import (
 )
 
 from ddqn_planner import GridMap, MoveRule, PlanStatus, inflate, simplify
-from ddqn_planner.grid import (
-    MOVES,
-    Cell,
-    path_cost,
-    path_length,
-    shortest_distances,
-    shortest_path,
-)
+from ddqn_planner.grid import MOVES, Cell, path_cost, path_length, shortest_distances, shortest_path
 from ddqn_planner.grid.moves import cells_along
 from ddqn_planner.planning import PlanRequest
 from ddqn_planner.planning.paths import REACH, is_path_valid, keep_or_switch, rest_of_path, search
@@ -171,10 +163,6 @@ def test_a_robot_beside_its_path_comes_back_to_it_and_a_far_one_has_lost_it() ->
     assert not len(rest_of_path(path[-4:], (3, 5), grid, MoveRule.ROBOT_SAFE))
 
 
-def cost_of(path: Any, grid: GridMap, rule: MoveRule) -> float:
-    return path_cost(grid, path, rule)
-
-
 @settings(max_examples=300)
 @given(GRIDS, RULES, st.sampled_from([0.0, 0.03, 0.3, 10.0]), st.data())
 def test_what_is_kept_is_cheap(place: Place, rule: MoveRule, threshold: float, data: Data) -> None:
@@ -192,14 +180,14 @@ def test_what_is_kept_is_cheap(place: Place, rule: MoveRule, threshold: float, d
     path, extra_cost = keep_or_switch(request, np.array(new, dtype=np.int32))
     assert (tuple(path[0]), tuple(path[-1])) == (robot, goal)
     assert legal_segments(path, after, rule).all()
-    cost, best = cost_of(path, after, rule), cost_of(new, after, rule)
+    cost, best = path_cost(after, path, rule), path_cost(after, new, rule)
     assert cost <= (1 + threshold) * best * (1 + 1e-6)
     assert cost >= best * (1 - 1e-6)
     rest = rest_of_path(under_way, robot, after, rule)
     if extra_cost is None:
         assert path.tolist() == list(map(list, new))
         if len(rest):
-            assert cost_of(rest, after, rule) > (1 + threshold) * best * (1 - 1e-6)
+            assert path_cost(after, rest, rule) > (1 + threshold) * best * (1 - 1e-6)
     else:
         assert path.tolist() == rest.tolist()
         assert cost == pytest.approx((1 + extra_cost) * best)
@@ -267,8 +255,7 @@ def test_segments_are_as_their_cells_are(place: Place, rule: MoveRule, data: Dat
     exact = exact_cost(first, last, grid, rule)
     assert cost_along(np.array([first, last]), grid, rule) == pytest.approx(exact)
     if max(abs(last[0] - first[0]), abs(last[1] - first[1])) == 1:
-        cells = [first, last]
-        assert path_cost(grid, cells, rule) == pytest.approx(exact)
+        assert path_cost(grid, [first, last], rule) == pytest.approx(exact)
 
 
 def check_simplified(path: list[Cell], grid: GridMap, rule: MoveRule) -> tuple[Cell, ...]:
@@ -391,7 +378,6 @@ def test_segments_are_as_long_as_can_be() -> None:
     assert simplify(diagonal, grid, MoveRule.UNIT) == ((0, 0), (8, 8))
 
 
-ACTIONS = [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)]
 BODIES = st.sampled_from([0, 1.1, 1.5, 2.1])
 RADII = st.sampled_from([0, 0.5, 1, 1.5, 2, 3, math.inf])
 Cells = set[Cell]
@@ -400,7 +386,7 @@ Cells = set[Cell]
 def moves(cell: Cell, allowed: Cells, grid: GridMap, rule: MoveRule) -> list[tuple[Cell, float]]:
     """The cells that one move leads to, within some, and the length of each."""
     (x, y), found = cell, []
-    for action, (dx, dy) in enumerate(ACTIONS):
+    for action, (dx, dy) in enumerate(MOVES.tolist()):
         past_corner = dx and dy and not {(x + dx, y), (x, y + dy)} <= allowed
         is_forbidden = grid.forbidden is not None and int(grid.forbidden[y, x]) >> action & 1
         if is_forbidden or (rule is MoveRule.ROBOT_SAFE and past_corner):
@@ -411,21 +397,17 @@ def moves(cell: Cell, allowed: Cells, grid: GridMap, rule: MoveRule) -> list[tup
     return found
 
 
-def lengths_from(
-    start: Cell, allowed: Cells, grid: GridMap, rule: MoveRule, ends: Cells
-) -> dict[Cell, float]:
-    """The lengths of the shortest ways to the ends, each of which stops a way."""
+def lengths_from(start: Cell, allowed: Cells, grid: GridMap, rule: MoveRule) -> dict[Cell, float]:
+    """The lengths of the shortest ways to all cells that they lead to."""
     lengths: dict[Cell, float] = {}
     waiting = [(0.0, start)]
     while waiting:
         length, cell = heapq.heappop(waiting)
-        if cell in lengths:
-            continue
-        lengths[cell] = length
-        if cell not in ends:
+        if cell not in lengths:
+            lengths[cell] = length
             for after, more in moves(cell, allowed, grid, rule):
                 heapq.heappush(waiting, (length + more, after))
-    return {cell: length for cell, length in lengths.items() if cell in ends}
+    return lengths
 
 
 @settings(max_examples=300)
@@ -453,11 +435,13 @@ def test_a_start_that_is_not_free_is_left_by_the_shortest_way(
         return
     near = {cell for cell in obstacles if math.dist(cell, start) <= clearing_radius}
     closed = obstacles - near if start in obstacles else obstacles
-    joined = {cell for cell in free if lengths_from(cell, free, grid, rule, {goal})}
+    distances = shortest_distances(grid, goal, rule)
+    joined = {cell for cell in free if np.isfinite(distances[cell[::-1]])}
     allowed = {cell for cell in cells if cell in joined or cell not in free | closed}
-    ways = lengths_from(start, allowed, grid, rule, joined)
+    lengths = lengths_from(start, allowed, grid, rule)
+    ways = {cell: lengths[cell] for cell in joined & lengths.keys()}
     if not ways:
-        leaves = lengths_from(start, {*cells} - closed, grid, rule, free)
+        leaves = free & lengths_from(start, {*cells} - closed, grid, rule).keys()
         stuck = start in obstacles and not leaves
         assert plan.status is (PlanStatus.START_OCCUPIED if stuck else PlanStatus.NO_PATH)
         return

@@ -152,14 +152,10 @@ def test_a_plan_tells_how_long_field_and_rollout_took(monkeypatch: pytest.Monkey
 
 
 def test_a_field_grows_in_steps_and_others_are_answered(monkeypatch: pytest.MonkeyPatch) -> None:
-    occupancy = np.zeros((40, 40), dtype=np.bool_)
-    occupancy[20, :39] = True
-    grid, planner = GridMap(occupancy), Planner.load("any_map")
-    whole = planner.plan(grid, (0, 0), (0, 39))
-    closed = occupancy.copy()
-    closed[20] = True
+    grid = GridMap(np.zeros((40, 40))).with_patch(np.ones((1, 39)), 0, 20)
+    whole = new_planner().plan(grid, (0, 0), (0, 39))
     monkeypatch.setattr("ddqn_planner.planning.planner.VISITS", 20)
-    planner = Planner.load("any_map")
+    planner = new_planner()
     steps = planner.steps(PlanRequest(grid, (0, 0), ((0, 39),), MoveRule.ROBOT_SAFE))
     waited = 0
     for plan in steps:
@@ -171,7 +167,8 @@ def test_a_field_grows_in_steps_and_others_are_answered(monkeypatch: pytest.Monk
     assert next(given_up) is next(given_up) is None
     given_up.close()  # type: ignore[attr-defined]
     assert planner.plan(grid, (0, 0), (1, 39)).status is PlanStatus.SUCCEEDED
-    assert planner.plan(GridMap(closed), (0, 0), (0, 39)).status is PlanStatus.NO_PATH
+    closed = GridMap(grid.with_patch([[True]], 39, 20).occupancy)
+    assert planner.plan(closed, (0, 0), (0, 39)).status is PlanStatus.NO_PATH
 
 
 def test_a_field_is_computed_once_per_map_goal_and_rule() -> None:
@@ -266,9 +263,8 @@ def test_a_tolerance_reaches_the_cells_that_its_metres_name() -> None:
     single = float(np.float32(0.7)) / float(np.float32(0.35))
     tolerances = {0.15 / 0.05: 3, single: 2, 2.99: 2, 1.0: 1}
     for (tolerance, cells), distance in product(tolerances.items(), range(1, 5)):
-        occupancy = np.zeros((1, 9), dtype=bool)
-        occupancy[0, 9 - distance :] = True
-        plan = ANY_MAP.plan(GridMap(occupancy), (0, 0), (8, 0), tolerance=tolerance)
+        grid = GridMap(np.zeros((1, 9))).with_patch(np.ones((1, distance)), 9 - distance, 0)
+        plan = ANY_MAP.plan(grid, (0, 0), (8, 0), tolerance=tolerance)
         assert (plan.status is PlanStatus.SUCCEEDED) == (distance <= cells)
 
 
