@@ -9,11 +9,8 @@ from ddqn_planner.grid import Cell, GridMap, MoveRule
 Place = tuple[GridMap, Cell]
 Data = st.DataObject
 RULES = st.sampled_from(list(MoveRule))
-occupancies = numpy_st.arrays(
-    np.bool_,
-    numpy_st.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9),
-    elements=st.sampled_from([False, False, True]),
-)
+shapes = numpy_st.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9)
+occupancies = numpy_st.arrays(np.bool_, shapes, elements=st.sampled_from([False, False, True]))
 
 
 @st.composite

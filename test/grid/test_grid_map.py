@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 from scipy.spatial.distance import cdist
-from strategies import Data, grids_with_directions, occupancies
+from strategies import Data, grids_with_directions, occupancies, shapes
 
 from ddqn_planner.grid import UNKNOWN, GridMap, MoveRule, clearance, copies, inflate
 from ddqn_planner.grid.arguments import as_cell
@@ -225,8 +225,6 @@ def test_maps_tell_their_patches_where_all_else_is_the_same(name: str, value: An
 
 
 RESOLUTION = 0.05
-
-
 RADII, WEIGHTS = st.sampled_from([0.0, 0.03, 0.05, 0.1, 0.12, 0.2, 1.0]), st.floats(0, 1)
 
 
@@ -291,10 +289,6 @@ def test_maps_that_come_one_after_another_are_inflated_as_if_each_were_the_first
             np.testing.assert_array_equal(found.obstacles, grid.occupancy)  # type: ignore[arg-type]
 
 
-values_of_any_kind = numpy_st.arrays(
-    np.int8, numpy_st.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9)
-)
-
 FREE, INSCRIBED, LETHAL, NO_INFORMATION = 0, 253, 254, 255
 
 
@@ -317,7 +311,7 @@ def test_costs_are_those_of_navfn() -> None:
     assert grid.cost_multiplier[0, [0, -1]] == pytest.approx([1, 4.96])
 
 
-@given(values_of_any_kind, st.booleans())
+@given(numpy_st.arrays(np.int8, shapes), st.booleans())
 def test_unknown_inscribed_lethal_cells_are_closed(values: np.ndarray, allow_unknown: bool) -> None:
     grid = grid_from_costmap(values, allow_unknown=allow_unknown)
     unknown = values < 0

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 from limits import memory_grows_less_than
 from PIL import Image
-from strategies import Data, Place, grids_with_directions, json_values
+from strategies import Data, Place, grids_with_directions, json_values, shapes
 
 from ddqn_planner import GridMap, load_map
 from ddqn_planner.grid import UNKNOWN, MapFile, MapFileError, read_map_file, save_map
@@ -31,7 +31,6 @@ PIXELS = np.zeros((2, 2), dtype=np.uint8)
 
 # The examples can share a folder: each writes the same files again.
 same_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-shapes = numpy_st.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=7)
 
 
 def put(path: Path, image: np.ndarray | Image.Image | bytes) -> None:

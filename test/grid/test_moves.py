@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import RULES, Data, Place, grids_uphill, grids_with_costs, grids_with_directions
+from strategies import RULES, Data, Place, grids_uphill, grids_with_directions
 
 from ddqn_planner import GridMap, MoveRule
-from ddqn_planner.grid import LENGTHS, MAX_COST_MULTIPLIER, MOVES, neighbours, shortest_path
+from ddqn_planner.grid import LENGTHS, MOVES, neighbours, shortest_path
 from ddqn_planner.grid.moves import move_costs, path_cost, path_length, shortest_distances
 from ddqn_planner.planning import PlanMethod
 
@@ -52,30 +52,6 @@ def test_neighbours_are_numbered_row_by_row_and_outside_comes_last(shape: tuple[
     numbers = np.pad(np.arange(size).reshape(shape), 1, constant_values=size)
     expected = [numbers[1 + y : 1 + y + height, 1 + x : 1 + x + width].ravel() for x, y in MOVES]
     np.testing.assert_array_equal(neighbours(shape), expected, strict=True)
-
-
-def test_a_move_uphill_costs_more_and_one_downhill_does_not() -> None:
-    uphill = np.zeros((1, 3))
-    uphill[0, 1] = 8 * 10 + 2  # toward greater y
-    cost = move_costs(np.ones((1, 3), np.float32), "unit", uphill.astype(np.uint8))[:, 0, 1]
-    steep, slanting = math.exp(1.5), math.exp(1.5 * math.cos(math.pi / 4))
-    # Each move counts half in the cell that it enters, which is flat or beyond the map's edge.
-    beside = [(1 + 1) / 2, (slanting + 1) / 2, steep, (slanting + 1) / 2, (1 + 1) / 2, 1, 1, 1]
-    assert cost == pytest.approx(beside)
-
-
-@given(grids_with_costs(), RULES)
-def test_a_move_costs_its_length_times_the_mean_multiplier(place: Place, rule: MoveRule) -> None:
-    grid, _ = place
-    assert ((grid.cost_multiplier >= 1) & (grid.cost_multiplier <= MAX_COST_MULTIPLIER)).all()
-    cost = move_costs(grid.cost_multiplier, rule)
-    for action, y, x in np.argwhere(grid.legal_moves(rule)).tolist():
-        next_x, next_y = np.array([x, y]) + MOVES[action]
-        mean_multiplier = (grid.cost_multiplier[y, x] + grid.cost_multiplier[next_y, next_x]) / 2
-        assert cost[action, y, x] == pytest.approx(rule.lengths[action] * mean_multiplier)
-        assert cost[(action + 4) % 8, next_y, next_x] == cost[action, y, x]
-        move = [(x, y), (next_x, next_y)]
-        assert path_cost(grid, move, rule) == pytest.approx(cost[action, y, x])
 
 
 def test_a_length_counts_moves_under_the_unit_rule_and_along_straight_segments() -> None:

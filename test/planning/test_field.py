@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 from networks import ANY_MAP, new_planner
 from random_maps import generate_map
-from strategies import GRIDS, RULES, Data, Place, cells_of
+from strategies import GRIDS, RULES, Data, Place, cells_of, shapes
 
 from ddqn_planner import GridMap, MoveRule, PlanStatus
 from ddqn_planner.grid import Cell, copies, grid_map
@@ -89,8 +89,7 @@ def test_a_request_visits_few_cells_of_a_large_map() -> None:
     assert field.nbytes <= 10 * grid.occupancy.size
 
 
-SHAPES = numpy_st.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9)
-PATCH_IDS = numpy_st.arrays(np.int32, SHAPES, elements=st.integers(0, 3))
+PATCH_IDS = numpy_st.arrays(np.int32, shapes, elements=st.integers(0, 3))
 LENGTHS = st.floats(1, 20, width=32) | st.just(float("inf"))
 COSTS = numpy_st.arrays(np.float32, (4, 8), elements=LENGTHS)
 
