@@ -289,20 +289,10 @@ def test_maps_that_come_one_after_another_are_inflated_as_if_each_were_the_first
             np.testing.assert_array_equal(found.obstacles, grid.occupancy)  # type: ignore[arg-type]
 
 
-FREE, INSCRIBED, LETHAL, NO_INFORMATION = 0, 253, 254, 255
-
-
-def published(costs: np.ndarray) -> np.ndarray:
-    """Return what Nav2's costmap publisher sends for the costs of a costmap, 0 to 255."""
-    values = 1 + 97 * (costs.astype(int) - 1) // 251
-    for cost, value in ((FREE, 0), (INSCRIBED, 99), (LETHAL, 100), (NO_INFORMATION, -1)):
-        values[costs == cost] = value
-    return values.astype(np.int8)
-
-
 def test_costs_are_those_of_navfn() -> None:
     costs = np.arange(253).reshape(1, -1)
-    grid = grid_from_costmap(published(costs))
+    published = np.where(costs > 0, 1 + 97 * (costs - 1) // 251, 0)  # by Nav2, for free cells
+    grid = grid_from_costmap(published.astype(np.int8))
     assert not grid.occupancy.any()
     navfn = np.minimum(50 + 0.8 * costs, 253).astype(int) / 50
     # A value stands for two or three costs, and steps of 0.04 are what a map holds.
