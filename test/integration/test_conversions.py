@@ -7,6 +7,7 @@ from functools import partial
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -94,7 +95,7 @@ def test_a_pose_has_a_cell_also_off_the_map_or_is_refused_by_the_name_of_its_val
             cell_from_pose("the goal", bad, grid, "map")
 
 
-def is_turn(before: tuple[int, int], at: tuple[int, int], after: tuple[int, int]) -> bool:
+def is_turn(before: Cell, at: Cell, after: Cell) -> bool:
     (dx, dy), (u, v) = np.subtract(at, before).tolist(), np.subtract(after, at).tolist()
     return bool(dx * v != dy * u or dx * u + dy * v < 0)
 
@@ -221,28 +222,13 @@ class Buffer:
 NOW = 111  # seconds of the node's clock
 
 
-class Node:
-    """What `Places` and `Refusals` ask of a node."""
-
-    def __init__(self, source: str = "tf") -> None:
-        self.after_jump_back: list[Callable[[], None]] = []
-        values = {"start_source": source, "robot_frame": "odom", "transform_tolerance": 5.0}
-        self.value = values.__getitem__
-
-    def create_timer(self, *_: object, clock: object) -> None:
-        """Do not call back."""
-
-    def create_publisher(self, *_: object) -> None:
-        """Have nobody to publish to."""
-
-    def create_subscription(self, _: object, topic: str, *__: object) -> SimpleNamespace:
-        return SimpleNamespace(topic_name=topic)
-
-    def destroy_subscription(self, _: object) -> None:
-        """Have nothing to destroy."""
-
-    def get_clock(self) -> SimpleNamespace:
-        return SimpleNamespace(now=lambda: Time(seconds=NOW, clock_type=ClockType.ROS_TIME))
+def new_node(source: str = "tf") -> Mock:
+    """Return what `Places` and `Refusals` ask of a node."""
+    values = {"start_source": source, "robot_frame": "odom", "transform_tolerance": 5.0}
+    node = Mock(after_jump_back=[], value=values.__getitem__)
+    node.create_subscription = lambda _, topic, *__: SimpleNamespace(topic_name=topic)
+    node.get_clock().now.return_value = Time(seconds=NOW, clock_type=ClockType.ROS_TIME)
+    return node
 
 
 @pytest.fixture
@@ -256,7 +242,7 @@ def listening(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Frames]:
         tf2_ros = SimpleNamespace(Buffer=lambda: Buffer(*seconds), **fields)
         monkeypatch.setitem(sys.modules, "tf2_ros", tf2_ros)
         monkeypatch.setattr(Frames, "_read", lambda _: None)
-        return Frames(Node(), lambda: 20.0)
+        return Frames(new_node(), lambda: 20.0)
 
     return make
 
@@ -297,7 +283,7 @@ def test_a_newest_transform_beyond_the_tolerance_is_not_used(listening: Any) -> 
     late = {NOW - 6: "6 s old", NOW + 6: "6 s in the future"}
     for stamp, words in (late | dict.fromkeys((NOW - 2, NOW + 2, 0), "")).items():
         listening(stamp)
-        node = Node()
+        node = new_node()
         places = Places(node, Refusals(node), lambda: "map", lambda: None)
         goal_in_map = partial(places.to_map, "the goal", pose_at(0), "map")
         if words:
@@ -326,7 +312,7 @@ def test_transforms_from_before_the_clock_jumped_back_are_forgotten(listening: A
 def test_a_set_start_outlives_a_jump_of_the_clock_and_odometry_does_not(
     listening: Any, source: str, stays: bool
 ) -> None:
-    node, pose = Node(source), pose_at(NOW, "map")
+    node, pose = new_node(source), pose_at(NOW, "map")
     listening()
     places = Places(node, Refusals(node), lambda: "map", lambda: None)
     places._take(pose)
