@@ -95,10 +95,7 @@ def take_compiled(source: Path, package: Path) -> None:
 
 
 def test_nodes_of_the_workspace_plan_with_its_model_on_its_map(
-    install: Path,
-    make_client: Callable[[], Any],
-    paper: Scenario,
-    capfd: Any,
+    install: Path, make_client: Callable[[], Any], paper: Scenario, capfd: Any
 ) -> None:
     (package,) = (install / "ddqn_planner" / "lib").glob("python*/site-packages/ddqn_planner")
     take_compiled(ROOT / "ddqn_planner", package)

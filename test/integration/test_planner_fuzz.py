@@ -1,7 +1,7 @@
 """Whatever comes in, the planner node answers, says why, and goes on with what it had."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -21,11 +21,12 @@ from ddqn_planner.nodes.conversions import grid_from_message
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.runtime import LATCHED
 
+TOPICS = st.sampled_from(["initialpose", "goal_pose", "goal_poses", "odom"])
 fuzz = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @pytest.fixture
-def unharmed(robot: Robot) -> Any:
+def robot(robot: Robot) -> Iterator[Robot]:
     """See afterwards that nothing was raised out of a callback."""
     # Else a message may come after the answer to a later request.
     robot.client.publisher(UInt8MultiArray, "trainer/model", LATCHED)
@@ -39,8 +40,7 @@ def unharmed(robot: Robot) -> Any:
 
 @fuzz
 @given(message=maps())
-def test_any_map_is_taken_or_refused(unharmed: Robot, message: OccupancyGrid) -> None:
-    robot = unharmed
+def test_any_map_is_taken_or_refused(robot: Robot, message: OccupancyGrid) -> None:
     robot.clear()
     message.header.stamp.sec = next(NUMBERS)
     robot.send_map(message)
@@ -59,9 +59,8 @@ def test_any_map_is_taken_or_refused(unharmed: Robot, message: OccupancyGrid) ->
 @fuzz
 @given(start=STAMPED_POSES, goal=STAMPED_POSES, tolerance=NUMBERS_32)
 def test_any_request_is_answered(
-    unharmed: Robot, start: PoseStamped, goal: PoseStamped, tolerance: float
+    robot: Robot, start: PoseStamped, goal: PoseStamped, tolerance: float
 ) -> None:
-    robot = unharmed
     request = GetPlan.Request(start=start, goal=goal, tolerance=tolerance)
     path = robot.client.call(GetPlan, "planner/get_plan", request).plan
     assert path.header.frame_id == "map"
@@ -75,12 +74,8 @@ def test_any_request_is_answered(
 
 
 @fuzz
-@given(
-    message=STAMPED_POSES,
-    topic=st.sampled_from(["initialpose", "goal_pose", "goal_poses", "odom"]),
-)
-def test_any_pose_is_taken_or_refused(unharmed: Robot, message: PoseStamped, topic: str) -> None:
-    robot = unharmed
+@given(message=STAMPED_POSES, topic=TOPICS)
+def test_any_pose_is_taken_or_refused(robot: Robot, message: PoseStamped, topic: str) -> None:
     pose_message: Any = message
     if topic == "goal_poses":
         good = robot.pose(GOAL).pose
@@ -100,11 +95,7 @@ NAMES = [*PLANNER_PARAMETERS, "use_sim_time"]
 
 @fuzz
 @given(parameters=some_parameters(NAMES), together=st.booleans())
-def test_any_parameters_are_answered(
-    unharmed: Robot, parameters: list[Any], together: bool
-) -> None:
-    robot = unharmed
-
+def test_any_parameters_are_answered(robot: Robot, parameters: list[Any], together: bool) -> None:
     def read() -> dict[str, Any]:
         request = GetParameters.Request(names=NAMES)
         values = robot.client.call(GetParameters, "planner/get_parameters", request).values
