@@ -6,6 +6,7 @@ import re
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path as FilePath
 from typing import Any
@@ -23,14 +24,14 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from nav_msgs.srv import GetPlan
-from networks import turning_network
+from networks import turning_planner
 from rcl_interfaces.srv import GetParameters
 from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
-from ddqn_planner.model import ModelMetadata, save_model
+from ddqn_planner.model import save_model
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.report import seconds
 from ddqn_planner.nodes.runtime import LATCHED
@@ -156,10 +157,22 @@ class Robot:
         """Return the message of the map, or of other values, with a stamp of its own."""
         return map_message(self.values if values is None else values, self.grid, next(NUMBERS))
 
+    def map_with(self, box: Any, value: int) -> OccupancyGrid:
+        """Return the message of the map with another value in some cells, indexed by [y, x]."""
+        values = self.values.copy()
+        values[box] = value
+        return self.stamped_map(values)
+
     def set_map(self, message: OccupancyGrid) -> None:
         """Send a map with a stamp of its own, and wait until the planner has it."""
         self.send_map(message)
         self.wait_for_map(message)
+
+    def plan_on(self, message: OccupancyGrid, reason: str = "^a path of ") -> DiagnosticStatus:
+        """Send a map, and wait until the plan for the active goal is one on it."""
+        self.send_map(message)
+        stamp = seconds(message.header.stamp)
+        return self.wait_for_reason(reason, {"planned on the map of (s)": stamp})
 
     def begin(self, start: Cell = START, goal: Cell = GOAL) -> None:
         """Send a map, a start and a goal, and wait until the planner has planned with all three."""
@@ -259,6 +272,5 @@ def changed(message: Any, field: str, value: Any) -> Any:
 
 def constant_model(path: FilePath, size: int, steps: int) -> None:
     """Write a model that always goes to -x, or where it cannot, to +x: it turns round for ever."""
-    network = turning_network(size)
-    metadata = ModelMetadata("paper", network.sizes, MoveRule.ROBOT_SAFE, 0.9, "", steps, 0, "")
-    save_model(path, network, metadata)
+    planner = turning_planner(size)
+    save_model(path, planner.network, replace(planner.metadata, steps=steps))

@@ -10,11 +10,10 @@ from client import cell_of, cells_of, map_message
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray
 from integration.robot import NUMBERS, Robot, check_path, odometry, points_of, values_of
-from nav_msgs.msg import OccupancyGrid, Odometry
+from nav_msgs.msg import Odometry
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell
-from ddqn_planner.nodes.report import seconds
 
 START, GOAL = (0, 5), (29, 5)
 NEVER, SOON = 3600.0, 0.05
@@ -47,55 +46,43 @@ def way(robot: Robot) -> list[Cell]:
     return cells_of(robot.grid, robot.last_plan())
 
 
-def plan_on(robot: Robot, message: OccupancyGrid, reason: str = "^a path of ") -> None:
-    robot.send_map(message)
-    stamp = seconds(message.header.stamp)
-    robot.wait_for_reason(reason, {"planned on the map of (s)": stamp})
-
-
-def with_values(robot: Robot, box: tuple[Any, Any], value: int) -> OccupancyGrid:
-    values = robot.values.copy()
-    values[box] = value
-    return robot.stamped_map(values)
-
-
-UPPER, LOWER = (slice(8, 11), 15), (slice(0, 3), 15)  # walls across the ways
+UPPER, LOWER = np.s_[8:11, 15], np.s_[:3, 15]  # walls across the ways
 
 
 @pytest.mark.parametrize("period", [SOON, 0.0])
 def test_the_plan_is_quiet_while_the_map_changes_elsewhere(robot: Robot, period: float) -> None:
     set_and_settle(robot, replan_period=period)
-    plan_on(robot, robot.stamped_map())
+    robot.plan_on(robot.stamped_map())
     first = robot.last_plan()
     for x in (10, 13, 16):
-        plan_on(robot, with_values(robot, (1, x), 100))
+        robot.plan_on(robot.map_with((1, x), 100))
     values = np.pad(robot.values, ((4, 0), (6, 2)), constant_values=100)
     shift = np.subtract(robot.grid.cell_to_world((-6, -4)), robot.grid.cell_to_world((0, 0)))
     x, y, yaw = robot.grid.origin
     grid = robot.grid_of(values, (x + shift[0], y + shift[1], yaw))
-    plan_on(robot, map_message(values, grid, next(NUMBERS)))
+    robot.plan_on(map_message(values, grid, next(NUMBERS)))
     assert robot.last_plan().header.stamp == first.header.stamp
 
 
 def test_a_blocked_path_is_planned_again_at_once_and_no_other_one(robot: Robot) -> None:
     set_and_settle(robot, replan_period=NEVER)
     assert max(y for _, y in way(robot)) > 7
-    robot.set_map(with_values(robot, LOWER, 100))
+    robot.set_map(robot.map_with(LOWER, 100))
     robot.set_map(robot.stamped_map())
-    robot.send_map(with_values(robot, UPPER, 100))
+    robot.send_map(robot.map_with(UPPER, 100))
     check_path(robot.plans.wait(), robot.grid)
     assert min(y for _, y in way(robot)) < 3
     # The better way is open again, but this path is not blocked.
     robot.set_map(robot.stamped_map())
-    robot.send_map(with_values(robot, LOWER, 100))
+    robot.send_map(robot.map_with(LOWER, 100))
     robot.plans.wait(lambda plan: max(y for _, y in cells_of(robot.grid, plan)) > 7)
     assert len(robot.plans.messages()) == 2
 
 
 def test_a_shortcut_that_opens_is_taken(robot: Robot) -> None:
-    plan_on(robot, robot.stamped_map())
+    robot.plan_on(robot.stamped_map())
     robot.clear()
-    robot.send_map(with_values(robot, (5, slice(None)), 0))
+    robot.send_map(robot.map_with(np.s_[5, :], 0))
     robot.plans.wait(lambda plan: len(plan.poses) == 30)
     # A map far away has nothing of the path.
     robot.clear()
@@ -107,21 +94,21 @@ def test_a_shortcut_that_opens_is_taken(robot: Robot) -> None:
 
 def test_a_path_is_planned_at_once_where_there_was_none(robot: Robot) -> None:
     set_and_settle(robot, replan_period=NEVER)
-    plan_on(robot, with_values(robot, (slice(None), 27), 100), "no path leads")
+    robot.plan_on(robot.map_with(np.s_[:, 27], 100), "no path leads")
     empty = robot.last_plan()
     assert empty.poses == []
-    plan_on(robot, with_values(robot, (slice(None), 28), 100), "no path leads")
+    robot.plan_on(robot.map_with(np.s_[:, 28], 100), "no path leads")
     assert robot.last_plan().header.stamp == empty.header.stamp
     robot.send_map()
     robot.wait_for_path(START, GOAL)
 
 
 def test_the_path_under_way_is_kept_up_to_the_threshold(robot: Robot) -> None:
-    plan_on(robot, robot.stamped_map())
+    robot.plan_on(robot.stamped_map())
     first = robot.last_plan()
     other_way_round = robot.values.copy()
     other_way_round[:3, 10:20], other_way_round[8:, 10:20] = 0, 2
-    plan_on(robot, robot.stamped_map(other_way_round), r"kept: its cost is \+\d\.\d%")
+    robot.plan_on(robot.stamped_map(other_way_round), r"kept: its cost is \+\d\.\d%")
     assert robot.last_plan().header.stamp == first.header.stamp
     best = robot.get_plan(robot.pose(START), robot.pose(GOAL))
     assert min(y for _, y in cells_of(robot.grid, best)) < 3
@@ -197,10 +184,8 @@ def wait_for_dock(docks: Robot, dock: Cell, reason: str, start: Cell = DOCKED) -
 def test_the_nearest_free_dock_is_taken_and_kept_up_to_the_threshold(docks: Robot) -> None:
     send_goals(docks, WALL, LEFT, OUTSIDE, RIGHT)
     wait_for_dock(docks, LEFT, "to goal 2 of 4")
-    taken = docks.values.copy()
-    taken[LEFT[::-1]] = 100
     docks.clear()
-    docks.send_map(docks.stamped_map(taken))
+    docks.send_map(docks.map_with(LEFT[::-1], 100))
     wait_for_dock(docks, RIGHT, "to goal 4 of 4")
     docks.clear()
     docks.send_map(docks.stamped_map())
@@ -222,13 +207,10 @@ def test_goals_none_of_which_can_be_reached_have_an_empty_plan(docks: Robot) -> 
     none = "^no path to any of {} goals: "
     occupied = rf"the goal is occupied {where}; set the goal on a free cell$"
     docks.wait_for_reason(none.format(2) + occupied)
-    walled = docks.values.copy()
-    walled[:, (5, 25)] = 100
-    docks.set_map(docks.stamped_map(walled))
+    docks.set_map(docks.map_with(np.s_[:, (5, 25)], 100))
     send_goals(docks, WALL, LEFT, RIGHT)
-    docks.wait_for_reason(
-        none.format(3) + "no path leads .*; set the goal where free cells lead to$"
-    )
+    cut_off = "no path leads .*; set the goal where free cells lead to$"
+    docks.wait_for_reason(none.format(3) + cut_off)
     docks.clear()
     docks.send_map(docks.stamped_map())
     wait_for_dock(docks, LEFT, "to goal 2 of 3")

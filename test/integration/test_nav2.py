@@ -369,9 +369,7 @@ def test_each_cause_has_its_code(navigator: Navigator) -> None:
     fields = {"start": start, "use_start": True, "planner_id": "Smac"}
     robot.set(start_clearing_radius=-1.0, planner_id="Smac")
     assert navigator.plan([], **fields).result.error_code == 309
-    walled = robot.values.copy()
-    walled[:, 3] = 100
-    robot.set_map(robot.stamped_map(walled))
+    robot.set_map(robot.map_with(np.s_[:, 3], 100))
     second = navigator.plan([robot.pose((0, 5)), goal], **fields).result
     assert second.error_code == 308
     assert second.error_msg.startswith("goal 2 of 2: no path leads from the start to the goal")

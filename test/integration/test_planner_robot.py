@@ -102,7 +102,7 @@ def test_a_start_on_an_obstacle_or_deep_in_one_is_told(robot: Robot, hall: np.nd
         robot.wait_for_reason(reason)
 
 
-def test_a_goal_moves_within_the_tolerance_of_the_request(robot: Robot, hall: np.ndarray) -> None:
+def test_a_goal_moves_within_the_tolerance_of_the_request(robot: Robot) -> None:
     def get_cells(tolerance: float, goal: Cell = (10, 2)) -> list[Cell]:
         request = GetPlan.Request(start=robot.pose((0, 2)), tolerance=tolerance)
         request.goal = robot.pose(goal, GOAL_YAW)
@@ -126,9 +126,7 @@ def test_a_goal_moves_within_the_tolerance_of_the_request(robot: Robot, hall: np
     robot.send_goal(robot.pose((10, 2)))
     robot.wait_for_path((0, 2), (9, 2))
     robot.value.wait(lambda value: value.data[2 * 20 + 9] == 100)
-    closed = hall.copy()
-    closed[:, 10] = 100
-    robot.set_map(robot.stamped_map(closed))
+    robot.set_map(robot.map_with(np.s_[:, 10], 100))
     assert get_cells(1.5, (12, 2)) == [(9, 2)]
     robot.wait_for_reason("a path of .*; the goal is cut off and moved 1.5 m")
 
@@ -258,9 +256,7 @@ def test_docks_in_another_frame_stay_where_they_are_when_it_moves(transformed: R
     odom.transform.translation.x += 1.0
     client.publish("tf", odom)
     client.publish("tf", transform(robot, (4, 12)))
-    taken = robot.values.copy()
-    taken[7, 1] = 100
-    robot.send_map(robot.stamped_map(taken))
+    robot.send_map(robot.map_with((7, 1), 100))
     robot.wait_for_path((4, 12), (18, 3), yaw=1.5)
 
 

@@ -10,7 +10,7 @@ import pytest
 import rclpy
 from client import map_message, pose
 from geometry_msgs.msg import PoseArray, PoseStamped
-from integration.robot import NUMBERS, Robot, values_of, yaw_of
+from integration.robot import NUMBERS, Robot, yaw_of
 from nav_msgs.msg import Path
 from networks import BODY, robot_model
 from rclpy.executors import SingleThreadedExecutor
@@ -19,8 +19,8 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from ddqn_planner.grid import Cell, GridMap
+from ddqn_planner.nodes.conversions import grid_from_message
 from ddqn_planner.nodes.planner_node import PlannerNode
-from ddqn_planner.nodes.report import seconds
 from ddqn_planner.nodes.runtime import LATCHED
 
 CELL, ORIGIN = 0.1, (-1.0, 2.0, 0.5)
@@ -78,8 +78,7 @@ def array_of(path: Path) -> np.ndarray:
 def check(path: Path, grid: GridMap, goal: Cell, yaw: float) -> np.ndarray:
     """Check that no part of the body touches an obstacle, and where the path begins and ends."""
     poses, (front, back, side) = array_of(path), BODY
-    assert grid.world_to_cell(*poses[-1, :2]) == goal
-    assert math.cos(poses[-1, 2] - yaw) > math.cos(0.25)
+    assert ends_at(path, grid, goal, yaw)
     assert np.hypot(*np.diff(poses[:, :2], axis=0).T).max() <= CELL / 2 + 1e-6
     over, up = np.meshgrid(np.arange(-back, front, 0.02), np.arange(-side, side, 0.02))
     body = (over + 1j * up).ravel()
@@ -91,9 +90,7 @@ def check(path: Path, grid: GridMap, goal: Cell, yaw: float) -> np.ndarray:
 
 def ends_at(path: Path, grid: GridMap, goal: Cell, yaw: float) -> bool:
     poses = array_of(path)
-    if not len(poses):
-        return False
-    is_there = grid.world_to_cell(*poses[-1, :2]) == goal
+    is_there = len(poses) > 0 and grid.world_to_cell(*poses[-1, :2]) == goal
     return is_there and math.cos(poses[-1, 2] - yaw) > math.cos(0.25)
 
 
@@ -101,6 +98,12 @@ def path_to(robot: Robot, goal: Cell, yaw: float, grid: GridMap | None = None) -
     """Wait for a plan to a pose, and check it."""
     grid = grid or robot.grid
     return check(robot.plans.wait(lambda path: ends_at(path, grid, goal, yaw)), grid, goal, yaw)
+
+
+def drive_to(robot: Robot, goal: Cell, yaw: float) -> np.ndarray:
+    """Set a goal, and return the poses of the plan to it."""
+    robot.send_goal(at(robot, goal, yaw))
+    return path_to(robot, goal, yaw)
 
 
 def drives_back(poses: np.ndarray) -> np.ndarray:
@@ -111,23 +114,19 @@ def drives_back(poses: np.ndarray) -> np.ndarray:
 
 def test_a_path_through_a_door_has_the_goals_heading_and_gets_better(robot: Robot) -> None:
     robot.set(path_bound=4.0, switch_threshold=0.0)
-    robot.send_goal(at(robot, BEYOND, 2.1))
-    first = path_to(robot, BEYOND, 2.1)
+    first = drive_to(robot, BEYOND, 2.1)
     assert robot.grid.world_to_cell(*first[0, :2]) == START
     # Nobody asks for this one.
     best = robot.plans.wait(lambda path: 0 < len(path.poses) < len(first))
     check(best, robot.grid, BEYOND, 2.1)
-    status = robot.wait_for_reason("^a path of .* of at most 1 times the least cost")
-    assert (
-        values_of(status)["model footprint (m)"]
-        == "[[0.3, 0.2], [-0.2, 0.2], [-0.2, -0.2], [0.3, -0.2]]"
-    )
+    body = "[[0.3, 0.2], [-0.2, 0.2], [-0.2, -0.2], [0.3, -0.2]]"
+    bounded = "^a path of .* of at most 1 times the least cost"
+    robot.wait_for_reason(bounded, {"model footprint (m)": body})
 
 
 def test_the_rest_of_a_path_is_kept_from_where_the_robot_is(robot: Robot) -> None:
     robot.set(path_bound=1.0)
-    robot.send_goal(at(robot, BEYOND, 0.5))
-    poses = path_to(robot, BEYOND, 0.5)
+    poses = drive_to(robot, BEYOND, 0.5)
     robot.clear()
     start = at(robot, START, poses[30, 2] + 0.1)
     start.pose.position.x, start.pose.position.y = poses[30, :2] + 0.03
@@ -158,52 +157,42 @@ def test_a_path_to_one_of_several_goals_is_kept_on_a_map_with_other_cells(robot:
     for share in (0.2, 0.4, 0.6, 0.8):
         moved = GridMap(robot.values > 0, CELL, (x - share * CELL, y - share * CELL, yaw))
         message = map_message(robot.values, moved, next(NUMBERS))
-        robot.send_map(message)
-        stamp = {"planned on the map of (s)": seconds(message.header.stamp)}
-        assert "to goal 2 of 2" in robot.wait_for_reason("", stamp).message
+        assert "to goal 2 of 2" in robot.plan_on(message, reason="").message
     robot.send_map()
 
 
 def test_a_car_turns_by_driving_back(robot: Robot, models: Any) -> None:
     robot.set(model=models.ackermann)
     behind = START[0] + 2, START[1]
-    robot.send_goal(at(robot, behind, 0.5 + math.pi))
-    poses = path_to(robot, behind, 0.5 + math.pi)
+    poses = drive_to(robot, behind, 0.5 + math.pi)
     back = drives_back(poses)
     assert 0 < back.sum() < len(back)
 
 
 def test_a_map_of_another_resolution_is_refused_with_the_remedy(robot: Robot) -> None:
-    robot.send_goal(at(robot, BESIDE, 0.0))
-    path_to(robot, BESIDE, 0.0)
+    drive_to(robot, BESIDE, 0.0)
     other = GridMap(robot.values > 0, 2 * CELL, ORIGIN)
     robot.set_map(map_message(robot.values, other, next(NUMBERS)))
     robot.plans.wait(lambda path: not path.poses)
-    status = robot.wait_for_reason(
-        "learned cells of 0.1 m, and the map's have 0.2 m; give a map of 0.1 m"
-    )
-    assert values_of(status)["status"] == "MAP_RESOLUTION_UNSUPPORTED"
+    reason = "learned cells of 0.1 m, and the map's have 0.2 m; give a map of 0.1 m"
+    robot.wait_for_reason(reason, {"status": "MAP_RESOLUTION_UNSUPPORTED"})
     robot.plans.clear()
     robot.set_map(robot.stamped_map())
     path_to(robot, BESIDE, 0.0)
 
 
 def test_a_path_leads_round_a_box_that_stands_on_it(robot: Robot) -> None:
-    robot.send_goal(at(robot, BESIDE, 0.5))
-    poses = path_to(robot, BESIDE, 0.5)
+    poses = drive_to(robot, BESIDE, 0.5)
     x, y = robot.grid.world_to_cell(*poses[len(poses) // 2, :2])
-    values = robot.values.copy()
-    values[y - 1 : y + 2, x - 1 : x + 2] = 100
+    message = robot.map_with(np.s_[y - 1 : y + 2, x - 1 : x + 2], 100)
     robot.plans.clear()
-    robot.set_map(robot.stamped_map(values))
-    grid = GridMap(values > 0, CELL, ORIGIN)
-    path_to(robot, BESIDE, 0.5, grid)
+    robot.set_map(message)
+    path_to(robot, BESIDE, 0.5, grid_from_message(message))
 
 
 def test_bodies_along_the_path_are_shown_to_who_asks(robot: Robot) -> None:
     shown = robot.client.subscribe(MarkerArray, "planner/footprints", LATCHED)
-    robot.send_goal(at(robot, BESIDE, 0.5))
-    path_to(robot, BESIDE, 0.5)
+    drive_to(robot, BESIDE, 0.5)
     front, back, side = BODY
     corners = np.array([complex(x, y) for x in (front, -back) for y in (side, -side)])
 
@@ -263,9 +252,8 @@ def test_actions_lead_through_poses_and_paths_are_checked(models: Any, rooms: np
         node._map._take(map_message(narrow, grid, next(NUMBERS)))
         through, _ = run(node._plan_for_action(start, [goal], "", lambda: None))
         poses_through = array_of(through)
-        number = int(
-            np.abs(poses_through[:, :2] - grid.cell_to_world((30, 26))).sum(axis=1).argmin()
-        )
+        from_door = np.abs(poses_through[:, :2] - grid.cell_to_world((30, 26))).sum(axis=1)
+        number = int(from_door.argmin())
         aside = through.poses[number]
         aside.pose.position.x -= 0.06 * math.sin(ORIGIN[2])
         aside.pose.position.y += 0.06 * math.cos(ORIGIN[2])
