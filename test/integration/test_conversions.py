@@ -308,21 +308,13 @@ def test_transforms_from_before_the_clock_jumped_back_are_forgotten(listening: A
     assert error.value.may_come
 
 
-@pytest.mark.parametrize(("source", "stays"), [("initialpose", True), ("odometry", False)])
-def test_a_set_start_outlives_a_jump_of_the_clock_and_odometry_does_not(
-    listening: Any, source: str, stays: bool
-) -> None:
-    node, pose = new_node(source), pose_at(NOW, "map")
-    listening()
+def test_a_set_start_outlives_a_jump_of_the_clock() -> None:
+    node, pose = new_node("initialpose"), pose_at(NOW, "map")
     places = Places(node, Refusals(node), lambda: "map", lambda: None)
     places._take(pose)
-    assert places.start() is pose
     for forget in node.after_jump_back:
         forget()
-    if stays:
-        assert places.start() is pose
-    else:
-        assert "nothing came on odom" in refusal("NO_START", places.start)
+    assert places.start() is pose
 
 
 def test_other_frames_are_refused_without_tf_and_the_remedy_names_it(listening: Any) -> None:
