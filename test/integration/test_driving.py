@@ -111,14 +111,6 @@ class Site(User):
         self.saved.wait()
         return episode
 
-    def wait_for_prior(self) -> None:
-        """Wait until what the trainer sends foretells from the map."""
-
-        def has_prior(message: UInt8MultiArray) -> bool:
-            return Experience.from_bytes(bytes_of("experience", message)).prior is not None
-
-        self.experience.wait(has_prior)
-
     def record_in(self, folder: FilePath) -> None:
         self.client.set_parameters("trainer", output_folder=str(folder))
         self.folder = folder
@@ -175,6 +167,10 @@ def site(trainer: Any, client: Client, tmp_path: FilePath) -> Iterator[Site]:
     assert "Traceback" not in trainer.log
 
 
+def foretells(message: UInt8MultiArray) -> bool:
+    return Experience.from_bytes(bytes_of("experience", message)).prior is not None
+
+
 def is_below(path: Path) -> bool:
     return len(path.poses) > 0 and all(it.pose.position.y < 5 for it in path.poses)
 
@@ -201,7 +197,7 @@ def test_the_robot_goes_round_what_was_slow_until_it_forgets(planner: Any, site:
     assert drive.seconds[-1] - drive.seconds[0] == pytest.approx(238, abs=10)
 
     assert site.saved.wait().data == str(site.folder / "experience.npz")
-    site.wait_for_prior()
+    site.experience.wait(foretells)
     slowness = site.learned()
     assert slowness[14, 50] > 2
     shown = site.slowness.wait(lambda message: max(message.data) > 40)

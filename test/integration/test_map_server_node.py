@@ -12,7 +12,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from integration.user import trigger
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.srv import GetMap, LoadMap
-from std_srvs.srv import Trigger
 
 from ddqn_planner.grid import GridMap, MapFile, read_map_file, save_map, scatter_obstacles
 from ddqn_planner.nodes.conversions import grid_from_message
@@ -198,11 +197,6 @@ def hall_client(run_node: Any, make_client: Callable[[str], Any]) -> Iterator[An
         yield make_client("/hall")
 
 
-def wait_until_planned(hall_client: Any, ends: tuple[Any, Any]) -> None:
-    """Wait for a path that is not empty: before it, map or model may be missing."""
-    wait_for("path", lambda: hall_client.get_plan(*ends).poses)
-
-
 def test_the_directions_come_with_the_stamp_and_the_place_of_the_map(hall_client: Any) -> None:
     topics = "map_directions", "map"
     directions, maps = (hall_client.subscribe(OccupancyGrid, topic, LATCHED) for topic in topics)
@@ -213,7 +207,7 @@ def test_the_directions_come_with_the_stamp_and_the_place_of_the_map(hall_client
         assert of_map.info == served.info
         forbidden = np.frombuffer(of_map.data, np.uint8).reshape(36, 48)
         np.testing.assert_array_equal(forbidden, read_map_file(find_map("warehouse")).forbidden)
-        assert hall_client.call(Trigger, "map_server/scatter_obstacles").success
+        trigger(hall_client, "map_server/scatter_obstacles")
 
 
 def test_each_map_is_planned_on_with_its_own_directions(hall_client: Any, tmp_path: Path) -> None:
@@ -225,13 +219,12 @@ def test_each_map_is_planned_on_with_its_own_directions(hall_client: Any, tmp_pa
     ends = pose(grid, (0, 1)), pose(grid, (8, 1))
     for name in ["east", "west", "free", "west"] * 2:
         diagnostics.clear()
-        request = LoadMap.Request(map_url=str(tmp_path / f"{name}.yaml"))
-        response = hall_client.call(LoadMap, "map_server/load_map", request)
+        response = load_map(hall_client, tmp_path / f"{name}.yaml")
         wait_for_map(diagnostics, response.map.header.stamp, "/hall/planner")
+        way = ends
         if name == "west":
             for _ in range(2):
                 assert not hall_client.get_plan(*ends).poses
-            # That the planner has the directions: the way back is open.
-            wait_until_planned(hall_client, ends[::-1])
-        else:
-            wait_until_planned(hall_client, ends)
+            way = ends[::-1]  # it is open: the planner has the directions
+        # Before this path, map or model may be missing.
+        wait_for("path", lambda way=way: hall_client.get_plan(*way).poses)
