@@ -217,7 +217,6 @@ def running_robot(planner: Any, make_robot: Any) -> Any:
 @pytest.fixture
 def robot(running_robot: Any) -> Any:
     """Give the planner its parameters, a map, a start and a goal, whatever was before."""
-    running_robot.reset()
     running_robot.begin()
     return running_robot
 

@@ -3,7 +3,6 @@
 import itertools
 import math
 import re
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -14,9 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from client import TIMEOUT as TIMEOUT  # this and values_of are used by the tests of the planner
-from client import Client, initial_pose, map_message, pose, wait_for_map
-from client import values_of as values_of
+from client import Client, initial_pose, map_message, pose, values_of, wait_for_map
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from exact_segments import is_legal
 from geometry_msgs.msg import PoseStamped, Quaternion
@@ -174,8 +171,9 @@ class Robot:
         stamp = seconds(message.header.stamp)
         return self.wait_for_reason(reason, {"planned on the map of (s)": stamp})
 
-    def begin(self, start: Cell = START, goal: Cell = GOAL) -> None:
-        """Send a map, a start and a goal, and wait until the planner has planned with all three."""
+    def begin(self, start: Cell = START, goal: Cell = GOAL, **parameters: Any) -> None:
+        """Reset, send a map, a start and a goal, and wait until there is a plan with all."""
+        self.reset(**parameters)
         self.clear()
         message, yaw = self.stamped_map(), next(NUMBERS) % 3000 / 1000
         # Else an earlier map may have the plan: no topic waits for another.
@@ -205,16 +203,14 @@ class Robot:
             recorder.clear()
 
 
-def ask_for_plan(robot: Robot) -> tuple[Any, threading.Event]:
-    """Set an active goal; return the future of another plan, and the event that it is there."""
+def ask_for_plan(robot: Robot) -> Any:
+    """Set an active goal; return the future of another plan."""
     robot.send_start(robot.pose(START))
     robot.send_goal(robot.pose(GOAL))
     plans = robot.client.service(GetPlan, "planner/get_plan")
-    answered = threading.Event()
     plan = plans.call_async(GetPlan.Request(start=robot.pose(START), goal=robot.pose(GOAL)))
-    plan.add_done_callback(lambda _: answered.set())
     robot.wait_until_received()
-    return plan, answered
+    return plan
 
 
 @contextmanager

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from client import cell_of, cells_of, map_message
+from client import cell_of, cells_of, map_message, values_of
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray
-from integration.robot import NUMBERS, Robot, check_path, odometry, points_of, values_of
+from integration.robot import NUMBERS, Robot, check_path, odometry, points_of
 from nav_msgs.msg import Odometry
 from std_msgs.msg import Header
 
@@ -30,8 +30,7 @@ def hall_robot(planner: Any, make_robot: Any) -> Robot:
 
 @pytest.fixture
 def robot(hall_robot: Robot) -> Robot:
-    hall_robot.reset(use_map_costs=True, replan_period=SOON)
-    hall_robot.begin(START, GOAL)
+    hall_robot.begin(START, GOAL, use_map_costs=True, replan_period=SOON)
     return hall_robot
 
 
@@ -166,8 +165,7 @@ def dock_robot(hall_robot: Robot) -> Robot:
 
 @pytest.fixture
 def docks(dock_robot: Robot) -> Robot:
-    dock_robot.reset(replan_period=SOON)
-    dock_robot.begin(DOCKED, RIGHT)
+    dock_robot.begin(DOCKED, RIGHT, replan_period=SOON)
     return dock_robot
 
 

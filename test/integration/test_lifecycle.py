@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 import rclpy
-from client import generated_map, initial_pose, plan_request, wait_for
-from integration.robot import ERROR, GOAL, NUMBERS, START, TIMEOUT, WARN, Robot, ask_for_plan
+from client import TIMEOUT, generated_map, initial_pose, plan_request, wait_for
+from integration.robot import ERROR, GOAL, NUMBERS, START, WARN, Robot, ask_for_plan
 from lifecycle_msgs.msg import Transition
 from nav_msgs.srv import GetPlan
 from processes import cpu_seconds
@@ -155,11 +155,11 @@ def test_a_stop_answers_what_waits(run_waiting: Any, load_gate: Path) -> None:
     with run_waiting("/stopped") as robot:
         robot.set_map(robot.stamped_map())
         robot.node.wait_for_log("a model waits")
-        plan, answered = ask_for_plan(robot)
+        plan = ask_for_plan(robot)
         robot.wait_for_reason("the model is being loaded")
         assert robot.state == "inactive"  # it answers, but nothing yet
         assert robot.transition("cleanup")
-        assert answered.wait(60)
+        wait_for("plan", plan.done)
         assert plan.result().plan.poses == []
         load_gate.touch()
         start(robot)
@@ -270,11 +270,11 @@ def test_callbacks_resume_in_order_unless_destroyed() -> None:
 def test_requests_wait_for_the_first_map(run_waiting: Any, load_gate: Path, model: Path) -> None:
     load_gate.touch()
     with run_waiting("/early") as robot:
-        plan, answered = ask_for_plan(robot)
+        plan = ask_for_plan(robot)
         robot.node.wait_for_log("planning with the model")
         assert not plan.done()
         robot.send_map()
-        assert answered.wait(TIMEOUT)
+        wait_for("plan", plan.done)
         assert plan.result().plan.poses
         robot.wait_for_path(START, GOAL)
         assert all(path.poses for path in robot.plans.messages())
@@ -293,7 +293,7 @@ def test_requests_wait_for_the_first_model_and_another_one_that_is_set_meanwhile
     first = str(broken) if case == "broken" else "any_map"
     with run_waiting(f"/waiting_{case}", {"model": first}) as robot:
         robot.set_map(robot.map_message())
-        plan, answered = ask_for_plan(robot)
+        plan = ask_for_plan(robot)
         assert robot.wait_for_reason("the model is being loaded", {"model": first}).level == WARN
         assert robot.client.get_parameter("planner", "mode") == "greedy"
         assert not plan.done()
@@ -301,7 +301,7 @@ def test_requests_wait_for_the_first_model_and_another_one_that_is_set_meanwhile
         if case == "replaced":
             robot.set(model=str(model))
         load_gate.touch()
-        assert answered.wait(TIMEOUT)
+        wait_for("plan", plan.done)
         assert bool(plan.result().plan.poses) == (case != "broken")
         if case == "broken":
             reason = "cannot be read as safetensors"

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import rclpy
 from builtin_interfaces.msg import Time
-from client import TIMEOUT, wait_for
+from client import wait_for
 from hypothesis import given
 from hypothesis import strategies as st
 from nav_msgs.msg import OccupancyGrid
@@ -66,10 +66,8 @@ class Source(MapSource):
         self.heard += 1
 
     def grid(self) -> GridMap:
-        future, deadline = self.ready(), time.monotonic() + TIMEOUT
-        while not future.done():
-            assert time.monotonic() < deadline
-            time.sleep(0.001)
+        future = self.ready()
+        wait_for("map", future.done)
         return future.result()
 
     def slowness(self) -> Any:

@@ -1,7 +1,6 @@
 """Nav2's actions: what decides in them without Nav2's types, and the real ones where installed."""
 
 import sys
-import threading
 from collections.abc import Callable, Coroutine, Iterator
 from functools import partialmethod
 from pathlib import Path
@@ -301,10 +300,8 @@ class Navigator:
         return done(self.ask(handle.get_result_async))
 
 
-def done(future: Any, timeout: float = 60.0) -> Any:
-    ready = threading.Event()
-    future.add_done_callback(lambda _: ready.set())
-    assert ready.wait(timeout)
+def done(future: Any) -> Any:
+    wait_for("an answer", future.done)
     return future.result()
 
 

@@ -32,7 +32,6 @@ def robot(robot: Robot) -> Iterator[Robot]:
     robot.client.publisher(UInt8MultiArray, "trainer/model", LATCHED)
     robot.client.wait_for_discovery("planner")
     yield robot
-    robot.reset()
     robot.begin()
     assert robot.node.process.poll() is None
     assert "Traceback" not in robot.node.log

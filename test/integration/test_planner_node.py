@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from client import TIMEOUT
+from client import values_of, wait_for
 from geometry_msgs.msg import PoseStamped, Quaternion
 from integration.robot import (
     ERROR,
@@ -27,7 +27,6 @@ from integration.robot import (
     check_path,
     constant_model,
     points_of,
-    values_of,
     yaw_of,
 )
 from nav_msgs.msg import OccupancyGrid, Path
@@ -320,7 +319,6 @@ def gated(run_robot: Any, tmp_path_factory: Any, model: FilePath) -> Iterator[An
 @pytest.fixture
 def slow_robot(gated: Any) -> Iterator[Any]:
     """Close the gate of a planner that knows the field toward START, its active goal."""
-    gated.reset()
     gated.begin(START, START)
     gated.gate.unlink()
     gated.node.forget_log()
@@ -330,7 +328,7 @@ def slow_robot(gated: Any) -> Iterator[Any]:
 
 def test_all_else_is_answered_while_a_plan_takes_long(slow_robot: Any) -> None:
     robot, client = slow_robot, slow_robot.client
-    plan, answered = ask_for_plan(robot)
+    plan = ask_for_plan(robot)
     robot.node.wait_for_log("a plan waits")
     assert len(robot.get_plan(robot.pose(START), robot.pose(START)).poses) == 1
     outside = changed(robot.pose(START), "pose.position.x", 50.0)
@@ -344,7 +342,7 @@ def test_all_else_is_answered_while_a_plan_takes_long(slow_robot: Any) -> None:
     assert robot.get_plan(outside, robot.pose((0, 5))).poses == []
     assert not plan.done()
     robot.gate.touch()
-    assert answered.wait(TIMEOUT)
+    wait_for("plan", plan.done)
     check_path(plan.result().plan, robot.grid)
     assert points_of(plan.result().plan)[-1] == pytest.approx(robot.grid.cell_to_world(GOAL))
 

@@ -42,7 +42,6 @@ def hall_robot(planner: Any, make_robot: Any, hall: np.ndarray) -> Robot:
 
 @pytest.fixture
 def robot(hall_robot: Robot) -> Robot:
-    hall_robot.reset()
     hall_robot.begin((0, 0), (19, 0))
     return hall_robot
 
