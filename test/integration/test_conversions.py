@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Time as Stamp
 from client import MapFixture, plan_request, pose
-from geometry_msgs.msg import PoseStamped, Quaternion, TransformStamped
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, TransformStamped
 from hypothesis import given
 from hypothesis import strategies as st
 from integration.robot import changed, points_of, yaw_of
@@ -167,11 +167,9 @@ QUATERNIONS = UNITS.map(lambda four: Quaternion(**dict(zip("xyzw", four, strict=
 
 
 def stamped_pose(point: tuple[float, ...], rotation: Quaternion) -> PoseStamped:
-    stamped = PoseStamped(header=Header(frame_id="odom"))
-    position = stamped.pose.position
-    position.x, position.y, position.z = point
-    stamped.pose.orientation = rotation
-    return stamped
+    place = Point(**dict(zip("xyz", point, strict=True)))
+    pose = Pose(position=place, orientation=rotation)
+    return PoseStamped(header=Header(frame_id="odom"), pose=pose)
 
 
 def transform(shift: tuple[float, ...], rotation: Quaternion) -> TransformStamped:
@@ -236,10 +234,8 @@ def listening(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Frames]:
     """Return what makes frames that know the transforms of some seconds."""
 
     def make(*seconds: int) -> Frames:
-        listener = SimpleNamespace(group=SimpleNamespace())
-        fields = {"TransformListener": lambda *_, **__: listener, "TransformException": KeyError}
-        fields["__spec__"] = object  # it is installed
-        tf2_ros = SimpleNamespace(Buffer=lambda: Buffer(*seconds), **fields)
+        tf2_ros = Mock(Buffer=lambda: Buffer(*seconds), TransformException=KeyError)
+        tf2_ros.__spec__ = object  # it is installed
         monkeypatch.setitem(sys.modules, "tf2_ros", tf2_ros)
         monkeypatch.setattr(Frames, "_read", lambda _: None)
         return Frames(new_node(), lambda: 20.0)

@@ -1,7 +1,6 @@
 """The live view of examples/, into a recording."""
 
 import sys
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path as FilePath
@@ -9,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from client import wait_for
 from geometry_msgs.msg import Quaternion
 from processes import running
 from std_msgs.msg import Float32, Header
@@ -20,7 +20,6 @@ from rerun.chunk import RrdReader
 from ddqn_planner.nodes.conversions import along, grid_from_message, occupancy_message, path_message
 from ddqn_planner.nodes.runtime import LATCHED
 
-TIMEOUT = 120.0
 HEADER, ORIGIN = Header(frame_id="map"), (-1.0, 2.0, 0.7)
 CELLS = {"plan": [(0, 0), (1, 1), (1, 2)], "episode": [(2, 0), (2, 1)]}
 
@@ -64,11 +63,8 @@ def test_a_recording_holds_all(
             path = path_message(*along(cells, grid), HEADER, Quaternion(w=1.0))
             client.publish(topic, path, LATCHED)
         client.publish("trainer/average_reward", Float32(data=-0.5))
-        deadline = time.monotonic() + TIMEOUT
         wanted = {*(f"map/{layer}" for layer in live_view.LAYERS), "reward"}
-        while not wanted <= set(read(file)):
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
+        wait_for("recording", lambda: wanted <= set(read(file)))
     found = read(file)
     for name, cells in CELLS.items():
         (strip,) = found[f"map/{name}"]["strips"][-1]
