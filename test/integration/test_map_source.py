@@ -420,7 +420,7 @@ def times(source: Source, driven: UInt8MultiArray) -> ExpectedTimes:
 
 def test_drives_are_planned_with_at_once(source: Source, driven: UInt8MultiArray) -> None:
     data = bytes(driven.data)
-    expected = Experience.from_bytes(data).apply(GRID).slowness
+    expected: Any = Experience.from_bytes(data).apply(GRID).slowness
     source._take(MESSAGE)
     assert source.slowness() is None
     source.heard = 0
@@ -522,9 +522,9 @@ def finished(coroutine: Coroutine[None, None, Any]) -> Any:
 
 
 def test_a_map_that_grows_keeps_its_times(times: ExpectedTimes) -> None:
-    before = times.apply(GRID).slowness
+    before: Any = times.apply(GRID).slowness
     grown = GridMap(np.zeros((60, 150), dtype=np.bool_), 0.25, (-2.5, -1.25, 0.0))
-    after = times.apply(grown).slowness
+    after: Any = times.apply(grown).slowness
     # Near the old edge more places tell of others.
     np.testing.assert_allclose(after[5:35, 10:130], before[:30], rtol=0.021)
 
