@@ -2,7 +2,7 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,8 @@ os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(Path(__file__).with_name("fas
 
 from shared import paper as paper
 from shared import small as small
+
+from ddqn_planner.cli import main
 
 ROOT = Path(__file__).resolve().parent.parent
 NOBODY = 65534
@@ -46,6 +48,17 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
             return nodeid if Path(file).name in ANY_WORKER else file
 
     return Scheduling(config, log)
+
+
+@pytest.fixture
+def console(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
+    """Run `ddqn-planner` with words and other arguments; return what it writes to out and err."""
+
+    def run(words: str, *others: object, status: int = 0) -> Any:
+        assert main([*words.split(), *map(str, others)]) == status
+        return capsys.readouterr()
+
+    return run
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from processes import executable
 
-from ddqn_planner.cli import main
 from ddqn_planner.grid import GridMap, MapFile, MoveRule, save_map
 from ddqn_planner.model import load_model
 from ddqn_planner.training.any_map import ANY_MAP, random_scenarios
@@ -76,7 +75,7 @@ def test_a_node_without_ros_says_in_one_line_how_to_get_it(without: Any, node: s
     assert done.returncode == 1
 
 
-def test_bad_input_ends_in_2(capsys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bad_input_ends_in_2(console: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     save_map(GridMap(np.zeros((2, 2))), "bare.yaml")
     for command, named in (
@@ -88,25 +87,24 @@ def test_bad_input_ends_in_2(capsys: Any, tmp_path: Path, monkeypatch: pytest.Mo
         ("plan dilemma --tolerance nan", "--tolerance is nan; give metres"),
         ("plan dilemma --tolerance -1", r"--tolerance is -1\.0; give metres"),
         ("plan dilemma --start-clearing-radius -1", r"--start-clearing-radius is -1\.0; give met"),
+        ("plan dilemma --model car", r"0\.05 m, and the map's have 0\.5 m; give a map"),
         ("train dilemma --gamma 2", r"gamma is 2\.0"),
         ("train dilemma --start 1 19", r"start \(1, 19\)"),
     ):
-        assert main(command.split()) == 2
-        assert re.search(named, error := capsys.readouterr().err)
+        assert re.search(named, error := console(command, status=2).err)
         assert "Traceback" not in error
 
 
-def test_a_trained_model_plans(capsys: Any, small_map: str, tmp_path: Path) -> None:
-    train = ["train", small_map, "--out", str(tmp_path / "run"), "--network", "propagation"]
-    train += ["--steps", "1000", "--learning-rate", "0.003", "--target-interval", "50"]
-    assert main(train) == 0
-    assert "of 16 starts" in capsys.readouterr().out
-    model = str(tmp_path / "run" / "model.safetensors")
-    assert main(["plan", small_map, "--model", model]) == 0
-    assert "length" in capsys.readouterr().out
+def test_a_trained_model_plans(console: Any, small_map: str, tmp_path: Path) -> None:
+    train = "train --network propagation --steps 1000 --learning-rate 0.003 --target-interval 50"
+    assert "of 16 starts" in console(train, small_map, "--out", tmp_path / "run").out
+    model = tmp_path / "run" / "model.safetensors"
+    assert "length" in console("plan", small_map, "--model", model).out
 
 
-def test_each_hyper_parameter_can_be_given(small: Scenario, small_map: str, tmp_path: Path) -> None:
+def test_each_hyper_parameter_can_be_given(
+    console: Any, small: Scenario, small_map: str, tmp_path: Path
+) -> None:
     given: dict[str, Any] = {}
     for each in PARAMETERS:
         low, default = each.metadata.get("range", [0])[0], each.default
@@ -115,8 +113,7 @@ def test_each_hyper_parameter_can_be_given(small: Scenario, small_map: str, tmp_
         given[each.name] = type(default)(other)
     given["steps"] = 4
     arguments = [f"--{name.replace('_', '-')}={value}" for name, value in given.items()]
-    out = str(tmp_path / "run")
-    assert main(["train", small_map, "--out", out, "--seed", "5", *arguments]) == 0
+    console("train --seed 5", small_map, "--out", tmp_path / "run", *arguments)
     trainer = Trainer([small], MoveRule.CORNER_CUTTING, HyperParameters(**given), seed=5)
     trainer.restore(tmp_path / "run" / "checkpoint.safetensors")  # of these parameters alone
     assert trainer.steps == 4
@@ -124,9 +121,10 @@ def test_each_hyper_parameter_can_be_given(small: Scenario, small_map: str, tmp_
     assert load_model(tmp_path / "run" / "model.safetensors")[1].seed == 5
 
 
-def test_the_model_for_any_map_is_trained_with_parameters_of_its_own(tmp_path: Path) -> None:
-    command = ["train-any-map", "--out", str(tmp_path), "--maps", "3", "--seed", "4"]
-    assert main([*command, "--steps", "128"]) == 0
+def test_the_model_for_any_map_is_trained_with_parameters_of_its_own(
+    console: Any, tmp_path: Path
+) -> None:
+    console("train-any-map --maps 3 --seed 4 --steps 128 --out", tmp_path)
     scenarios = random_scenarios(seed=4, maps=3)
     trainer = Trainer(scenarios, MoveRule.ROBOT_SAFE, ANY_MAP, seed=4)
     trainer.restore(tmp_path / "checkpoint.safetensors")  # of these parameters alone

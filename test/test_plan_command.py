@@ -13,28 +13,23 @@ from bodies import Oracle
 from PIL import Image, ImageColor
 
 from ddqn_planner import Planner, inflate, pictures
-from ddqn_planner.cli import main
 from ddqn_planner.grid import MapFile, save_map
 from ddqn_planner.grid.footprint import placed
 from ddqn_planner.pictures import PATH_COLOUR, VALUE_COLOURS
 
 
-def test_plan_prints_the_papers_path_by_its_rule(capsys: Any) -> None:
-    assert main(["plan", "dilemma", "--model", "dilemma"]) == 0
-    printed = capsys.readouterr().out
+def test_plan_prints_the_papers_path_by_its_rule(console: Any) -> None:
+    printed = console("plan dilemma --model dilemma").out
     assert "length 22.97 cells, optimum 22.97 under corner_cutting" in printed
     assert [printed.count(letter) for letter in "*SG"] == [17, 1, 1]
-    assert main(["plan", "dilemma", "--move-rule", "unit"]) == 0
-    printed = capsys.readouterr().out
+    printed = console("plan dilemma --move-rule unit").out
     assert "length 18.00 cells, optimum 18.00 under unit" in printed
     assert "11.49 m" in printed  # as the robot drives, whatever the rule counts
-    assert main(["plan", "dilemma", "--start", "1", "19"]) == 1
-    assert "the start is occupied" in capsys.readouterr().err
-    request = ["plan", "dilemma", "--model", "dilemma", "--goal", "0", "0"]
-    assert main(request) == 1
-    assert "greedy steps do not find it" in capsys.readouterr().err
-    assert main([*request, "--mode", "astar_fallback"]) == 0
-    assert re.search("cells, optimum.*, astar_fallback, planned in", capsys.readouterr().out)
+    assert "the start is occupied" in console("plan dilemma --start 1 19", status=1).err
+    request = "plan dilemma --model dilemma --goal 0 0"
+    assert "greedy steps do not find it" in console(request, status=1).err
+    printed = console(f"{request} --mode astar_fallback").out
+    assert re.search("cells, optimum.*, astar_fallback, planned in", printed)
 
 
 CLEARED = {"start": (5, 0), "start_clearing_radius": 2}
@@ -54,7 +49,7 @@ ASKED: dict[str, tuple[dict[str, Any], tuple[float, float], dict[str, Any]]] = {
 }
 
 
-def test_plan_gives_as_the_library(capsys: Any, tmp_path: Path) -> None:
+def test_plan_gives_as_the_library(console: Any, tmp_path: Path) -> None:
     random, planner, seen = np.random.default_rng(12), Planner.load("any_map"), set()
     values = random.choice([0, 60, -1, 100], (30, 30), p=[0.8, 0.08, 0.06, 0.06])
     values[0, 0], values[-1, -1], values[0, 5], values[-1, -4] = 0, 0, 100, 100
@@ -63,9 +58,9 @@ def test_plan_gives_as_the_library(capsys: Any, tmp_path: Path) -> None:
     for options, (rules, body, asked) in ASKED.items():
         grid = inflate(map_file.grid(**rules), *body)
         plan = planner.plan(grid, **{"start": (0, 0), "goal": (29, 29), **asked})
-        command = ["plan", str(tmp_path / "map.yaml"), "--json", *options.split()]
-        assert main(command) == (0 if plan.cells else 1)
-        answer = json.loads(capsys.readouterr().out)
+        given, status = options.split(), 0 if plan.cells else 1
+        printed = console("plan --json", tmp_path / "map.yaml", *given, status=status).out
+        answer = json.loads(printed)
         assert answer["cells"] == [list(cell) for cell in plan.cells]
         assert (answer["status"], answer["length"]) == (plan.status.name, plan.length)
         if plan.cells:
@@ -75,34 +70,33 @@ def test_plan_gives_as_the_library(capsys: Any, tmp_path: Path) -> None:
     assert len(seen) == len(ASKED)  # each option counts
 
 
-def test_plan_draws_a_wide_map_for_a_terminal(capsys: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plan_draws_a_wide_map_for_a_terminal(
+    console: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    assert main(["plan", "office", "--clearance-weight", "1"]) == 0
-    *rows, start, length = capsys.readouterr().out.splitlines()
+    *rows, start, length = console("plan office --clearance-weight 1").out.splitlines()
     assert [len(row.split()) for row in rows] == [64] * 43  # squares of 9 cells
     assert "goal (550, 330)" in start
     assert re.search(r"cost \d{4}\.\d\d, greedy", length)
 
 
-def test_plan_gives_every_cell(capsys: Any, tmp_path: Path) -> None:
+def test_plan_gives_every_cell(console: Any, tmp_path: Path) -> None:
     file = tmp_path / "path.csv"
-    assert main(["plan", "office", "--cells", "--csv", str(file)]) == 0
-    *cells, start, length = capsys.readouterr().out.splitlines()
+    *cells, start, length = console("plan office --cells --csv", file).out.splitlines()
     assert start == "start (15, 15), goal (550, 330), 39.50 m"
     assert length.startswith("length 789.95 cells, optimum 789.95 under robot_safe, greedy, ")
     assert (cells[0], cells[-1]) == ("15 15", "550 330")
     header, *rows = file.read_text().splitlines()
     assert (header, rows[0]) == ("x,y,x_metres,y_metres", "15,15,0.775,0.775")
     assert cells == [" ".join(row.split(",")[:2]) for row in rows]
-    assert main(["plan", "dilemma", "--start", "1", "19", "--csv", str(file)]) == 1
+    console("plan dilemma --start 1 19 --csv", file, status=1)
     assert file.read_text().splitlines() == [header]  # of no other plan
 
 
-def test_plan_writes_json_and_a_picture(capsys: Any, tmp_path: Path) -> None:
+def test_plan_writes_json_and_a_picture(console: Any, tmp_path: Path) -> None:
     def plan(picture: str, *goal: Any) -> Any:
-        command = ["plan", "dilemma", "--json", "--picture", str(tmp_path / picture)]
-        assert main([*command, *map(str, goal)]) == 0
-        return json.loads(capsys.readouterr().out)
+        file = tmp_path / picture
+        return json.loads(console("plan dilemma --json --picture", file, *goal).out)
 
     answer = plan("plan.png")
     assert (answer["cells"][0], answer["cells"][-1]) == ([6, 6], [17, 19])
@@ -116,11 +110,11 @@ def test_plan_writes_json_and_a_picture(capsys: Any, tmp_path: Path) -> None:
 
 
 def test_missing_matplotlib_is_named(
-    capsys: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    console: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    assert main(["plan", "dilemma", "--picture", str(tmp_path / "plan.png")]) == 2
-    assert capsys.readouterr().err.endswith("; pip install matplotlib\n")
+    said = console("plan dilemma --picture", tmp_path / "plan.png", status=2).err
+    assert said.endswith("; pip install matplotlib\n")
 
 
 @pytest.fixture
@@ -152,7 +146,7 @@ BODY_ASKED: dict[str, tuple[dict[str, Any], float, dict[str, Any], dict[str, Any
 
 
 def test_plan_drives_a_body_as_the_library_and_without_a_collision(
-    rooms: Any, capsys: Any, tmp_path: Path
+    rooms: Any, console: Any, tmp_path: Path
 ) -> None:
     map_file, path = rooms
     file, seen = tmp_path / "poses.csv", set()
@@ -167,9 +161,8 @@ def test_plan_drives_a_body_as_the_library_and_without_a_collision(
         assert planner.pose_planner is not None
         body = str(planner.pose_planner.footprint.tolist())
         plan = planner.plan_poses(grid, start, goal, **{"bound": 1.0, **asked})
-        command = ["plan", path, "--model", "car", "--json", "--csv", str(file), *options.split()]
-        assert main(command) == (0 if plan.cells else 1)
-        answer = json.loads(capsys.readouterr().out)
+        given, status = [path, "--csv", file, *options.split()], 0 if plan.cells else 1
+        answer = json.loads(console("plan --model car --json", *given, status=status).out)
         assert answer["poses"] == plan.poses.tolist()
         assert (answer["status"], answer["reason"]) == (plan.status.name, plan.status.value)
         assert (answer["bound"], answer["cost"]) == (plan.bound, plan.cost)
@@ -185,60 +178,44 @@ def test_plan_drives_a_body_as_the_library_and_without_a_collision(
     assert len(seen) == len(BODY_ASKED)  # each option counts
 
 
-def test_plan_tells_how_a_body_drives_or_why_it_cannot(rooms: Any, capsys: Any) -> None:
-    command = ["plan", rooms[1], "--model", "car"]
-    assert main(command) == 0
+def test_plan_tells_how_a_body_drives_or_why_it_cannot(rooms: Any, console: Any) -> None:
     words = r"\d\.\d\d m, \d+ poses, at most 1\.000 times the least cost, planned in \d+\.\d ms\n"
-    assert re.fullmatch(words, capsys.readouterr().out)
+    assert re.fullmatch(words, console("plan --model car", rooms[1]).out)
     for options, reason in (
         ("--start 64 10", "the start is occupied"),
         ("--start 3 25", "the start is occupied"),  # not by its cell
         ("--goal 200 40", "the goal lies outside the map"),
         ("--goal 112 -1", "the goal lies outside the map"),
     ):
-        assert main([*command, *options.split()]) == 1
-        assert capsys.readouterr().err == f"no path: {reason} for the body; --picture shows it\n"
+        said = console(f"plan --model car {options}", rooms[1], status=1).err
+        assert said == f"no path: {reason} for the body; --picture shows it\n"
 
 
-@pytest.mark.parametrize(
-    ("options", "named"),
-    [
-        (
-            "--model car --robot-radius 0",
-            "--robot-radius is for models without a body, unlike car;",
-        ),
-        ("--model car --move-rule unit", "--move-rule is for models without"),
-        ("--model car --mode greedy", "--mode is for models without"),
-        ("--model car --start-clearing-radius 1", "--start-clearing-radius is for models without"),
-        ("--model car --cells", "--cells is for models without"),
-        (
-            "--yaws 0 0",
-            "--yaws is for models with a body, unlike any_map; leave it out, or give an",
-        ),
-        ("--yaw-tolerance 0", "--yaw-tolerance is for models with a"),
-        ("--bound 1.2", "--bound is for models with a"),
-        ("--model car --yaws nan 0", "nan); give three finite numbers x, y, yaw"),
-        ("--model car --bound nan", "the bound is nan; give 1 or more"),
-        ("--model car --bound 0.9", "the bound is 0.9; give 1 or more"),
-        ("--model car --tolerance -1", "the tolerance is -1.0; give two numbers"),
-        ("--model car --yaw-tolerance nan", "the tolerance is nan; give two numbers"),
-        ("--model cart", "no 'cart.safetensors'"),
-    ],
-)
-def test_plan_refuses_what_a_model_cannot_follow(
-    rooms: Any, capsys: Any, options: str, named: str
-) -> None:
-    assert main(["plan", rooms[1], *options.split()]) == 2
-    assert named in capsys.readouterr().err
+REFUSED = {
+    "--model car --robot-radius 0": "--robot-radius is for models without a body, unlike car;",
+    "--model car --move-rule unit": "--move-rule is for models without",
+    "--model car --mode greedy": "--mode is for models without",
+    "--model car --start-clearing-radius 1": "--start-clearing-radius is for models without",
+    "--model car --cells": "--cells is for models without",
+    "--yaws 0 0": "--yaws is for models with a body, unlike any_map; leave it out, or give an",
+    "--yaw-tolerance 0": "--yaw-tolerance is for models with a",
+    "--bound 1.2": "--bound is for models with a",
+    "--model car --yaws nan 0": "nan); give three finite numbers x, y, yaw",
+    "--model car --bound nan": "the bound is nan; give 1 or more",
+    "--model car --bound 0.9": "the bound is 0.9; give 1 or more",
+    "--model car --tolerance -1": "the tolerance is -1.0; give two numbers",
+    "--model car --yaw-tolerance nan": "the tolerance is nan; give two numbers",
+    "--model cart": "no 'cart.safetensors'",
+}
 
 
-def test_plan_names_the_resolution_that_a_body_needs(capsys: Any) -> None:
-    assert main(["plan", "dilemma", "--model", "car"]) == 2
-    assert "0.05 m, and the map's have 0.5 m; give a map" in capsys.readouterr().err
+@pytest.mark.parametrize("options", REFUSED)
+def test_plan_refuses_what_a_model_cannot_follow(rooms: Any, console: Any, options: str) -> None:
+    assert REFUSED[options] in console(f"plan {options}", rooms[1], status=2).err
 
 
 def test_a_picture_shows_what_a_body_sweeps_and_where_it_has_no_room(
-    rooms: Any, capsys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    rooms: Any, console: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("matplotlib")
     shown, drawn, draw_body = [], [], pictures.draw_body
@@ -249,19 +226,19 @@ def test_a_picture_shows_what_a_body_sweeps_and_where_it_has_no_room(
         draw_body(*body)
 
     monkeypatch.setattr(pictures, "draw_body", draw)
-    for goal, tolerance in (("40", "0"), ("12", "0"), ("12", "0.6")):
-        command = ["plan", rooms[1], "--model", "car", "--goal", "102", goal, "--json"]
-        command += ["--tolerance", tolerance, "--picture", str(tmp_path / "plan.png")]
-        has_path = main(command) == 0
-        with Image.open(tmp_path / "plan.png") as picture:
+    file = tmp_path / "plan.png"
+    for ends, status in (("40", 0), ("12", 1), ("12 --tolerance 0.6", 0)):
+        words = f"plan --model car --json --goal 102 {ends} --picture"
+        printed = console(words, file, rooms[1], status=status).out
+        with Image.open(file) as picture:
             pixels = np.asarray(picture.convert("RGB"))
         colours = map(ImageColor.getrgb, (VALUE_COLOURS[1], PATH_COLOUR))
         shown.append([int((pixels == colour).all(axis=2).sum()) for colour in colours])
         # Cells, counted from the centre of the first one, are the metres of the plan.
         _, footprint, *poses = drawn[-1]
         swept, ends = ((placed(footprint, each) + 0.5) * 0.05 + (1, -2) for each in poses)
-        driven = np.reshape(json.loads(capsys.readouterr().out)["poses"], (-1, 3))
-        asked = driven[[0, -1]] if has_path else np.array([[1.775, -0.725, 0], [6.125, -1.375, 0]])
+        driven = np.reshape(json.loads(printed)["poses"], (-1, 3))
+        asked = np.array([[1.775, -0.725, 0], [6.125, -1.375, 0]]) if status else driven[[0, -1]]
         np.testing.assert_allclose(swept, placed(planner.footprint, driven), atol=1e-9)
         np.testing.assert_allclose(ends, placed(planner.footprint, asked), atol=1e-9)
     (swept, path), (none, no_path), _ = shown

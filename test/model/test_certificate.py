@@ -1,6 +1,7 @@
 import math
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,6 @@ from networks import random_network
 from strategies import Place, grids_with_costs, grids_with_free_cell
 
 from ddqn_planner import MoveRule
-from ddqn_planner.cli import main
 from ddqn_planner.grid import MAX_COST_MULTIPLIER, OCCUPIED, UNKNOWN
 from ddqn_planner.grid.moves import MOVES, path_cost, shortest_distances
 from ddqn_planner.model import ModelMetadata, PropagationQNetwork, load_model
@@ -210,11 +210,9 @@ def test_the_error_of_the_costs_is_the_greatest_one() -> None:
     assert certificate.path_error == pytest.approx(1.3 / 0.7 - 1, abs=1e-3)
 
 
-def test_certify_prints_the_documented_proof(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["certify", "any_map"]) == 0
-    printed = capsys.readouterr().out
+def test_certify_prints_the_documented_proof(console: Any) -> None:
+    printed = console("certify any_map").out
     assert printed.startswith("proved: all 4,096 decisions, ")
     assert printed in GUARANTEES.read_text(encoding="utf-8")
-    assert main(["certify", "dilemma"]) == 1
     why = "the moves depend on the whole map, not on 3x3 patches"
-    assert capsys.readouterr().out == f"nothing can be proved: {why}\n"
+    assert console("certify dilemma", status=1).out == f"nothing can be proved: {why}\n"

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ddqn_planner.cli import main
 from ddqn_planner.grid.footprint import swept_cells
 from ddqn_planner.model import RobotNetwork, load_model, model_bytes
 from ddqn_planner.training.robot import RobotTrainer
@@ -21,24 +20,21 @@ TINY: Any = (
 )
 
 
-def test_the_command_trains_a_robot_that_is_proved(capsys: Any, tmp_path: Path) -> None:
+def test_the_command_trains_a_robot_that_is_proved(console: Any, tmp_path: Path) -> None:
     path, (footprint, motion, radius, resolution, _) = tmp_path / "tiny.safetensors", TINY
-    command = ["train-robot", "--footprint", footprint, "--motion", motion, "--out", str(path)]
-    command += ["--turning-radius", str(radius), "--resolution", str(resolution)]
-    command += ["--padding", "0.02"]
-    assert main([*command, "--steps", "20000"]) == 1
-    assert re.search(r"steps|seed", capsys.readouterr().err)
+    command = f"train-robot --motion {motion} --turning-radius {radius} --resolution {resolution}"
+    given = "--padding", 0.02, "--out", path, "--footprint", footprint
+    assert re.search("steps|seed", console(command, *given, "--steps", 20_000, status=1).err)
     assert not path.exists()
-    assert main(command) == 0
-    assert re.search(r"transitions: proved: all [\d,]+ cells", capsys.readouterr().out)
+    printed = console(command, *given).out
+    assert re.search(r"transitions: proved: all [\d,]+ cells", printed)
     network, metadata = load_model(path)
     assert isinstance(network, RobotNetwork)
     assert network.footprint.max() == pytest.approx(0.36)
     expected = swept_cells(network.footprint, network.motions)
     np.testing.assert_array_equal(network.swept(), expected)
     assert 20_000 < metadata.steps < 2_000_000
-    assert main(["certify", str(path)]) == 0
-    assert "no others do" in capsys.readouterr().out
+    assert "no others do" in console("certify", path).out
 
 
 def test_the_same_seed_trains_the_same_model() -> None:
@@ -97,8 +93,8 @@ WRONG = {
 
 
 @pytest.mark.parametrize("options", WRONG)
-def test_what_is_no_robot_is_refused(capsys: Any, tmp_path: Path, options: str) -> None:
-    command = ["train-robot", "--footprint", "0.2", "--out", str(tmp_path / "robot.safetensors")]
-    assert main([*command, *options.split()]) == (1 if "steps" in options else 2)
-    assert WRONG[options] in capsys.readouterr().err
+def test_what_is_no_robot_is_refused(console: Any, tmp_path: Path, options: str) -> None:
+    given = "--out", tmp_path / "robot.safetensors", *options.split()
+    status = 1 if "steps" in options else 2
+    assert WRONG[options] in console("train-robot --footprint 0.2", *given, status=status).err
     assert not any(tmp_path.iterdir())
