@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from ddqn_planner import Experience, GridMap
-from ddqn_planner.cli import main
 from ddqn_planner.experience.drives import DriveEnd, DriveFolder
 from ddqn_planner.experience.recordings import drives_of, read_csv, read_mcap
 from ddqn_planner.grid import save_map
@@ -97,34 +96,22 @@ def slowness(path: Path) -> float:
     return float(Experience.load(path).slowness(GRID)[20, 60])
 
 
-def test_a_folder_is_learned_anew(tmp_path: Path, map_file: Path, capsys: Any) -> None:
+def test_a_folder_is_learned_anew(tmp_path: Path, map_file: Path, console: Any) -> None:
     folder = DriveFolder(tmp_path / "drives", 0.5, 0.5)
     seconds, *positions = np.transpose(slow_drive())
     for _ in range(3):
         folder.add(DriveEnd.ARRIVED, seconds, np.column_stack(positions), GRID)
-    command = ["learn", str(folder.folder), "--map", str(map_file)]
-    assert main(command) == 2  # the trainer records there
-    assert "another process records" in capsys.readouterr().err
+    learn = "learn", folder.folder, "--map", map_file
+    # The trainer records there.
+    assert "another process records" in console(*learn, status=2).err
     folder.close()
     before = slowness(folder.experience_path)
     folder.experience_path.write_text("broken")
-    assert main(command) == 0
+    output = console(*learn).out
     assert slowness(folder.experience_path) == pytest.approx(before, rel=0.03)
-    output = capsys.readouterr().out
     assert "3 drives, 60 m, 6.0 min" in output
     assert f"saved {folder.experience_path}" in output
     DriveFolder(tmp_path / "drives", 0.5, 0.5).close()
-
-
-def test_a_csv_file_is_learned(tmp_path: Path, map_file: Path, capsys: Any) -> None:
-    file = tmp_path / "drive.csv"
-    rows = [f"{t},{x},note,{y}" for t, x, y in slow_drive()]
-    file.write_text("\n".join(["seconds,x,what,y", *rows]))
-    out = tmp_path / "new" / "learned.npz"
-    options = ["--map", str(map_file), "--out", str(out), "--nominal-speed", "1.0"]
-    assert main(["learn", str(file), *options]) == 0
-    assert slowness(out) > 3
-    assert Experience.load(out).nominal_speed == 1
 
 
 def test_a_csv_file_may_have_a_mark_of_its_encoding_and_blanks(tmp_path: Path) -> None:
@@ -134,17 +121,18 @@ def test_a_csv_file_may_have_a_mark_of_its_encoding_and_blanks(tmp_path: Path) -
     assert read_csv(file) == [(1, 2, 3), (4, 5, 6)]
 
 
-def test_recordings_add_to_older_experience(tmp_path: Path, map_file: Path, capsys: Any) -> None:
+def test_recordings_add_to_older_experience(tmp_path: Path, map_file: Path, console: Any) -> None:
     files = [tmp_path / f"{name}.csv" for name in "ab"]
     for file, y in zip(files, (5.0, 8.0), strict=True):
-        file.write_text("seconds,x,y\n" + "".join(f"{t},{x},{y}\n" for t, x, _ in slow_drive()))
-    learn = ["learn", "--map", str(map_file), "--out"]
-    both, first, after = (tmp_path / f"{name}.npz" for name in ("both", "first", "after"))
-    speed = ["--nominal-speed", "0.8"]
-    assert main([*learn, str(both), *map(str, files), *speed]) == 0
-    assert main([*learn, str(first), str(files[0]), *speed]) == 0
-    going_on = [*learn, str(after), str(files[1]), "--experience", str(first)]
-    assert main(going_on) == 0
+        rows = [f"{t},{x},note,{y}" for t, x, _ in slow_drive()]
+        file.write_text("\n".join(["seconds,x,what,y", *rows]))
+    both, first, after = (tmp_path / "new" / f"{name}.npz" for name in ("both", "first", "after"))
+    learn = "learn --nominal-speed 0.8 --map", map_file, "--out"
+    console(*learn, both, *files)
+    console(*learn, first, files[0])
+    going_on = "learn --map", map_file, "--out", after, files[1], "--experience", first
+    console(*going_on)
+    assert slowness(both) > 2.5
     one, two, old = map(Experience.load, (both, after, first))
     driven = np.ix_((20, 32), (40, 60, 80))
     np.testing.assert_allclose(one.slowness(GRID)[driven], two.slowness(GRID)[driven], rtol=0.3)
@@ -153,53 +141,48 @@ def test_recordings_add_to_older_experience(tmp_path: Path, map_file: Path, caps
     assert one.prior is not None
     assert two.nominal_speed == 0.8
     before = after.read_bytes()
-    assert main([*going_on, "--nominal-speed", "0.5"]) == 2
-    assert "nominal_speed 0.8 (now 0.5); leave those options out" in capsys.readouterr().err
+    said = console(*going_on, "--nominal-speed", 0.5, status=2).err
+    assert "nominal_speed 0.8 (now 0.5); leave those options out" in said
     assert after.read_bytes() == before
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "reason"),
-    [
-        ("drive.csv", "time,x,y\n1,2,3\n", "the columns seconds are missing"),
-        ("drive.csv", "seconds,x,y\n1,2,three\n", "'three'.* has no numbers"),
-        ("drive.csv", "seconds,x,y\n1,2\n", "'2'.* has no numbers"),
-        ("drive.csv", "seconds,x,y\n1,2,nan\n", "holds no drive"),
-        ("drive.csv", "", "columns seconds, x, y are missing"),
-        ("drive.csv", "seconds,x,y\n99,1,1\n98,2,1\n97,3,1\n", "time .* runs backwards"),
-        ("drive.csv", "seconds,x,y\n" + 9 * "7,1,1\n7,2,1\n", "time .* stands still"),
-        (
-            "drive.csv",
-            "seconds,x,y\n1,-50,1\n2,-51,1\n3,-52,1\n",
-            r"\[-52.0, 1.0\] to .* map has 30.0 x",
-        ),
-        ("drive.db3", "", r"no \.csv and no \.mcap file.* `ros2 bag convert`"),
-        ("missing.csv", None, "No such file"),
-        (".", None, r"no folder with episodes\.csv or \.mcap files"),
-    ],
-)
+# A file's name and its text, and why it is refused.
+REFUSED = [
+    ("drive.csv", "time,x,y\n1,2,3\n", "the columns seconds are missing"),
+    ("drive.csv", "seconds,x,y\n1,2,three\n", "'three'.* has no numbers"),
+    ("drive.csv", "seconds,x,y\n1,2\n", "'2'.* has no numbers"),
+    ("drive.csv", "seconds,x,y\n1,2,nan\n", "holds no drive"),
+    ("drive.csv", "", "columns seconds, x, y are missing"),
+    ("drive.csv", "seconds,x,y\n99,1,1\n98,2,1\n97,3,1\n", "time .* runs backwards"),
+    ("drive.csv", "seconds,x,y\n" + 9 * "7,1,1\n7,2,1\n", "time .* stands still"),
+    ("drive.csv", "seconds,x,y\n1,-50,1\n2,-52,1\n", r"\[-52.0, 1.0\] to .* map has 30.0 x"),
+    ("drive.db3", "", r"no \.csv and no \.mcap file.* `ros2 bag convert`"),
+    ("missing.csv", None, "No such file"),
+    (".", None, r"no folder with episodes\.csv or \.mcap files"),
+]
+
+
+@pytest.mark.parametrize(("name", "text", "reason"), REFUSED)
 def test_what_cannot_be_learned_is_refused(
-    tmp_path: Path, map_file: Path, capsys: Any, name: str, text: str | None, reason: str
+    tmp_path: Path, map_file: Path, console: Any, name: str, text: str | None, reason: str
 ) -> None:
     file = tmp_path / name
     if text is not None:
         file.write_text(text)
-    assert main(["learn", str(file), "--map", str(map_file)]) == 2
-    assert re.search(reason, capsys.readouterr().err)
+    assert re.search(reason, console("learn", file, "--map", map_file, status=2).err)
     assert not [*tmp_path.glob("experience.npz"), *tmp_path.glob("*.lock")]
 
 
 @pytest.mark.parametrize("kind", [ODOMETRY, WITH_COVARIANCE, "geometry_msgs/msg/PoseStamped"])
 def test_poses_of_an_mcap_file_are_learned(
-    tmp_path: Path, map_file: Path, kind: str, capsys: Any
+    tmp_path: Path, map_file: Path, kind: str, console: Any
 ) -> None:
     messages = [message("/where", kind, sample) for sample in slow_drive()]
     messages += [message("/odom", ODOMETRY, (t, 0.0, 0.0), "odom") for t in range(9)]
     messages += [("/chatter", "std_msgs/msg/String", {"data": "hello"})]
     file = write_mcap(tmp_path / "drive.mcap", messages)
-    assert main(["learn", str(file), "--map", str(map_file)]) == 0
+    assert "1200 poses of /where" in console("learn", file, "--map", map_file).out
     assert slowness(tmp_path / "experience.npz") > 2
-    assert "1200 poses of /where" in capsys.readouterr().out
 
 
 def tree(robot: str, y: float, topic: str = "/tf") -> list[Message]:
@@ -223,7 +206,7 @@ def driven(y: float) -> np.ndarray:
 
 
 def test_transforms_of_a_bag_lead_from_a_frame_below_the_one_that_moves_to_the_map(
-    tmp_path: Path, map_file: Path, capsys: Any
+    tmp_path: Path, map_file: Path, console: Any
 ) -> None:
     messages = [*tree("", 5.0), message("/goal_pose", ODOMETRY, (100.0, 20.0, 1.0))]
     parts = [
@@ -233,39 +216,31 @@ def test_transforms_of_a_bag_lead_from_a_frame_below_the_one_that_moves_to_the_m
     source, samples = read_mcap(parts)
     assert source == "/tf of base_link"
     np.testing.assert_allclose(samples, driven(5.0), atol=1e-9)
-    assert main(["learn", str(tmp_path), "--map", str(map_file)]) == 0
-    assert "200 poses of /tf of base_link" in capsys.readouterr().out
+    printed = console("learn", tmp_path, "--map", map_file).out
+    assert "200 poses of /tf of base_link" in printed
 
 
-@pytest.mark.parametrize(
-    ("messages", "names", "choice"),
-    [
-        (
-            [*tree("robot1/", 1.0), *tree("robot2/", 9.0)],
-            "/tf of robot1/base_link, /tf of robot2/base_link",
-            {"robot_frame": "robot2/base_link"},
-        ),
-        (
-            [
-                sent
-                for both in zip(
-                    tree("", 9.0, "/robot2/tf"), tree("", 1.0, "/robot1/tf"), strict=True
-                )
-                for sent in both
-            ],
-            "/robot1/tf of base_link, /robot2/tf of base_link",
-            {"topic": "/robot2/tf"},
-        ),
-        (
-            [message("/a", ODOMETRY, s) for s in driven(6.0).tolist()] + tree("", 9.0),
-            "/a, /tf of base_link",
-            {"robot_frame": "base_link"},
-        ),
-    ],
-)
-def test_of_several_robots_one_is_chosen(
-    tmp_path: Path, messages: list[Message], names: str, choice: dict[str, str]
-) -> None:
+BY_TURNS = zip(tree("", 9.0, "/robot2/tf"), tree("", 1.0, "/robot1/tf"), strict=True)
+# The poses that messages of two robots hold, the messages, and what chooses the second robot.
+TWO_ROBOTS: dict[str, tuple[list[Message], dict[str, str]]] = {
+    "/tf of robot1/base_link, /tf of robot2/base_link": (
+        [*tree("robot1/", 1.0), *tree("robot2/", 9.0)],
+        {"robot_frame": "robot2/base_link"},
+    ),
+    "/robot1/tf of base_link, /robot2/tf of base_link": (
+        [sent for both in BY_TURNS for sent in both],
+        {"topic": "/robot2/tf"},
+    ),
+    "/a, /tf of base_link": (
+        [message("/a", ODOMETRY, s) for s in driven(6.0).tolist()] + tree("", 9.0),
+        {"robot_frame": "base_link"},
+    ),
+}
+
+
+@pytest.mark.parametrize("names", TWO_ROBOTS)
+def test_of_several_robots_one_is_chosen(tmp_path: Path, names: str) -> None:
+    messages, choice = TWO_ROBOTS[names]
     file = write_mcap(tmp_path / "two.mcap", messages)
     with pytest.raises(ValueError, match=f"poses of several robots: {names}; give --topic"):
         read_mcap([file])

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from experience.straight_drives import driven, straight
 from random_maps import generate_map
 
 from ddqn_planner import Experience, GridMap
@@ -96,10 +97,8 @@ def test_the_places_of_experience_teach_its_prior_where_they_lie_on_a_map() -> N
     occupancy = np.zeros((60, 120), dtype=np.bool_)
     occupancy[30] = True
     grid = GridMap(occupancy, 0.25, (10.0, 0.0, 0.0))
-    experience = Experience(0.5)
-    for y, slowness in ((3.0, 1.0), (7.0, 4.0), (11.0, 1.0), (900.0, 9.0)):  # the last lies off it
-        seconds = np.arange(0, 50 * slowness, 0.5)
-        experience.record(seconds, np.column_stack([10 + seconds / 2 / slowness, 0 * seconds + y]))
+    rows = (3.0, 1.0), (7.0, 4.0), (11.0, 1.0), (900.0, 9.0)  # the last lies off the map
+    experience = driven(*[straight((10, y), (35, y), slowness, rate=2) for y, slowness in rows])
     teach_prior(experience, GridMap(np.zeros((4, 4), dtype=np.bool_), 0.25))
     assert experience.prior is None
     teach_prior(experience, grid)
@@ -115,10 +114,8 @@ def test_the_places_of_experience_teach_its_prior_where_they_lie_on_a_map() -> N
 
 
 def test_what_all_places_have_in_common_is_not_learned_twice() -> None:
-    experience, grid = Experience(0.5), GridMap(np.zeros((40, 120), dtype=np.bool_), 0.25)
-    for y in (2.0, 4.0, 6.0):
-        seconds = np.arange(0, 200, 0.5)
-        experience.record(seconds, np.column_stack([1 + seconds / 8, 0 * seconds + y]))
+    experience = driven(*[straight((1, y), (26, y), 4, rate=2) for y in (2.0, 4.0, 6.0)])
+    grid = GridMap(np.zeros((40, 120), dtype=np.bool_), 0.25)
     before = experience.slowness(grid)
     assert before[36, 60] == pytest.approx(4, rel=0.4)
     teach_prior(experience, grid)
