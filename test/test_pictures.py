@@ -6,13 +6,7 @@ import pytest
 from PIL import Image, ImageColor
 
 from ddqn_planner.grid import GridMap
-from ddqn_planner.pictures import (
-    OBSTACLE_COLOUR,
-    PATH_COLOUR,
-    draw_body,
-    draw_text,
-    save_picture,
-)
+from ddqn_planner.pictures import OBSTACLE_COLOUR, PATH_COLOUR, draw_body, draw_text, save_picture
 
 
 def test_a_map_as_text_has_its_first_row_below() -> None:

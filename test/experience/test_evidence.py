@@ -6,7 +6,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from experience.straight_drives import HALL, SPEED, Poses, at, driven, straight
+from experience.straight_drives import HALL, SPEED, Poses, at, driven, straight, uneven
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
@@ -331,12 +331,9 @@ def test_nine_of_ten_drives_take_a_time_within_their_interval(noise: float) -> N
     for _ in range(150):
         expected = experience.expected_time(HALL, cells)
         slow = np.repeat(np.exp(random.normal(0, noise, 40)), 5) * 2
-        places = np.linspace(2, 12, 201)
-        times = np.concatenate([[0], np.cumsum(slow * 0.05 / SPEED)])
-        seconds = np.arange(0, times[-1], 0.1)
-        positions = np.column_stack([np.interp(seconds, times, places), np.full(len(seconds), 5.1)])
-        experience.record(seconds, positions)
-        actual = times[-1] * 39 / 40  # from the first cell's centre to the last one's
+        experience.record(*uneven(np.linspace(2, 12, 201), np.append(slow, 0)))
+        # From the first cell's centre to the last one's.
+        actual = slow.sum() * 0.05 / SPEED * 39 / 40
         inside.append(expected.low <= actual <= expected.high)
     assert 0.8 < np.mean(inside[50:]) <= 1
     assert expected.low < expected.seconds < expected.high

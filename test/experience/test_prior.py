@@ -60,7 +60,6 @@ def test_a_prior_survives_as_arrays() -> None:
     prior, features = some_prior(), np.ones((2, 3, FEATURES), dtype=np.float32)
     again = Prior.from_arrays(prior._asdict())
     assert again.log_slowness(features).dtype == np.float32
-    assert (again.log_slowness(features) == prior.log_slowness(features)).all()
     assert all(np.array_equal(one, other) for one, other in zip(prior, again, strict=True))
 
 
@@ -72,21 +71,16 @@ def test_places_unlike_all_known_ones_are_foretold_as_the_least_unlike() -> None
 @pytest.mark.parametrize("name", Prior._fields)
 def test_what_is_no_prior_is_refused(name: str) -> None:
     arrays = some_prior()._asdict()
-    bad = {
-        "shape": np.concatenate([np.atleast_1d(arrays[name])] * 2, axis=-1),
-        "numbers": np.full_like(arrays[name], np.nan),
-        "type": arrays[name].astype(complex),
-        "array": np.array("prior"),
-    }
-    for value in bad.values():
+    bad = [
+        np.concatenate([np.atleast_1d(arrays[name])] * 2, axis=-1),
+        np.full_like(arrays[name], np.nan),
+        arrays[name].astype(complex),
+        np.array("prior"),
+    ]
+    if name in ("scale", "replay"):  # neither a scale nor the weight of a place is negative
+        bad.append(-arrays[name])
+    for value in bad:
         with pytest.raises(ValueError, match="cannot be true"):
             Prior.from_arrays({**arrays, name: value})
     with pytest.raises(ValueError, match="cannot be true"):
         Prior.from_arrays({key: arrays[key] for key in arrays if key != name})
-
-
-@pytest.mark.parametrize("name", ["scale", "replay"])
-def test_a_prior_with_negative_scales_or_weights_is_refused(name: str) -> None:
-    arrays = some_prior()._asdict()
-    with pytest.raises(ValueError, match="cannot be true"):
-        Prior.from_arrays({**arrays, name: -arrays[name]})
