@@ -57,7 +57,6 @@ with contextlib.suppress(SystemExit):
 LARGE = {"torch", "numba", "scipy", "matplotlib", "gymnasium", "rclpy"}
 UNUSED = {
     "import ddqn_planner": LARGE | {"numpy"},
-    "import ddqn_planner.grid, ddqn_planner.model, ddqn_planner.planning": LARGE,
     GRID: LARGE,
     PLAN: LARGE - {"numba", "scipy"},
     "from ddqn_planner import Experience; Experience(nominal_speed=0.5)": LARGE,

@@ -42,6 +42,13 @@ def test_the_buffer_holds_the_last_transitions_whole(capacity: int, batches: lis
             np.testing.assert_array_equal(values, sample.cell)
 
 
+def part(trainer: Trainer) -> None:
+    """Let the two networks of a trainer differ, so that the targets do."""
+    random = np.random.default_rng(0)
+    for tensor in trainer._parts[1].values():
+        tensor += random.normal(0, 0.3, tensor.shape).astype(np.float32)
+
+
 def about_to_update(scenarios: list[Scenario], parameters: HyperParameters) -> Trainer:
     """A trainer that makes its first update after the next step; its two networks differ."""
     settings = {"learning_starts": 60, "environments": 5, "update_interval": 5}
@@ -49,10 +56,7 @@ def about_to_update(scenarios: list[Scenario], parameters: HyperParameters) -> T
     trainer = Trainer(scenarios, MoveRule.CORNER_CUTTING, parameters, seed=1)
     for _ in trainer.run(60):
         pass
-    random = np.random.default_rng(0)
-    _, target, *_ = trainer._parts
-    for tensor in target.values():
-        tensor += random.normal(0, 0.3, tensor.shape).astype(np.float32)
+    part(trainer)
     trainer._learner.settle()
     return trainer
 
@@ -110,6 +114,8 @@ def test_compiled_training_is_that_of_torch(
     parameters = HyperParameters(target=target, hidden_units=units, **brief)
     trainers = [Trainer(scenarios, MoveRule.ROBOT_SAFE, parameters, seed=2) for _ in range(2)]
     compiled, of_torch = trainers
+    for trainer in trainers:
+        part(trainer)
     TorchLearner(of_torch)
     one, other = ([e for ended in t.run(90) for e in ended] for t in (compiled, of_torch))
     assert one == other
