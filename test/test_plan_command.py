@@ -236,11 +236,11 @@ def test_a_picture_shows_what_a_body_sweeps_and_where_it_has_no_room(
         shown.append([int((pixels == colour).all(axis=2).sum()) for colour in colours])
         # Cells, counted from the centre of the first one, are the metres of the plan.
         _, footprint, *poses = drawn[-1]
-        swept, ends = ((placed(footprint, each) + 0.5) * 0.05 + (1, -2) for each in poses)
+        swept, marked = ((placed(footprint, each) + 0.5) * 0.05 + (1, -2) for each in poses)
         driven = np.reshape(json.loads(printed)["poses"], (-1, 3))
         asked = np.array([[1.775, -0.725, 0], [6.125, -1.375, 0]]) if status else driven[[0, -1]]
         np.testing.assert_allclose(swept, placed(planner.footprint, driven), atol=1e-9)
-        np.testing.assert_allclose(ends, placed(planner.footprint, asked), atol=1e-9)
+        np.testing.assert_allclose(marked, placed(planner.footprint, asked), atol=1e-9)
     (swept, path), (none, no_path), _ = shown
     assert none == 0 < min(swept, no_path)
     assert no_path < path
