@@ -328,10 +328,11 @@ def _percent_of_grey(document: dict[str, Any], mode: str) -> NDArray[np.int8]:
     if negate in NO:
         p = np.float32(1) - p
     percent = np.full(256, -1.0)
-    if mode == "scale" and free < occupied:
+    if mode == "scale":
+        between = (free < p) & (p < occupied)
         # map_server subtracts the thresholds in double precision.
-        scaled = (p - free) / np.float32(occupied_thresh - free_thresh) * np.float32(100)
-        percent = np.floor(scaled) + (scaled - np.floor(scaled) >= 0.5)
+        scaled = (p[between] - free) / np.float32(occupied_thresh - free_thresh) * np.float32(100)
+        percent[between] = np.floor(scaled) + (scaled - np.floor(scaled) >= 0.5)
     percent[p >= occupied] = 100
     percent[p <= free] = 0
     return percent.astype(np.int8)
