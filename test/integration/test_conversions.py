@@ -12,7 +12,6 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time as Stamp
-from client import MapFixture, plan_request, pose
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, TransformStamped
 from hypothesis import given
 from hypothesis import strategies as st
@@ -24,7 +23,7 @@ from rclpy.time import Time
 from scipy.spatial.transform import Rotation
 from std_msgs.msg import Header
 
-from ddqn_planner.grid import Cell, GridMap, MapFile
+from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.nodes.conversions import (
     along,
     cell_from_pose,
@@ -137,25 +136,6 @@ def test_a_path_looks_ahead_and_ends_as_the_goal_and_is_the_same_serialized(
         )
         np.testing.assert_allclose(values, expected, atol=1e-12)
     assert len(serialize_message(sent)) == len(serialize_message(path))
-
-
-def test_the_check_of_an_answer_finds_each_error() -> None:
-    values = np.array([[0, 100, 0], [0, 0, 100], [0, 100, 0]], dtype=np.int8)
-    fixture = MapFixture(MapFile(values, 0.1, (1.0, 2.0, 0.3)))
-    cases: list[tuple[Cell, Cell, list[Cell], str]] = [
-        ((0, 0), (1, 1), [(0, 0), (0, 1), (1, 1)], ""),
-        ((0, 0), (0, 0), [(0, 0)], ""),
-        *((start, goal, [], "") for start in ((0, 0), (1, 0)) for goal in ((2, 0), (9, 9))),
-        ((0, 0), (1, 1), [], "where there is one"),
-        ((0, 0), (1, 1), [(0, 0), (0, 1)], "asked was"),
-        ((0, 0), (1, 1), [(0, 0), (1, 1)], "illegal segment"),
-        ((0, 0), (2, 0), [(0, 0), (2, 0)], "illegal segment"),
-        ((0, 0), (0, 1), [(0, 0), (-1, 0), (0, 1)], "illegal segment"),
-    ]
-    for start, goal, path, error in cases:
-        plan = Path(poses=[pose(fixture.grid, cell) for cell in path])
-        found = fixture.error(plan_request(fixture.grid, start, goal), plan)
-        assert (error in found) if error else not found
 
 
 POINTS = st.tuples(*3 * [st.floats(-100, 100)])

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from client import wait_for
 from PIL import Image
-from processes import running
 
 pytestmark = pytest.mark.slow
 
@@ -90,18 +89,3 @@ def test_no_process_outlives_the_demo(demo: Demo, signal_number: int, code: int)
     if signal_number == signal.SIGKILL:  # else the demo has waited for them
         wait_for("their end", lambda: not demo.commands(), [])
     assert demo.commands() == {}
-
-
-def test_a_signal_while_a_node_is_started_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    children = []
-
-    def start(*arguments: Any, **options: Any) -> subprocess.Popen[bytes]:
-        children.append(popen(*arguments, **options))
-        signal.raise_signal(signal.SIGINT)
-        return children[0]
-
-    popen = subprocess.Popen
-    monkeypatch.setattr(subprocess, "Popen", start)
-    with pytest.raises(KeyboardInterrupt), running("sleep", "60"):
-        pass
-    assert children[0].returncode == -signal.SIGTERM
