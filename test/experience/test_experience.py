@@ -149,6 +149,8 @@ def faulty(fault: str) -> Poses:
         positions = np.concatenate([positions[:half], still, positions[half:]])
     if fault == "teleport":
         positions[half : half + 20] += (1.0, 3.0)
+    if fault == "clock ahead":
+        seconds[half:] += 3600
     if fault == "clock back":
         seconds[half:] -= 3600
     if fault == "clock stands":
@@ -164,7 +166,7 @@ def faulty(fault: str) -> Poses:
 FAULTS = "pause", "pause with samples", "teleport", "odometry reset", "not finite"
 
 
-@pytest.mark.parametrize("fault", [*FAULTS, "clock back", "clock stands"])
+@pytest.mark.parametrize("fault", [*FAULTS, "clock ahead", "clock back", "clock stands"])
 def test_what_cannot_be_true_is_not_believed(fault: str) -> None:
     experience = driven(faulty(fault))
     slowness = experience.slowness(HALL)

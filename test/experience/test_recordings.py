@@ -155,7 +155,11 @@ REFUSED = [
     ("drive.csv", "", "columns seconds, x, y are missing"),
     ("drive.csv", "seconds,x,y\n99,1,1\n98,2,1\n97,3,1\n", "time .* runs backwards"),
     ("drive.csv", "seconds,x,y\n" + 9 * "7,1,1\n7,2,1\n", "time .* stands still"),
-    ("drive.csv", "seconds,x,y\n1,-50,1\n2,-52,1\n", r"\[-52.0, 1.0\] to .* map has 30.0 x"),
+    (
+        "drive.csv",
+        "seconds,x,y\n1,-50,1\n2,-51,1\n3,-52,1\n",
+        r"\[-52.0, 1.0\] to .* map has 30.0 x",
+    ),
     ("drive.db3", "", r"no \.csv and no \.mcap file.* `ros2 bag convert`"),
     ("missing.csv", None, "No such file"),
     (".", None, r"no folder with episodes\.csv or \.mcap files"),

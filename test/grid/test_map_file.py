@@ -87,6 +87,13 @@ def test_each_mode_follows_map_servers_rule_and_row_0_is_the_bottom_one(
     assert (map_file.resolution, map_file.origin) == (0.05, (1.0, -2.0, 0.5))
 
 
+@pytest.mark.filterwarnings("error")
+def test_between_thresholds_that_nearly_coincide_nothing_overflows(tmp_path: Path) -> None:
+    image = np.array([[0, 128, 255]], dtype=np.uint8)
+    file = write(tmp_path, image, mode="scale", free_thresh=0.0, occupied_thresh=1e-40)
+    assert values(file) == [[100, 100, 0]]
+
+
 def test_what_is_not_opaque_is_unknown_but_in_mode_raw(tmp_path: Path) -> None:
     pixels = np.array([[[0, 0, 0, 255], [0, 0, 0, 254], [254, 254, 254, 0]]], dtype=np.uint8)
     assert values(write(tmp_path, pixels)) == [[100, -1, -1]]
