@@ -45,14 +45,14 @@ PYTEST := $(BIN)/python -m pytest --numprocesses $(PROCESSES) --dist loadfile --
 
 # Compiled before, by two processes at once: each process of the tests would compile it all.
 $(VENV)/compiled: $(VENV)/installed $(wildcard ddqn_planner/*.py ddqn_planner/*/*.py)
-	$(BIN)/ddqn-planner warm-up & $(BIN)/ddqn-planner warm-up differential_robot; wait
+	$(BIN)/ddqn-planner warm-up & first=$$!; $(BIN)/ddqn-planner warm-up differential_robot && wait $$first
 	touch $@
 
 test: $(VENV)/compiled
 	$(PYTEST)
 
 # No ROS and nothing slow: for every save.
-test-fast: $(VENV)/compiled
+test-fast: setup
 	$(PYTEST) --ignore test/integration -m "not slow"
 
 # What measures has tests of its own: they train and drive for minutes.
