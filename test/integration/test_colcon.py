@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from client import cells_of, pose, values_of
+from client import cells_of, initial_pose, pose, values_of
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import OccupancyGrid
+from nav_msgs.msg import Path as PathMessage
 from processes import running
 
 from ddqn_planner.grid import path_length
@@ -94,7 +95,10 @@ def take_compiled(source: Path, package: Path) -> None:
 
 
 def test_nodes_of_the_workspace_plan_with_its_model_on_its_map(
-    install: Path, make_client: Callable[[], Any], paper: Scenario, capfd: Any
+    install: Path,
+    make_client: Callable[[], Any],
+    paper: Scenario,
+    capfd: Any,
 ) -> None:
     (package,) = (install / "ddqn_planner" / "lib").glob("python*/site-packages/ddqn_planner")
     take_compiled(ROOT / "ddqn_planner", package)
@@ -111,13 +115,17 @@ def test_nodes_of_the_workspace_plan_with_its_model_on_its_map(
     client = make_client()
     diagnostics = client.subscribe(DiagnosticArray, "/diagnostics")
     maps = client.subscribe(OccupancyGrid, "map", LATCHED)
+    plans = client.subscribe(PathMessage, "plan", LATCHED)
     with (
         node("map_server_node", "--ros-args", "-p", "yaml_filename:=dilemma.yaml") as map_server,
         node("planner_node", "--ros-args", "-p", "path_simplification:=none") as planner,
     ):
         grid = grid_from_message(maps.wait())
         diagnosis = diagnostics.wait(names_model).status[0]
-        plan = client.get_plan(pose(grid, paper.start), pose(grid, paper.goal))
+
+        client.publish("initialpose", initial_pose(pose(grid, paper.start)))
+        client.publish("goal_pose", pose(grid, paper.goal))
+        plan = plans.wait(lambda message: message.poses)
 
     # The optimum of the default model's rule, which does not cut corners.
     assert path_length(cells_of(grid, plan)) == pytest.approx(14 + 8 * 2**0.5)
