@@ -12,13 +12,14 @@ from random_maps import Random, generate_map, inflated_costs
 from tables import table
 
 from ddqn_planner import GridMap, MoveRule, Planner
-from ddqn_planner.grid import Cell, clearance, path_cost
+from ddqn_planner.grid import Cell, clearance
 from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.moves import cells_along
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.planning import PlanRequest
 from ddqn_planner.planning.paths import rest_of_path
 from ddqn_planner.planning.planner import last_step
+from ddqn_planner.planning.segments import cost_along
 
 RULE = MoveRule.ROBOT_SAFE
 THRESHOLDS = (0.0, 0.03, 0.05, 0.1)
@@ -85,7 +86,7 @@ def drive(
     true_map = GridMap(occupancy, cost=inflated_costs(occupancy, INFLATION))
     if robot != goal:  # the best path from there, so that all drives end at the goal
         way += planner.plan(true_map, robot, goal, RULE).cells[1:]
-    return Driven(replans, flips, path_cost(true_map, way, RULE))
+    return Driven(replans, flips, cost_along(way, true_map, RULE))
 
 
 def scenario(kind: str, side: int, random: Random) -> tuple[Occupancy, Cell, Cell]:

@@ -23,9 +23,10 @@ from tqdm import tqdm
 
 from ddqn_planner import GridMap, MoveRule, Planner, QField
 from ddqn_planner.cli import exit_code
-from ddqn_planner.grid import MOVES, Cell, legal_moves, path_cost, read_map_file, shortest_distances
+from ddqn_planner.grid import MOVES, Cell, legal_moves, read_map_file, shortest_distances
 from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.noise import random_costs, random_requests, unknown_costs
+from ddqn_planner.planning.segments import cost_along
 
 INFLATION_RADIUS = 5.0  # cells that the cost of an obstacle reaches
 UNKNOWN_SHARE = 0.2  # of the free cells
@@ -195,7 +196,7 @@ def measure(
             for _, start, told in of_goal:
                 cells = field.rollout(start).cells
                 arrived = cells[:1] == (start,) and cells[-1:] == (goal,)
-                cost = path_cost(grid, cells, move_rule) if arrived else math.inf
+                cost = cost_along(cells, grid, move_rule) if arrived else math.inf
                 optimum = float(optima[start[::-1]])
                 agrees = math.isclose(told, optimum, rel_tol=AGREES)
                 yield Rollout(

@@ -11,7 +11,6 @@ from ddqn_planner.grid.moves import (
     legal_moves,
     move_costs,
     neighbours,
-    path_cost,
     path_length,
     shortest_distances,
     shortest_path,

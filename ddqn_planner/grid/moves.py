@@ -106,34 +106,14 @@ def actions_along(vectors: NDArray[Any]) -> NDArray[np.int64]:
 
 
 def path_length(cells: Cells, move_rule: MoveRule | str = MoveRule.ROBOT_SAFE) -> float:
-    """Return the length in cells of a path of straight segments between the given cells."""
-    return float(_segment_lengths(cells, move_rule).sum())
-
-
-def path_cost(grid: GridMap, cells: Cells, move_rule: MoveRule | str) -> float:
-    """Return the cost of a path of moves: see `move_costs`."""
-    path = np.asarray(cells, dtype=np.int64).reshape(-1, 2)
-    ends = np.stack([path[:-1], path[1:]])
-    x, y = ends.transpose(2, 0, 1)
-    multiplier = grid.cost_multiplier[y, x].astype(np.float64)
-    if grid.uphill is not None:
-        multiplier *= UPHILL[grid.uphill[y, x], actions_along(np.diff(path, axis=0))]
-    return float((_segment_lengths(cells, move_rule) * multiplier.mean(axis=0)).sum())
-
-
-def _segment_lengths(cells: Cells, move_rule: MoveRule | str) -> NDArray[np.float64]:
-    """Return the length of each straight segment of a path; under `MoveRule.UNIT`, its moves."""
+    """Return the length in cells of straight segments, or of moves under `MoveRule.UNIT`."""
     steps = np.diff(np.asarray(cells, dtype=np.int64).reshape(-1, 2).T)
     is_unit = MoveRule(move_rule) is MoveRule.UNIT
-    lengths: NDArray[np.float64] = np.abs(steps * 1.0).max(axis=0) if is_unit else np.hypot(*steps)
-    return lengths
+    return float((np.abs(steps * 1.0).max(axis=0) if is_unit else np.hypot(*steps)).sum())
 
 
 def positions(parts: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return positions on a path, given in how many parts they divide each of its N segments.
-
-    2.5 is the middle of the third segment, and N the end.
-    """
+    """Return positions that divide each segment of a path in parts: 2.5 is amid the third one."""
     number = np.repeat(np.arange(len(parts)), parts)
     within = np.arange(len(number)) - np.repeat(np.cumsum(parts) - parts, parts)
     return np.append(number + within / parts[number], float(len(parts)))

@@ -86,8 +86,8 @@ class Plan:
     move_rule : MoveRule
         The rule under which the moves are legal.
     cost : float, optional
-        What the path costs, see `path_cost`: on a map with costs, if a planner made the plan. On a
-        map of expected times it is in seconds.
+        What the path costs, its length in each cell times the `GridMap.cost_multiplier`: on a map
+        with costs, if a planner made the plan. On a map of expected times it is in seconds.
     goal : (x, y), optional
         Where the path ends, or would end: the goal asked for, the nearest of several, or the cell
         to which it moved. None for a rollout, or if no Q field was needed.

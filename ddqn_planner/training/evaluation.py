@@ -5,8 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import GridMap, MoveRule, path_cost, shortest_distances
+from ddqn_planner.grid import GridMap, MoveRule, shortest_distances
 from ddqn_planner.planning import QField
+from ddqn_planner.planning.segments import cost_along
 
 
 class Evaluation(NamedTuple):
@@ -26,7 +27,7 @@ def length_ratios(field: QField, grid: GridMap, move_rule: MoveRule) -> NDArray[
     for x, y in grid.free_cells():
         if np.isfinite(optimum[y, x]) and (x, y) != field.goal:
             plan = field.rollout((x, y))
-            cost = path_cost(grid, plan.cells, move_rule) if plan.cells else np.inf
+            cost = cost_along(plan.cells, grid, move_rule) if plan.cells else np.inf
             ratios[y, x] = cost / optimum[y, x]
     return ratios
 

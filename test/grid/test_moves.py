@@ -10,8 +10,9 @@ from strategies import RULES, Data, Place, grids_uphill, grids_with_directions
 
 from ddqn_planner import GridMap, MoveRule
 from ddqn_planner.grid import LENGTHS, MOVES, neighbours, shortest_path
-from ddqn_planner.grid.moves import move_costs, path_cost, path_length, shortest_distances
+from ddqn_planner.grid.moves import move_costs, path_length, shortest_distances
 from ddqn_planner.planning import PlanMethod
+from ddqn_planner.planning.segments import cost_along
 
 
 def test_a_rule_is_a_member_or_its_value() -> None:
@@ -107,5 +108,5 @@ def test_distances_and_paths_are_exact(place: Place, rule: MoveRule, data: Data)
         assert path == []
     else:
         assert (path[0], path[-1]) == (start, goal)
-        length = path_cost(grid, path, rule)
+        length = cost_along(path, grid, rule)
         assert length == pytest.approx(distance[start[1], start[0]])

@@ -13,11 +13,12 @@ from strategies import Place, grids_with_costs, grids_with_free_cell
 
 from ddqn_planner import MoveRule
 from ddqn_planner.grid import MAX_COST_MULTIPLIER, OCCUPIED, UNKNOWN
-from ddqn_planner.grid.moves import MOVES, path_cost, shortest_distances
+from ddqn_planner.grid.moves import MOVES, shortest_distances
 from ddqn_planner.model import ModelMetadata, PropagationQNetwork, load_model
 from ddqn_planner.model.certificate import MAX_FILTERS, MOVE_RULES, Certificate, _margins, certify
 from ddqn_planner.model.move_costs import every_patch, legal_in_patches
 from ddqn_planner.planning import Planner
+from ddqn_planner.planning.segments import cost_along
 
 GUARANTEES = Path(__file__).resolve().parents[2] / "docs" / "guarantees.md"
 
@@ -135,7 +136,7 @@ def test_no_path_exceeds_the_certificate(
         plan = field.rollout(start)
         assert bool(plan.cells) == math.isfinite(optimum[start[1], start[0]])
         if plan.cells:
-            cost = path_cost(grid, plan.cells, rule)
+            cost = cost_along(plan.cells, grid, rule)
             bound = (1 + certificate.path_error) * optimum[start[1], start[0]]
             assert cost <= bound * (1 + 1e-6)
 

@@ -19,12 +19,13 @@ from strategies import GRIDS, RULES, Data, Place, cells_of, shapes
 from ddqn_planner import GridMap, MoveRule, PlanStatus
 from ddqn_planner.grid import Cell, copies, grid_map
 from ddqn_planner.grid.grid_map import LAYERS
-from ddqn_planner.grid.moves import MOVES, legal_moves, move_costs, path_cost, shortest_distances
+from ddqn_planner.grid.moves import MOVES, legal_moves, move_costs, shortest_distances
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning import field as fields
 from ddqn_planner.planning import kernels
 from ddqn_planner.planning.field import DistanceField, QField, network_field
+from ddqn_planner.planning.segments import cost_along
 
 
 def fresh_field(grid: GridMap, goal: Cell, rule: MoveRule) -> DistanceField:
@@ -65,7 +66,7 @@ def test_no_path_depends_on_the_past(place: Place, rule: MoveRule, data: Data) -
             assert plan == field.rollout(start, straight)
         assert (plan.status is PlanStatus.NO_PATH) == np.isinf(exact[start[::-1]])
         if plan.cells:
-            cost = path_cost(grid, plan.cells, rule)
+            cost = cost_along(plan.cells, grid, rule)
             assert cost == pytest.approx(exact[start[::-1]], rel=2e-2)
     assert_same(grown, whole)
 

@@ -26,7 +26,7 @@ from strategies import (
 )
 
 from ddqn_planner import GridMap, MoveRule, PlanStatus, inflate, simplify
-from ddqn_planner.grid import MOVES, Cell, path_cost, path_length, shortest_distances, shortest_path
+from ddqn_planner.grid import MOVES, Cell, path_length, shortest_distances, shortest_path
 from ddqn_planner.grid.moves import cells_along
 from ddqn_planner.planning import PlanRequest
 from ddqn_planner.planning.paths import REACH, is_path_valid, keep_or_switch, rest_of_path, search
@@ -180,14 +180,14 @@ def test_what_is_kept_is_cheap(place: Place, rule: MoveRule, threshold: float, d
     path, extra_cost = keep_or_switch(request, np.array(new, dtype=np.int32))
     assert (tuple(path[0]), tuple(path[-1])) == (robot, goal)
     assert legal_segments(path, after, rule).all()
-    cost, best = path_cost(after, path, rule), path_cost(after, new, rule)
+    cost, best = cost_along(path, after, rule), cost_along(new, after, rule)
     assert cost <= (1 + threshold) * best * (1 + 1e-6)
     assert cost >= best * (1 - 1e-6)
     rest = rest_of_path(under_way, robot, after, rule)
     if extra_cost is None:
         assert path.tolist() == list(map(list, new))
         if len(rest):
-            assert path_cost(after, rest, rule) > (1 + threshold) * best * (1 - 1e-6)
+            assert cost_along(rest, after, rule) > (1 + threshold) * best * (1 - 1e-6)
     else:
         assert path.tolist() == rest.tolist()
         assert cost == pytest.approx((1 + extra_cost) * best)
@@ -229,7 +229,7 @@ def test_a_search_finds_any_legal_path(place: Place, rule: MoveRule, data: Data)
     for known in (None, -distances.astype(np.float32)):  # nothing is known, or all is
         cells = search(start, goal, grid, rule, known)
         if cells:
-            assert path_cost(grid, cells, rule) == pytest.approx(cheapest)
+            assert cost_along(cells, grid, rule) == pytest.approx(cheapest)
 
 
 def test_a_search_follows_the_values_even_on_a_detour() -> None:
@@ -254,8 +254,6 @@ def test_segments_are_as_their_cells_are(place: Place, rule: MoveRule, data: Dat
     assert legal == is_legal(first, last, grid, rule, Fraction(begin))
     exact = exact_cost(first, last, grid, rule)
     assert cost_along(np.array([first, last]), grid, rule) == pytest.approx(exact)
-    if max(abs(last[0] - first[0]), abs(last[1] - first[1])) == 1:
-        assert path_cost(grid, [first, last], rule) == pytest.approx(exact)
 
 
 def check_simplified(path: list[Cell], grid: GridMap, rule: MoveRule) -> tuple[Cell, ...]:

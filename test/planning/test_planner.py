@@ -17,7 +17,7 @@ from networks import ANY_MAP, new_planner, random_network, turning_planner
 from strategies import GRIDS, RULES, Data, Place, cells_of
 
 from ddqn_planner import GridMap, MoveRule, Plan, inflate
-from ddqn_planner.grid import MOVES, Cell, legal_moves, path_cost, path_length, shortest_distances
+from ddqn_planner.grid import MOVES, Cell, legal_moves, path_length, shortest_distances
 from ddqn_planner.grid.grid_map import Exploration
 from ddqn_planner.model import AnyMapQNetwork, ModelMetadata
 from ddqn_planner.planning import PlanMethod, Planner, PlanRequest, PlanStatus, QField, simplify
@@ -77,7 +77,7 @@ def test_a_plan_is_the_cheapest(
             continue
         assert (plan.cells[0], plan.cells[-1]) == (start, goal)
         check_legal(plan.cells, grid, rule)
-        cost = path_cost(grid, plan.cells, rule)
+        cost = cost_along(plan.cells, grid, rule)
         assert cost == pytest.approx(exact[start[::-1]], rel=2e-2)
         assert plan.cost is None or plan.cost == pytest.approx(cost)
         assert plan.length == path_length(plan.cells, rule)
@@ -88,7 +88,7 @@ def test_a_plan_is_the_cheapest(
             assert simple.cost is not None
             assert simple.cost <= plan.cost * (1 + 1e-8)
         unmasked = planner.q_field(grid, goal, rule).unmasked().rollout(start).cells
-        assert path_cost(grid, unmasked, rule) == pytest.approx(cost)
+        assert cost_along(unmasked, grid, rule) == pytest.approx(cost)
 
 
 @settings(max_examples=200)
