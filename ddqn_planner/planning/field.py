@@ -95,10 +95,6 @@ class QField:
         legal = self.legal & (actions_A11 == greedy_1HW)
         return QField(self.goal, self.q, legal, self.move_rule)
 
-    def grow(self, start: Cell, limit: int) -> bool:
-        """Return whether all that a start needs is known, after so many visits of cells more."""
-        return True
-
     def is_known(self, start: Cell) -> bool:
         """Return whether no more of the field is needed for the rollout from a start."""
         return True
@@ -172,10 +168,13 @@ class DistanceField(QField):
         number, toward = self._number(start), self.goal if straight else start
         with self._lock:
             self.grow(start)
-            if self.known.state[number] != kernels.CLOSED:
+            distance, state, *_ = self.known
+            if state[number] != kernels.CLOSED:
                 return Plan(PlanStatus.NO_PATH, move_rule=self.move_rule)
-            path = kernels.roll_out(self.known.distance, self.costs, number, toward)
-        return Plan(PlanStatus.SUCCEEDED, path, move_rule=self.move_rule)
+            most = 2 + int(1.01 * distance[number])  # no move costs less than 1; sums are rounded
+            path = np.empty((min(most, distance.size), 2), np.int32)
+            length = kernels.roll_out(distance, number, path, toward, self.costs[:7])
+        return Plan(PlanStatus.SUCCEEDED, path[:length], move_rule=self.move_rule)
 
     def take_over(self, old: DistanceField, start: Cell | None = None) -> bool:
         """Repair and take what an older field knows, or begin if quicker; False for other maps."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place, inlined, inner
-from ddqn_planner.grid import MOVES, Cell
+from ddqn_planner.grid import MOVES
 from ddqn_planner.grid.moves import UPHILL
 from ddqn_planner.model.move_costs import VALUES, MoveCosts
 
@@ -280,16 +280,9 @@ def _take_back(distance: Any, state: Any, changed: Any, lost: Any, waiting: Any,
 # What distances say
 
 
-def roll_out(distance: Distances, costs: MoveCosts, start: int, toward: Cell) -> Cells:
-    """Return the (x, y) of greedy steps from a closed start to the goal, both too: (N, 2)."""
-    most = 2 + int(1.01 * distance[start])  # no move costs less than 1; sums are rounded
-    path: Cells = np.empty((min(most, distance.size), 2), np.int32)
-    return path[: _roll_out(distance, start, path, toward, costs[:7])]
-
-
 @in_place
-def _roll_out(distance: Any, cell: int, path: Any, toward: Any, costs: Any) -> int:
-    """Write a path from a cell on; return its length."""
+def roll_out(distance: Any, cell: int, path: Any, toward: Any, costs: Any) -> int:
+    """Write the (x, y) of a closed cell and of greedy steps to the goal; return how many."""
     width, (to_x, to_y), number, best = costs[-1], toward, 0, 0
     x, y = cell % width - 1, cell // width - 1
     from_x, from_y = x, y

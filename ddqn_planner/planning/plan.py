@@ -143,22 +143,13 @@ class Plan:
 
 @dataclass(frozen=True, eq=False)
 class PosePlan(Plan):
-    """A path for a robot with a body and a heading; its `path` has the cells of the origin.
+    """A path for a robot with a body and a heading; its `path` has the cells of the origin."""
 
-    Parameters
-    ----------
-    poses : (N, 3) float64
-        x, y in metres and yaw in radians, -pi to pi, in the map frame, from start to goal: at most
-        half a cell apart. Empty unless the status is SUCCEEDED.
-    driven : float
-        The length of the origin's way, in cells, whatever the direction.
-    bound : float
-        The proved ratio of the cost to the least one, 1.0 when it is the least.
-    """
-
+    # (N, 3): x, y in metres and yaw in radians, -pi to pi, in the map frame, from start to goal, at
+    # most half a cell apart; empty unless the status is SUCCEEDED.
     poses: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)))
-    driven: float = 0.0
-    bound: float = 1.0
+    driven: float = 0.0  # the length of the origin's way, in cells, whatever the direction
+    bound: float = 1.0  # the proved ratio of the cost to the least one, 1.0 when it is the least
 
     @property
     def length(self) -> float:

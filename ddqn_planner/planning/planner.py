@@ -15,7 +15,7 @@ from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import Cells, as_cell, as_flag, as_number, as_pose, listed
 from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
-from ddqn_planner.planning.field import FieldCache, Goals, QField
+from ddqn_planner.planning.field import DistanceField, FieldCache, Goals, QField
 from ddqn_planner.planning.paths import keep_or_switch, search, way_and_ends
 from ddqn_planner.planning.plan import (
     Plan,
@@ -265,32 +265,25 @@ class Planner:
     def steps(self, request: PlanRequest) -> Iterator[Plan | None]:
         """Yield None before each slow step (a part of a field, a search), and last the plan."""
         ms, began = 0.0, time.perf_counter()
-        for plan in self._explore(request) if request.grid.exploration else self._find(request):
+        find = self._explore if request.grid.exploration else self._find
+        for plan in _with_plan_last(find(request)):
             ms += 1e3 * (time.perf_counter() - began)
             if plan is not None:
                 vars(plan)["field_ms"] = ms - plan.rollout_ms  # frozen, but nobody else has it yet
             yield plan
             began = time.perf_counter()
 
-    def _explore(self, request: PlanRequest) -> Iterator[Plan | None]:
-        """Do the work of `steps` on a map with hopes: a bold plan if it keeps the share."""
+    def _explore(self, request: PlanRequest) -> Generator[None, None, Plan]:
+        """Do the work of `_find` on a map with hopes: a bold plan if it keeps the share."""
         grid, rule, hopes = request.grid, request.move_rule, request.grid.exploration
         assert hopes is not None
-        plan = yield from self._found(replace(request, grid=hopes.bold))
+        plan = yield from self._find(replace(request, grid=hopes.bold))
         if plan.path.size and plan.extra_cost is None:  # one under way was judged when it was new
-            best = yield from self._found(replace(request, under_way=()))
+            best = yield from self._find(replace(request, under_way=()))
             longest = (1 + hopes.share) * (best.cost or math.inf) * SAME_COST
             if _cost(plan.path, grid, rule) > longest:
-                plan = yield from self._found(replace(request, grid=hopes.safe))
-        yield replace(plan, cost=_cost(plan.path, grid, rule)) if plan.path.size else plan
-
-    def _found(self, request: PlanRequest) -> Generator[None, None, Plan]:
-        """Return what `_find` yields last, after None before each slow step."""
-        for plan in self._find(request):
-            if plan is not None:
-                return plan
-            yield
-        raise AssertionError("there was no plan")
+                plan = yield from self._find(replace(request, grid=hopes.safe))
+        return replace(plan, cost=_cost(plan.path, grid, rule)) if plan.path.size else plan
 
     def _refusal(self, request: PlanRequest, free: Goals) -> PlanStatus | None:
         """Return why there is no path, where one look at start and free goals says so."""
@@ -307,53 +300,49 @@ class Planner:
             return PlanStatus.MAP_SIZE_UNSUPPORTED
         return None
 
-    def _find(self, request: PlanRequest) -> Iterator[Plan | None]:
-        """Do the work of `steps`, without the time that the field takes."""
+    def _find(self, request: PlanRequest) -> Generator[None, None, Plan]:
+        """Return a plan without the time that its field took, after None before each slow step."""
         grid, start, rule = request.grid, request.start, request.move_rule
         goals = tuple(sorted({goal for goal in request.goals if grid.is_free(goal)}))
         status = self._refusal(request, goals)
         if status is not None:
-            yield Plan(status, move_rule=rule)
-            return
+            return Plan(status, move_rule=rule)
         # A field that is known answers at once; else it is computed, or grown as far as the start.
         field = self.fields.find(grid, goals, rule) if grid.is_free(start) else None
         costs = None
         if field is None or not field.is_known(start):
-            yield None
+            yield
             costs = self.fields.costs(grid, rule)
             if costs is None and len(goals) > 1:
                 goals = self._nearest_alone(request, goals)
             elif costs is not None and goals and grid.is_free(start):
                 field = self.fields.get(grid, goals, rule, start, costs)
-                while not field.grow(start, VISITS):
-                    yield None
+                while isinstance(field, DistanceField) and not field.grow(start, VISITS):
+                    yield
         way_out: tuple[Cell, ...] = (start,)
         began = time.perf_counter()
         plan = field.rollout(start, request.simplified) if field is not None else None
         if plan is None or not plan.path.size:
             if plan is not None and request.reach >= 1:
-                yield None
+                yield
             elif plan is not None and plan.status is PlanStatus.NO_PATH:
-                yield plan
-                return
+                return plan
             # A look at the whole map finds a way out and goals in reach, or why there are none.
             found = way_and_ends(request, goals)
             if isinstance(found, PlanStatus):
-                yield Plan(found, move_rule=rule)
-                return
+                return Plan(found, move_rule=rule)
             way_out, goals = found
             field = self.fields.get(grid, goals, rule, way_out[-1], costs)
             began = time.perf_counter()
             plan = field.rollout(way_out[-1], request.simplified)
             if not plan.path.size and request.method is PlanMethod.ASTAR_FALLBACK:
-                yield None
+                yield
                 began = time.perf_counter()
                 cells = np.array(search(way_out[-1], field.goal, grid, rule, field.value))
                 plan = Plan(PlanStatus.SUCCEEDED, cells, PlanMethod.ASTAR_FALLBACK)
         if plan.path.size:
-            yield _dressed(request, plan, way_out, began)
-        else:
-            yield replace(plan, goal=goals[0])
+            return _dressed(request, plan, way_out, began)
+        return replace(plan, goal=goals[0])
 
     def _nearest_alone(self, request: PlanRequest, goals: Goals) -> Goals:
         """Return the nearest of several goals, by a field toward each."""
@@ -385,6 +374,11 @@ def _dressed(request: PlanRequest, found: Plan, way_out: tuple[Cell, ...], began
 def _cost(path: Cells, grid: GridMap, rule: MoveRule) -> float:
     """Return what a path costs: seconds, on a map of expected times."""
     return cost_along(path, grid, rule) * (grid.seconds_per_cell or 1.0)
+
+
+def _with_plan_last(finding: Generator[None, None, Plan]) -> Iterator[Plan | None]:
+    """Yield what a generator yields, and then what it returns."""
+    yield (yield from finding)
 
 
 def last_step(steps: Iterator[AnyPlan | None]) -> AnyPlan:
