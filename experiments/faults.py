@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from client import RULE, Client, generated_map, plan_request, wait_for
 from diagnostic_msgs.msg import DiagnosticArray
+from map_files import save_map
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
 from nav_msgs.srv import GetPlan, LoadMap
@@ -22,7 +23,7 @@ from rcl_interfaces.srv import GetParameters
 from std_srvs.srv import Trigger
 from tables import table
 
-from ddqn_planner.grid import OCCUPIED, MapFile, MoveRule, save_map
+from ddqn_planner.grid import OCCUPIED, MapFile, MoveRule
 from ddqn_planner.grid.noise import MAX_NEW_OBSTACLES, random_requests
 from ddqn_planner.model import load_model
 from ddqn_planner.nodes.runtime import LATCHED

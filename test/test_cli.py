@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from map_files import save_map
 from processes import executable
 
-from ddqn_planner.grid import GridMap, MapFile, MoveRule, save_map
+from ddqn_planner.grid import GridMap, MapFile, MoveRule
 from ddqn_planner.model import load_model
 from ddqn_planner.training.any_map import ANY_MAP, random_scenarios
 from ddqn_planner.training.environment import Scenario

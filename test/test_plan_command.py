@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 from bodies import Oracle
+from map_files import save_map
 from PIL import Image, ImageColor
 
 from ddqn_planner import Planner, inflate, pictures
-from ddqn_planner.grid import MapFile, save_map
+from ddqn_planner.grid import MapFile
 from ddqn_planner.grid.footprint import placed
 from ddqn_planner.pictures import PATH_COLOUR, VALUE_COLOURS
 

@@ -3,7 +3,7 @@
 from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell
 from ddqn_planner.grid.body import clearance, inflate
 from ddqn_planner.grid.grid_map import MAX_COST_MULTIPLIER, GridMap
-from ddqn_planner.grid.map_file import MapFile, MapFileError, load_map, read_map_file, save_map
+from ddqn_planner.grid.map_file import MapFile, MapFileError, load_map, read_map_file
 from ddqn_planner.grid.moves import (
     LENGTHS,
     MOVES,

@@ -11,6 +11,7 @@ import pytest
 from generalisation import BenchmarkMap, RequestSettings, Rollout, illegal_moves, main, markdown
 from hypothesis import given
 from hypothesis import strategies as st
+from map_files import save_map
 from networks import random_network
 from random_maps import KINDS
 
@@ -20,7 +21,6 @@ from ddqn_planner.grid import (
     legal_moves,
     move_costs,
     neighbours,
-    save_map,
     shortest_distances,
 )
 from ddqn_planner.model import ModelMetadata, QNetwork

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from map_files import save_map
 
 from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience.drives import DriveEnd, DriveFolder
 from ddqn_planner.experience.recordings import drives_of, read_csv, read_mcap
-from ddqn_planner.grid import save_map
 
 GRID = GridMap(np.zeros((40, 120), dtype=np.bool_), resolution=0.25)
 

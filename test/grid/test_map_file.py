@@ -17,11 +17,12 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 from limits import memory_grows_less_than
+from map_files import save_map
 from PIL import Image
 from strategies import Data, Place, grids_with_directions, json_values, shapes
 
 from ddqn_planner import GridMap, load_map
-from ddqn_planner.grid import UNKNOWN, MapFile, MapFileError, read_map_file, save_map
+from ddqn_planner.grid import UNKNOWN, MapFile, MapFileError, read_map_file
 from ddqn_planner.grid.map_file import MapDataError, MapMetadataError, MapNotFoundError
 from ddqn_planner.resources import find_map
 

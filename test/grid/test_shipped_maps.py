@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from map_files import save_map
 from random_maps import generate_map
 
 from ddqn_planner import GridMap, MoveRule, Planner, load_map
-from ddqn_planner.grid import MOVES, OCCUPIED, Cell, read_map_file, save_map, shortest_distances
+from ddqn_planner.grid import MOVES, OCCUPIED, Cell, read_map_file, shortest_distances
 from ddqn_planner.resources import find_map
 from ddqn_planner.training.environment import Scenario
 

@@ -10,10 +10,11 @@ import pytest
 from client import pose, wait_for, wait_for_map
 from diagnostic_msgs.msg import DiagnosticArray
 from integration.user import trigger
+from map_files import save_map
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.srv import GetMap, LoadMap
 
-from ddqn_planner.grid import GridMap, MapFile, read_map_file, save_map, scatter_obstacles
+from ddqn_planner.grid import GridMap, MapFile, read_map_file, scatter_obstacles
 from ddqn_planner.nodes.conversions import grid_from_message
 from ddqn_planner.nodes.map_server_node import known_path
 from ddqn_planner.nodes.runtime import LATCHED

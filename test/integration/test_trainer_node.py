@@ -18,13 +18,14 @@ from hypothesis import given
 from integration.messages import STAMPED_POSES, maps, some_parameters
 from integration.robot import changed
 from integration.user import SOON, User, limited
+from map_files import save_map
 from nav_msgs.msg import OccupancyGrid
 from rcl_interfaces.srv import ListParameters, SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 from std_msgs.msg import Float32
 from std_srvs.srv import Trigger
 
-from ddqn_planner.grid import MOVES, GridMap, MapFile, MoveRule, legal_moves, save_map
+from ddqn_planner.grid import MOVES, GridMap, MapFile, MoveRule, legal_moves
 from ddqn_planner.model import load_model
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.nodes.trainer_node import PARAMETERS
