@@ -1,6 +1,7 @@
 """What learns from driving: `Experience`, and simpler ways to compare it with."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -40,7 +41,8 @@ class Learner:
         if self.slowness is None:
             return grid
         of_squares = np.clip(self.slowness, 1, MAX_SLOWNESS).astype(np.float32)
-        return grid.with_slowness(of_squares[self.of_cells], grid.resolution / SPEED)
+        times = {"slowness": of_squares[self.of_cells], "seconds_per_cell": grid.resolution / SPEED}
+        return replace(grid, **times)
 
     def record(self, seconds: Float64, positions: Float64) -> None:
         """Learn from the poses of a drive."""

@@ -7,7 +7,7 @@ than 25 cm on maps from files, after first measurements.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -73,7 +73,7 @@ class World:
     def known(self, seconds: float) -> GridMap:
         """Return the map of one who knows, but for waits and directions."""
         slowness = self.slowness(seconds).astype(np.float32)
-        return self.grid.with_slowness(slowness, self.grid.resolution / SPEED)
+        return replace(self.grid, slowness=slowness, seconds_per_cell=self.grid.resolution / SPEED)
 
     def routes(self, planner: Planner, start: Cell, goal: Cell, seconds: float) -> Routes:
         """Return the routes of one who knows nothing, and of one who knows all."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -205,10 +205,6 @@ class GridMap:
         if not has_same or older_version not in versions:
             return None
         return [box for _, box in self._history[versions.index(older_version) + 1 :]]
-
-    def with_slowness(self, slowness: NDArray[np.float32], seconds_per_cell: float) -> GridMap:
-        """Return the same map with other expected times."""
-        return replace(self, slowness=slowness, seconds_per_cell=seconds_per_cell)
 
     def with_times_of(self, other: GridMap) -> GridMap:
         """Return the same map with the expected times of another, and those that are hoped for."""

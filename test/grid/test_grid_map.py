@@ -78,14 +78,10 @@ MALFORMED: list[tuple[str, list[Any], str]] = [
 
 
 def test_a_malformed_map_is_refused_by_name() -> None:
-    times = {"slowness": np.ones((2, 3)), "seconds_per_cell": 1.0}
     for name, values, words in MALFORMED:
         for value in values:
             with pytest.raises(ValueError, match=f"^{name} ?{words}"):
                 GridMap(**{"occupancy": ZEROS, name: value})
-            if name in times:
-                with pytest.raises(ValueError, match=f"^{name} {words}"):
-                    GridMap(ZEROS).with_slowness(**{**times, name: value})
 
 
 def test_the_map_keeps_read_only_copies_of_arrays_and_lists() -> None:

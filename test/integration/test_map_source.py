@@ -564,7 +564,7 @@ def test_the_plan_goes_round_and_its_time_is_told(times: ExpectedTimes) -> None:
     assert 0.95 < seconds / plan.cost < 1.05
     assert 19 / 0.5 < plan.cost < 19 / 0.2  # not straight on
     small = np.zeros((10, 10), dtype=np.bool_)
-    of_old_map = GridMap(small).with_slowness(np.ones(small.shape, np.float32), 1.0)
+    of_old_map = GridMap(small, slowness=np.ones(small.shape), seconds_per_cell=1.0)
     for grid in (of_old_map, GRID):  # the second one is from before the drives
         outcome = Outcome("SUCCEEDED", "", planner, replace(request, grid=grid), plan)
         assert times.describe(outcome) == {}

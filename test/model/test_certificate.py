@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -125,7 +126,7 @@ def test_no_path_exceeds_the_certificate(
     grid, goal = place
     if timed:
         slowness = np.linspace(1, 9, grid.occupancy.size, dtype=np.float32)
-        grid = grid.with_slowness(slowness.reshape(grid.occupancy.shape), 1.0)
+        grid = replace(grid, slowness=slowness.reshape(grid.occupancy.shape), seconds_per_cell=1.0)
     network, certificate = unsure_and_noisy(share, noise)
     assert certificate.proved
     assert (noise > 0.0 or share < 1) == (certificate.path_error > 0.05)

@@ -1,6 +1,7 @@
 """The path that a body follows, where the robot's own cell and heading have none."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -57,7 +58,7 @@ def test_a_body_explores_within_the_share_alone(planner: Planner) -> None:
     slowness = random.uniform(4, 8, (3, 20, 40)).astype(np.float32)
     slowness[0] *= 1.1
     hall = GridMap(np.zeros((20, 40)), CELL)
-    expected, bold, safe = (hall.with_slowness(each, 1.0) for each in slowness)
+    expected, bold, safe = (replace(hall, slowness=each, seconds_per_cell=1.0) for each in slowness)
     timed = expected.with_layers(exploration=Exploration(0.1, bold, safe))
     paths = [plan(planner, grid, START, bound=1.0) for grid in (timed, safe, bold)]
     assert np.array_equal(paths[0].poses, paths[1].poses)

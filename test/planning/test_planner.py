@@ -386,7 +386,7 @@ def test_a_robot_between_two_docks_keeps_to_one_of_them(has_costs: bool) -> None
 
 def explored(grid: GridMap, share: float, *slowness: Any) -> GridMap:
     """Return a map with expected times, and those that a bold plan and a safe one hope for."""
-    expected, bold, safe = (grid.with_slowness(np.array(each, "f4"), 0.5) for each in slowness)
+    expected, bold, safe = (replace(grid, slowness=each, seconds_per_cell=0.5) for each in slowness)
     return expected.with_layers(exploration=Exploration(share, bold, safe))
 
 
