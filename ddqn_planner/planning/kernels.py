@@ -15,9 +15,6 @@ from ddqn_planner.grid import MOVES
 from ddqn_planner.grid.moves import UPHILL
 from ddqn_planner.model.move_costs import VALUES, MoveCosts
 
-Distances = NDArray[np.float64]
-Cells = NDArray[np.int32]
-
 # States. The distance of an open cell may fall; that of a closed one is the least. Until a cell is
 # reached its distance is 0: then pages of memory that no request needs are never touched.
 UNREACHED, OPEN, CLOSED, MARKED = 0, 1, 2, 4
@@ -40,9 +37,9 @@ class Known(NamedTuple):
 
     # The least costs of paths to the goal. As float32 they would lose the order of neighbours
     # above some 10^6.
-    distance: Distances
+    distance: NDArray[np.float64]
     state: NDArray[np.uint8]
-    opened: Cells  # all that are open, and some others
+    opened: NDArray[np.int32]  # all that are open, and some others
     # Whether closed cells have the least distances: those of a repair may be too great.
     closed_is_final: bool = True
 
@@ -223,7 +220,9 @@ def _best(distance: Any, cell: int, enough: float, costs: Any) -> tuple[float, i
     return least, best
 
 
-def take_back(known: Known, costs: MoveCosts, changed: Cells, limit: int) -> Known | None:
+def take_back(
+    known: Known, costs: MoveCosts, changed: NDArray[np.int32], limit: int
+) -> Known | None:
     """Take back what changed moves no longer support; None, and nothing, if it is too much."""
     # `changed` has all cells whose own moves changed (Ramalingam and Reps 1996; LPA*, Koenig and
     # Likhachev 2002, is the same for one start).

@@ -103,12 +103,13 @@ def way_and_ends(request: PlanRequest, goals: Goals) -> tuple[tuple[Cell, ...], 
     if request.reach >= 1:
         candidates.append((_near(~grid.occupancy, request.goals[0], request.reach), 1))
     for ends, number in candidates:
-        joined_to_ends = grid.reachable(ends, rule, backward=True)
-        way_out = (start,) if grid.is_free(start) else find_way_out(request, joined_to_ends)
-        if way_out and joined_to_ends[way_out[-1][1], way_out[-1][0]]:
-            reached = grid.reachable([way_out[-1]], rule)
-            reached_ends = ends[reached[ends[:, 1], ends[:, 0]]]
-            return way_out, tuple((x, y) for x, y in reached_ends[:number].tolist())
+        way_out: tuple[Cell, ...] = (start,)
+        if not grid.is_free(start):
+            way_out = find_way_out(request, grid.reachable(ends, rule, backward=True))
+        reached = grid.reachable(way_out[-1:], rule)
+        reached_ends = ends[reached[ends[:, 1], ends[:, 0]]][:number].tolist()
+        if reached_ends:
+            return way_out, tuple((x, y) for x, y in reached_ends)
     if grid.is_obstacle(start) and not find_way_out(request, ~grid.occupancy):
         return PlanStatus.START_OCCUPIED
     return PlanStatus.NO_PATH if goals else PlanStatus.GOAL_OCCUPIED
