@@ -1,7 +1,9 @@
 """Which cells a segment passes, in exact numbers: what is legal, and what it costs."""
 
 import math
+from collections.abc import Sequence
 from fractions import Fraction
+from itertools import pairwise
 
 import numpy as np
 
@@ -82,3 +84,10 @@ def is_legal(
         index = MOVES.tolist().index(step), first[1], first[0]
         assert grid.legal_moves(rule)[index]
     return True
+
+
+def check_legal(cells: Sequence[Cell], grid: GridMap, rule: MoveRule) -> None:
+    """Check that a path consists of legal moves."""
+    legal = grid.legal_moves(rule)
+    for (x, y), (next_x, next_y) in pairwise(cells):
+        assert legal[MOVES.tolist().index([next_x - x, next_y - y]), y, x]

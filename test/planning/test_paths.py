@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from exact_segments import exact_cost, is_legal
+from exact_segments import check_legal, exact_cost, is_legal
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
@@ -66,17 +66,6 @@ def drawn_path(data: Data, grid: GridMap, goal: Cell, rule: MoveRule) -> list[Ce
     path = list(shortest_path(grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule))
     assume(path)
     return path
-
-
-@given(GRIDS, RULES, st.data())
-def test_legal_segments_touch_free_cells(place: Place, rule: MoveRule, data: Data) -> None:
-    grid, _ = place
-    cell = st.tuples(st.integers(-1, grid.width), st.integers(-1, grid.height))
-    path = data.draw(st.lists(cell, min_size=1, max_size=6))
-    for move in data.draw(st.lists(st.sampled_from(MOVES.tolist()), max_size=6)):
-        path.append((path[-1][0] + move[0], path[-1][1] + move[1]))
-    expected = [is_legal(*segment, grid, rule) for segment in pairwise(path)]
-    assert legal_segments(path, grid, rule).tolist() == expected
 
 
 @given(GRIDS, RULES, st.data())
@@ -214,7 +203,6 @@ def test_a_search_finds_any_legal_path(place: Place, rule: MoveRule, data: Data)
     start = data.draw(st.sampled_from(grid.free_cells()))
     shape, values = grid.occupancy.shape, st.floats(width=32)
     value = data.draw(numpy_st.arrays(np.float32, shape, elements=values))
-    legal = grid.legal_moves(rule)
     distances = shortest_distances(grid, goal, rule)
 
     cells = search(start, goal, grid, rule, value)
@@ -222,8 +210,7 @@ def test_a_search_finds_any_legal_path(place: Place, rule: MoveRule, data: Data)
     if cells:
         assert (cells[0], cells[-1]) == (start, goal)
         assert len(set(cells)) == len(cells)
-        for (x, y), (next_x, next_y) in pairwise(cells):
-            assert legal[MOVES.tolist().index([next_x - x, next_y - y]), y, x]
+        check_legal(cells, grid, rule)
 
     cheapest = distances[start[1], start[0]]
     for known in (None, -distances.astype(np.float32)):  # nothing is known, or all is
@@ -243,17 +230,21 @@ def test_a_search_follows_the_values_even_on_a_detour() -> None:
 
 
 @settings(max_examples=300)
-@given(GRIDS, RULES, st.data())
-def test_segments_are_as_their_cells_are(place: Place, rule: MoveRule, data: Data) -> None:
-    grid, first = place
-    far = min(grid.width - first[0], grid.height - first[1]) - 1
-    diagonal = st.integers(0, far).map(lambda by: (first[0] + by, first[1] + by))
-    last = data.draw(cells_of(grid) | diagonal, label="last")
-    begin = data.draw(st.sampled_from([0.0, 0.0, 0.25, 0.625]), label="begin")
-    (legal,) = legal_segments(np.array([first, last]), grid, rule, begin)
-    assert legal == is_legal(first, last, grid, rule, Fraction(begin))
-    exact = exact_cost(first, last, grid, rule)
-    assert cost_along(np.array([first, last]), grid, rule) == pytest.approx(exact)
+@given(GRIDS, RULES, st.sampled_from([0.0, 0.0, 0.25, 0.625]), st.data())
+def test_segments_are_as_their_cells_are(
+    place: Place, rule: MoveRule, begin: float, data: Data
+) -> None:
+    grid, _ = place
+    path = data.draw(st.lists(cells_of(grid), min_size=1, max_size=4))
+    steps = st.tuples(st.sampled_from(MOVES.tolist()), st.integers(1, 4))
+    for (dx, dy), by in data.draw(st.lists(steps, max_size=4)):  # perhaps off the map
+        path.append((path[-1][0] + by * dx, path[-1][1] + by * dy))
+    segments, begins = [*pairwise(path)], [Fraction(begin)] + [Fraction(0)] * len(path)
+    expected = [is_legal(*each, grid, rule, at) for each, at in zip(segments, begins, strict=False)]
+    assert legal_segments(path, grid, rule, begin).tolist() == expected
+    if all(map(grid.contains, path)):
+        exact = sum(exact_cost(*segment, grid, rule) for segment in segments)
+        assert cost_along(path, grid, rule) == pytest.approx(exact)
 
 
 def check_simplified(path: list[Cell], grid: GridMap, rule: MoveRule) -> tuple[Cell, ...]:
@@ -381,30 +372,22 @@ RADII = st.sampled_from([0, 0.5, 1, 1.5, 2, 3, math.inf])
 Cells = set[Cell]
 
 
-def moves(cell: Cell, allowed: Cells, grid: GridMap, rule: MoveRule) -> list[tuple[Cell, float]]:
-    """The cells that one move leads to, within some, and the length of each."""
-    (x, y), found = cell, []
-    for action, (dx, dy) in enumerate(MOVES.tolist()):
-        past_corner = dx and dy and not {(x + dx, y), (x, y + dy)} <= allowed
-        is_forbidden = grid.forbidden is not None and int(grid.forbidden[y, x]) >> action & 1
-        if is_forbidden or (rule is MoveRule.ROBOT_SAFE and past_corner):
-            continue
-        if (x + dx, y + dy) in allowed:
-            length = 1.0 if rule is MoveRule.UNIT else math.hypot(dx, dy)
-            found.append(((x + dx, y + dy), length))
-    return found
+def within(allowed: Cells, grid: GridMap) -> GridMap:
+    """The map of which only some cells are free."""
+    free = [[(x, y) in allowed for x in range(grid.width)] for y in range(grid.height)]
+    return GridMap(~np.array(free), forbidden=grid.forbidden)
 
 
-def lengths_from(start: Cell, allowed: Cells, grid: GridMap, rule: MoveRule) -> dict[Cell, float]:
+def lengths_from(start: Cell, grid: GridMap, rule: MoveRule) -> dict[Cell, float]:
     """The lengths of the shortest ways to all cells that they lead to."""
-    lengths: dict[Cell, float] = {}
-    waiting = [(0.0, start)]
+    lengths, waiting, legal = dict[Cell, float](), [(0.0, start)], grid.legal_moves(rule)
     while waiting:
-        length, cell = heapq.heappop(waiting)
-        if cell not in lengths:
-            lengths[cell] = length
-            for after, more in moves(cell, allowed, grid, rule):
-                heapq.heappush(waiting, (length + more, after))
+        length, (x, y) = heapq.heappop(waiting)
+        if (x, y) not in lengths:
+            lengths[x, y] = length
+            for action in np.flatnonzero(legal[:, y, x]):
+                after = x + int(MOVES[action, 0]), y + int(MOVES[action, 1])
+                heapq.heappush(waiting, (length + rule.lengths[action], after))
     return lengths
 
 
@@ -435,11 +418,11 @@ def test_a_start_that_is_not_free_is_left_by_the_shortest_way(
     closed = obstacles - near if start in obstacles else obstacles
     distances = shortest_distances(grid, goal, rule)
     joined = {cell for cell in free if np.isfinite(distances[cell[::-1]])}
-    allowed = {cell for cell in cells if cell in joined or cell not in free | closed}
-    lengths = lengths_from(start, allowed, grid, rule)
+    allowed = within({cell for cell in cells if cell in joined or cell not in free | closed}, grid)
+    lengths = lengths_from(start, allowed, rule)
     ways = {cell: lengths[cell] for cell in joined & lengths.keys()}
     if not ways:
-        leaves = free & lengths_from(start, {*cells} - closed, grid, rule).keys()
+        leaves = free & lengths_from(start, within({*cells} - closed, grid), rule).keys()
         stuck = start in obstacles and not leaves
         assert plan.status is (PlanStatus.START_OCCUPIED if stuck else PlanStatus.NO_PATH)
         return
@@ -447,8 +430,7 @@ def test_a_start_that_is_not_free_is_left_by_the_shortest_way(
     way, rest = plan.cells[: number + 1], plan.cells[number:]
     assert (way[0], rest[-1]) == (start, goal)
     assert not closed & {*plan.cells}
-    for cell, after in pairwise(way):
-        assert after in dict(moves(cell, allowed, grid, rule))
+    check_legal(way, allowed, rule)
     shortest = min(ways.values())
     assert path_length(way, rule) == pytest.approx(shortest)
     tied = [end for end, length in ways.items() if length < shortest + 1e-6]
