@@ -135,15 +135,6 @@ def add(values: Any, array: Any) -> None:
 
 
 @inner_in_place
-def greatest(values: Any) -> int:
-    """Return the first action of the greatest value (8,)."""
-    best = 0
-    for action in range(1, values.size):
-        best = action if values[action] > values[best] else best
-    return best
-
-
-@inner_in_place
 def look(network: Any, windows: Any) -> None:
     """Compute what a network makes of the common windows."""
     layer, after, output = network.layer, network.after, network.output
@@ -247,7 +238,7 @@ def play(game: Any, learning: Any, robots: Any, random: Any, counters: Any, unti
         evaluate(online, windows, scenario, cell)
         for n in range(count):
             if exploration.random() >= epsilon:
-                actions[n] = greatest(online.q[n])
+                actions[n] = online.q[n].argmax()
         for n in range(count):
             at = scenario[n], actions[n], cell[n]
             after = next_cell[actions[n], cell[n]] if legal[at] else cell[n]
@@ -282,7 +273,7 @@ def update(learning: Any, sampling: Any, counters: Any) -> None:
     evaluate(online, windows, batch.scenario, batch.next_cell)
     evaluate(target, windows, batch.scenario, batch.next_cell)
     for n in range(size):
-        best = greatest(selection[n])
+        best = selection[n].argmax()
         batch.reward[n] += batch.discount[n] * evaluation[n, best]  # the target y
     evaluate(online, windows, batch.scenario, batch.cell)
     gradient.q[:] = 0
