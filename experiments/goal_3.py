@@ -105,8 +105,8 @@ def train_supervised(training: Training) -> None:
     random = np.random.default_rng(training.seed)
     tensors = trainer.network.tensors
     zeros = ({name: np.zeros_like(t) for name, t in tensors.items()} for _ in range(3))
-    parts = [tensors, *zeros]
-    windows, networks = networks_of(trainer.environment, parts, SUPERVISED_BATCH)
+    e, parts = trainer.environment, [tensors, *zeros]
+    windows, networks = networks_of(e.background, e.shape, parts, SUPERVISED_BATCH)
     network, gradient, *_ = networks
     moved = [each.weights for each in networks]
     steps = training.parameters.steps

@@ -21,7 +21,7 @@ from ddqn_planner.training.environment import GridVectorEnvironment, Scenario, p
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.propagation import value_iteration
 from ddqn_planner.training.run import TrainingRun
-from ddqn_planner.training.shared_background import evaluate, look, network_of, windows_of
+from ddqn_planner.training.shared_background import evaluate, look, networks_of
 from ddqn_planner.training.trainer import Trainer
 
 SCENARIO: Final = paper_scenario()
@@ -202,9 +202,8 @@ def rollouts(planner: Planner, environment: GridVectorEnvironment) -> NDArray[np
     # All maps at once, and the paths' cells alone: whole fields take 10 to 20 times as long.
     maps, background = np.arange(len(environment.start)), environment.background
     of_model, exact = planner.network, background.astype(np.float64)
-    tensors = [of_model.tensors[name] for name in of_model.shapes(of_model.sizes)]
-    windows = windows_of(exact, environment.shape, len(tensors[0]), len(maps))
-    network = network_of(tensors, windows)
+    tensors = {name: of_model.tensors[name] for name in of_model.shapes(of_model.sizes)}
+    windows, (network,) = networks_of(exact, environment.shape, [tensors], len(maps))
     look(network, windows)
     lengths = np.zeros((2, len(maps)))
     for length, is_masked in zip(lengths, (True, False), strict=True):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from functools import cache, partial
 from typing import TYPE_CHECKING, ClassVar, TypeAlias
@@ -45,7 +44,7 @@ class ModelFileError(ValueError):
     """A model file cannot be used; the message says why and what to do."""
 
 
-class QNetwork(ABC):
+class QNetwork:
     """A trained Q-network, of `sizes` and `tensors`: what it says of a map's moves."""
 
     name: ClassVar[str]  # in model files and hyper-parameters
@@ -58,9 +57,18 @@ class QNetwork(ABC):
         self.tensors = dict(tensors)
 
     @classmethod
-    @abstractmethod
     def shapes(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
-        """Return the shape of each tensor."""
+        """Return the shape of each tensor: the weights and biases of the layers."""
+        return {
+            f"{layer}.{part}": shape if part == "weight" else shape[:1]
+            for layer, shape in cls._layers(sizes).items()
+            for part in ("weight", "bias")
+        }
+
+    @classmethod
+    def _layers(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
+        """Return the shape of each layer's weights."""
+        raise NotImplementedError
 
     def supports(self, shape: tuple[int, int]) -> bool:
         """Say whether the network can plan on maps of shape (H, W)."""
@@ -102,13 +110,12 @@ class PaperQNetwork(QNetwork):
     size_names = ("height", "width", "filters", "hidden_units")
 
     @classmethod
-    def shapes(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
-        """Return the shape of each tensor."""
+    def _layers(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
         height, width, filters, units = (sizes[name] for name in cls.size_names)
         features = filters * ((height + 1) // 2) * ((width + 1) // 2)
-        layers = {"hidden": (units, features)} if units else {}
-        layers["fully_connected"] = (len(MOVES), units or features)
-        return _with_biases({"convolution": (filters, 1, 3, 3), **layers})
+        hidden = {"hidden": (units, features)} if units else {}
+        last = {"fully_connected": (len(MOVES), units or features)}
+        return {"convolution": (filters, 1, 3, 3), **hidden, **last}
 
     def supports(self, shape: tuple[int, int]) -> bool:
         """Say whether maps of shape (H, W) have the network's size."""
@@ -159,22 +166,30 @@ class PropagationQNetwork(QNetwork):
     uses_costs: ClassVar[bool] = False  # whether the features tell costs and the move rule
 
     def __init__(self, sizes: Mapping[str, int], tensors: Mapping[str, Array]) -> None:
-        super().__init__(sizes, tensors)
+        prices = {name: t for name, t in tensors.items() if name.startswith("prices")}
+        clear = {name: np.where(np.abs(t) < NOISE, 0, t) for name, t in prices.items()}
+        super().__init__(sizes, {**tensors, **clear})
         # What holds for all maps, so that it is computed once.
         self._certify, self._proved = cache(partial(certify, self)), cache(self._proved_costs)
 
     @classmethod
-    def shapes(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
-        """Return the shape of each tensor."""
-        filters = sizes["filters"]
-        layers = {"convolution": (filters, cls.inputs), "hidden": (filters, filters)}
-        return _with_biases({**layers, "moves": (len(MOVES), filters)})
+    def _layers(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
+        filters, outputs = sizes["filters"], len(MOVES)
+        layers: dict[str, tuple[int, ...]] = {"convolution": (filters, cls.inputs)}
+        layers |= {"hidden": (filters, filters), "moves": (outputs, filters)}
+        return {**layers, "prices": (outputs, cls.inputs)} if cls.uses_costs else layers
 
-    @staticmethod
-    def features(patch_B9: NDArray[np.int8], move_rule: MoveRule) -> Array:
-        """Return which cells of patches are occupied: (B, 9), see `patches`."""
-        occupied: NDArray[np.bool_] = patch_B9 == OCCUPIED
-        return occupied.astype(np.float32)
+    @classmethod
+    def features(cls, patch_B9: NDArray[np.int8], move_rule: MoveRule) -> Array:
+        """Return which cells of patches are occupied, (B, 9), see `patches`.
+
+        Then, with costs, which cells cost what, 0..1, and which are unknown; the rule: (B, 28).
+        """
+        occupied, unknown = patch_B9 == OCCUPIED, patch_B9 == UNKNOWN
+        cost_B9 = np.where(occupied | unknown, 0, patch_B9) / 100
+        rule_B1 = np.full((len(patch_B9), 1), move_rule.cuts_corners)
+        others = [cost_B9, unknown, rule_B1] if cls.uses_costs else []
+        return np.concatenate([occupied, *others], axis=1, dtype=np.float32)
 
     def success(self, feature_BI: Array) -> Array:
         """Return p(s, a) in 0..1: (B, 8), given features (B, I)."""
@@ -192,8 +207,11 @@ class PropagationQNetwork(QNetwork):
         return tries_BA
 
     def multiplier(self, feature_BI: Array) -> Array:
-        """Return the cost multiplier of each move, here 1: (B, 8), given features (B, I)."""
-        return np.ones((len(feature_BI), len(MOVES)), dtype=np.float32)
+        """Return the cost multiplier of each move, at least 1: (B, 8), given features (B, I)."""
+        if not self.uses_costs:
+            return np.ones((len(feature_BI), len(MOVES)), dtype=np.float32)
+        multiplier_BA: Array = 1 + np.maximum(self._layer("prices", feature_BI), 0)
+        return multiplier_BA
 
     def certificate(self, move_rule: MoveRule) -> Certificate:
         """Return what is proved of its moves: under all rules, or the one it was trained for."""
@@ -209,12 +227,38 @@ class PropagationQNetwork(QNetwork):
     def _proved_costs(self, move_rule: MoveRule, with_costs: bool, timed: bool) -> MoveCosts | None:
         """Return the costs of moves without what depends on the map."""
         patch_P9 = every_patch()
+        legal_PA = legal_in_patches(patch_P9, move_rule)
+        if with_costs:
+            return self._sums_of_prices(move_rule, legal_PA)
         table_PA = self._costs_of(patch_P9, move_rule, timed)
         table_PA[patch_P9[:, 4] == OCCUPIED] = np.inf
-        legal_PA = legal_in_patches(patch_P9, move_rule)
-        if not np.array_equal(np.isfinite(table_PA), legal_PA):
+        is_right = np.array_equal(np.isfinite(table_PA), legal_PA)
+        return MoveCosts.of_table(table_PA) if is_right else None
+
+    def _sums_of_prices(self, move_rule: MoveRule, legal_PA: NDArray[np.bool_]) -> MoveCosts | None:
+        """Return costs that are sums over the two cells of a move, if they are proved to be."""
+        if not self.certificate(move_rule).proved:
             return None
-        return MoveCosts.of_table(table_PA)
+        lengths_PA = np.where(legal_PA, move_rule.lengths, np.inf).astype(np.float32)
+        costs = MoveCosts.of_table(lengths_PA)
+        # The layer is linear, so that its output is a sum over the patch's cells.
+        weight_AI, bias_A = self.tensors["prices.weight"], self.tensors["prices.bias"]
+        occupied_9A, cost_9A, unknown_9A = weight_AI[:, :27].T.reshape(3, 9, -1)
+        terms_9AL = np.empty((9, len(MOVES), VALUES), dtype=np.float32)
+        terms_9AL[..., 0], terms_9AL[..., -1] = unknown_9A, occupied_9A
+        terms_9AL[..., 1:-1] = cost_9A[..., None] * (np.arange(OCCUPIED) / 100)
+        terms_9AL[4] += (bias_A + weight_AI[:, 27] * move_rule.cuts_corners)[:, None]
+        actions, after = np.arange(len(MOVES)), 4 + MOVES @ [1, 3]
+        terms_2AL = np.stack([terms_9AL[4], terms_9AL[after, actions]])
+        terms_2AL[..., -1] = terms_2AL[..., -2]  # no move leads there
+        terms_9AL[4] = terms_9AL[after, actions] = 0
+        greatest = 1 + float(terms_2AL.max(axis=2).sum(axis=0).max())
+        if terms_9AL.any() or terms_2AL.min() < 0 or greatest > MAX_MULTIPLIER:
+            return None  # what a move costs does not follow from its two cells
+        from_on = np.minimum.accumulate(terms_2AL[..., ::-1], axis=2)[..., ::-1]
+        low_L = 1 + np.minimum(terms_2AL[..., :1], from_on).sum(axis=0).min(axis=0)
+        terms = terms_2AL.ravel() + np.float32(0.5)
+        return costs._replace(terms=terms, highest=costs.highest * greatest, low=low_L)
 
     def believed_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts:
         """Return the costs of a map's moves, right or not: Q is minus the cheapest path's cost."""
@@ -245,62 +289,3 @@ class AnyMapQNetwork(PropagationQNetwork):
     name = "any_map"
     inputs = 28
     uses_costs = True
-
-    def __init__(self, sizes: Mapping[str, int], tensors: Mapping[str, Array]) -> None:
-        prices = {name: t for name, t in tensors.items() if name.startswith("prices")}
-        clear = {name: np.where(np.abs(t) < NOISE, 0, t) for name, t in prices.items()}
-        super().__init__(sizes, {**tensors, **clear})
-
-    @classmethod
-    def shapes(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
-        """Return the shape of each tensor."""
-        return super().shapes(sizes) | _with_biases({"prices": (len(MOVES), cls.inputs)})
-
-    @staticmethod
-    def features(patch_B9: NDArray[np.int8], move_rule: MoveRule) -> Array:
-        """Return of 9 cells which are occupied, costs of 0..1, which are unknown; rule: (B, 28)."""
-        occupied, unknown = patch_B9 == OCCUPIED, patch_B9 == UNKNOWN
-        cost_B9 = np.where(occupied | unknown, 0, patch_B9) / 100
-        rule_B1 = np.full((len(patch_B9), 1), move_rule.cuts_corners)
-        return np.concatenate([occupied, cost_B9, unknown, rule_B1], axis=1, dtype=np.float32)
-
-    def multiplier(self, feature_BI: Array) -> Array:
-        """Return the cost multiplier of each move, at least 1: (B, 8), given features (B, 28)."""
-        multiplier_BA: Array = 1 + np.maximum(self._layer("prices", feature_BI), 0)
-        return multiplier_BA
-
-    def _proved_costs(self, move_rule: MoveRule, with_costs: bool, timed: bool) -> MoveCosts | None:
-        if not with_costs:
-            return super()._proved_costs(move_rule, with_costs, timed)
-        if not self.certificate(move_rule).proved:
-            return None
-        legal_PA = legal_in_patches(every_patch(), move_rule)
-        lengths_PA = np.where(legal_PA, move_rule.lengths, np.inf).astype(np.float32)
-        costs = MoveCosts.of_table(lengths_PA)
-        # The layer is linear, so that its output is a sum over the patch's cells.
-        weight_AI, bias_A = self.tensors["prices.weight"], self.tensors["prices.bias"]
-        occupied_9A, cost_9A, unknown_9A = weight_AI[:, :27].T.reshape(3, 9, -1)
-        terms_9AL = np.empty((9, len(MOVES), VALUES), dtype=np.float32)
-        terms_9AL[..., 0], terms_9AL[..., -1] = unknown_9A, occupied_9A
-        terms_9AL[..., 1:-1] = cost_9A[..., None] * (np.arange(OCCUPIED) / 100)
-        terms_9AL[4] += (bias_A + weight_AI[:, 27] * move_rule.cuts_corners)[:, None]
-        actions, after = np.arange(len(MOVES)), 4 + MOVES @ [1, 3]
-        terms_2AL = np.stack([terms_9AL[4], terms_9AL[after, actions]])
-        terms_2AL[..., -1] = terms_2AL[..., -2]  # no move leads there
-        terms_9AL[4] = terms_9AL[after, actions] = 0
-        greatest = 1 + float(terms_2AL.max(axis=2).sum(axis=0).max())
-        if terms_9AL.any() or terms_2AL.min() < 0 or greatest > MAX_MULTIPLIER:
-            return None  # what a move costs does not follow from its two cells
-        from_on = np.minimum.accumulate(terms_2AL[..., ::-1], axis=2)[..., ::-1]
-        low_L = 1 + np.minimum(terms_2AL[..., :1], from_on).sum(axis=0).min(axis=0)
-        terms = terms_2AL.ravel() + np.float32(0.5)
-        return costs._replace(terms=terms, highest=costs.highest * greatest, low=low_L)
-
-
-def _with_biases(weights: Mapping[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of layers' weights and biases, given those of the weights."""
-    return {
-        f"{layer}.{part}": shape if part == "weight" else shape[:1]
-        for layer, shape in weights.items()
-        for part in ("weight", "bias")
-    }

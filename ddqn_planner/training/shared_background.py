@@ -7,7 +7,7 @@ may differ.
 """
 
 from collections import namedtuple
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import fields
 from functools import partial
 from typing import Any, NamedTuple
@@ -31,10 +31,7 @@ inner_in_place = partial(inner, _nrt=False)  # without counts of references, as 
 
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, np.float32(1e-8)  # Adam's, as torch has them
 LEAST = np.float32(1e-30)  # mean of a gradient: less moves no weight
-DQN, PRINTED = 1, 2  # other targets than Double DQN's
 WINDOWS = 5_000  # that the steps of one call look at: so it returns within milliseconds
-
-Tensors = dict[str, NDArray[np.float32]]
 
 # The hyper-parameters that are numbers, for compiled code.
 NUMBERS: Any = {f.name: type(f.default) for f in fields(HyperParameters) if f.type in (int, float)}
@@ -73,64 +70,54 @@ class Network(NamedTuple):
 
 
 def arrays_of(
-    parts: tuple[Tensors, ...], environment: GridVectorEnvironment, replay: ReplayBuffer
+    parts: Sequence[dict[str, Any]], environment: GridVectorEnvironment, replay: ReplayBuffer
 ) -> tuple[Any, Any, Any]:
     """Return what `play` takes of a training: its game, what it learns, and its robots."""
     e, p = environment, environment.parameters
-    gradient = {name: np.zeros_like(tensor) for name, tensor in parts[0].items()}
-    all_parts, most = (*parts[:2], gradient, *parts[2:]), max(p.batch_size, p.environments)
-    windows, (*networks, mean, square) = networks_of(e, all_parts, most)
-    kind = ("double_dqn", "dqn", "printed").index(p.target)
+    slopes = {name: np.zeros_like(tensor) for name, tensor in parts[0].items()}
+    most = max(p.batch_size, p.environments)
+    windows, networks = networks_of(e.background, e.shape, [*parts, slopes], most)
+    online, target, mean, square, gradient = networks
+    selection = target if p.target == "dqn" else online  # see `double_dqn_gradient`
+    evaluation = online if p.target == "printed" else target
     numbers = Numbers(*(as_number(getattr(p, name)) for name, as_number in NUMBERS.items()))
-    drawn, actions = ReplayBuffer(p.batch_size).transitions, np.zeros_like(e.cell)
-    learning = numbers, kind, windows, *networks, mean.weights, square.weights, drawn
-    robots = e.cell, actions, e.steps, e.visited, e.total_reward, e.terminated, e.truncated
+    batch, actions = ReplayBuffer(p.batch_size).transitions, np.zeros_like(e.cell)
+    of_update = batch, selection.q, evaluation.q, gradient, mean.weights, square.weights
+    learning = numbers, windows, online, target, replay.transitions, *of_update
+    robots = e.scenario, e.cell, actions, e.steps, e.visited, e.total_reward
     game = e.legal, e.rewards, e.next_cell, e.goal
-    return game, (*learning, replay.transitions), (e.scenario, *robots)
+    return game, learning, (*robots, e.terminated, e.truncated)
 
 
 def networks_of(
-    environment: GridVectorEnvironment, parts: Iterable[Tensors], batch: int
-) -> tuple[Windows, tuple[Network, ...]]:
-    """Return networks of the paper's tensors, which from now on are parts of them."""
-    parts, networks = list(parts), []
-    filters = len(next(iter(parts[0].values())))
-    windows = windows_of(environment.background, environment.shape, filters, batch)
-    for tensors in parts:
-        network = network_of([*tensors.values()], windows)
-        for (name, tensor), array in zip(tensors.items(), network[1:7], strict=False):
-            tensors[name] = array.T.reshape(tensor.shape)
-        networks.append(network)
-    return windows, tuple(networks)
+    background_SC: Floats, shape: tuple[int, int], parts: Sequence[dict[str, Any]], batch: int
+) -> tuple[Windows, list[Network]]:
+    """Return networks of the paper's tensors, which from now on are parts of them, for B states.
 
-
-def windows_of(background_SC: Floats, shape: tuple[int, int], filters: int, batch: int) -> Windows:
-    """Cut backgrounds of maps of shape (H, W) into windows, with room for B states."""
-    cut_L9, zeros = window_cells(shape), partial(np.zeros, dtype=background_SC.dtype)
-    background_SC = np.pad(background_SC, [(0, 0), (0, 1)])  # 0 outside the map
-    own = background_SC[:, cut_L9]
-    common = np.sort(background_SC, axis=0)[len(own) // 2][cut_L9]
+    The maps are of shape (H, W); all floats are as exact as their backgrounds.
+    """
+    zeros: Any = partial(np.zeros, dtype=background_SC.dtype)
+    own = np.pad(background_SC, [(0, 0), (0, 1)])[:, window_cells(shape)]  # 0 outside the map
+    common = np.sort(own, axis=0)[len(own) // 2]
     scenario, differing = np.nonzero((own != common).any(axis=2))
     ends = np.searchsorted(scenario, np.arange(len(own) + 1))
-    rows = batch * (4 + int(np.diff(ends).max()))
-    numbers = np.zeros(rows, np.int64), np.zeros(batch + 1, np.int64)
-    seen = zeros((rows, 9)), *numbers, zeros((rows, filters))
-    return Windows(common, own, differing, ends, shape, *seen)
-
-
-def network_of(tensors: Sequence[Floats], windows: Windows) -> Network:
-    """Return a network with a copy of a model's tensors, as exact as the windows."""
-    turned = [t.T if t.ndim < 3 else t.reshape(-1, 9).T for t in tensors]
-    turned += [np.zeros((0, 8)), np.zeros(0)][: 6 - len(turned)]
-    zeros: Any = partial(np.zeros, dtype=windows.own.dtype)
-    weights = np.concatenate([array.ravel() for array in turned], dtype=windows.own.dtype)
-    parts = np.split(weights, np.cumsum([array.size for array in turned])[:-1])
-    layers: Any = [part.reshape(t.shape) for part, t in zip(parts, turned, strict=True)]
-    batch, units = len(windows.first) - 1, len(tensors[3])
-    of_common = zeros((len(windows.common), len(tensors[0]))), zeros(units)
-    own_output = zeros((batch, units))
-    q, eight = (zeros((batch, 8)), ()) if len(tensors) > 4 else (own_output, (0,) * 8)
-    return Network._make([weights, *layers, *of_common, own_output, q, eight])
+    rows, filters = batch * (4 + int(np.diff(ends).max())), len(parts[0]["convolution.bias"])
+    seen = zeros((rows, 9)), np.zeros(rows, np.int64), np.zeros(batch + 1, np.int64)
+    windows = Windows(common, own, differing, ends, shape, *seen, zeros((rows, filters)))
+    networks = []
+    for tensors in parts:
+        turned = [t.T if t.ndim < 3 else t.reshape(-1, 9).T for t in tensors.values()]
+        turned += [np.zeros((0, 8)), np.zeros(0)][: 6 - len(turned)]
+        weights = np.concatenate([array.ravel() for array in turned], dtype=own.dtype)
+        split = np.split(weights, np.cumsum([array.size for array in turned])[:-1])
+        layers: Any = [part.reshape(t.shape) for part, t in zip(split, turned, strict=True)]
+        units, has_last = len(layers[3]), len(tensors) > 4
+        for (name, tensor), array in zip(tensors.items(), layers, strict=False):
+            tensors[name] = array.T.reshape(tensor.shape)
+        own_output, of_common = zeros((batch, units)), (zeros((len(common), filters)), zeros(units))
+        q, eight = (zeros((batch, 8)), ()) if has_last else (own_output, (0,) * 8)
+        networks.append(Network._make([weights, *layers, *of_common, own_output, q, eight]))
+    return windows, networks
 
 
 @inner_in_place
@@ -145,15 +132,6 @@ def add(values: Any, array: Any) -> None:
     """Add values to an array (N,)."""
     for n in range(array.size):
         array[n] += values[n]
-
-
-@inner_in_place
-def greatest(values: Any) -> int:
-    """Return the first action of the greatest value (8,)."""
-    best = 0
-    for action in range(1, values.size):
-        best = action if values[action] > values[best] else best
-    return best
 
 
 @inner_in_place
@@ -245,7 +223,7 @@ def play(game: Any, learning: Any, robots: Any, random: Any, counters: Any, unti
     The counters are steps, updates and replayed transitions.
     """
     legal, rewards, next_cell, goal = game
-    numbers, _, windows, online, target, _, _, _, _, replay = learning
+    numbers, windows, online, target, replay = learning[:5]
     scenario, cell, actions, episode_steps, visited, total_reward, terminated, truncated = robots
     exploration, sampling = random
     look(online, windows)
@@ -260,7 +238,7 @@ def play(game: Any, learning: Any, robots: Any, random: Any, counters: Any, unti
         evaluate(online, windows, scenario, cell)
         for n in range(count):
             if exploration.random() >= epsilon:
-                actions[n] = greatest(online.q[n])
+                actions[n] = online.q[n].argmax()
         for n in range(count):
             at = scenario[n], actions[n], cell[n]
             after = next_cell[actions[n], cell[n]] if legal[at] else cell[n]
@@ -284,7 +262,8 @@ def play(game: Any, learning: Any, robots: Any, random: Any, counters: Any, unti
 @inner
 def update(learning: Any, sampling: Any, counters: Any) -> None:
     """Make one Double DQN update with a batch from the replay buffer, see `double_dqn_gradient`."""
-    numbers, kind, windows, online, target, gradient, mean, square, batch, replay = learning
+    numbers, windows, online, target, replay = learning[:5]
+    batch, selection, evaluation, gradient, mean, square = learning[5:]
     size = batch.cell.size
     for n in range(size):
         slot = sampling.integers(0, min(counters[2], replay.cell.size))
@@ -294,9 +273,8 @@ def update(learning: Any, sampling: Any, counters: Any) -> None:
     evaluate(online, windows, batch.scenario, batch.next_cell)
     evaluate(target, windows, batch.scenario, batch.next_cell)
     for n in range(size):
-        best = greatest(target.q[n] if kind == DQN else online.q[n])
-        next_q = online.q[n, best] if kind == PRINTED else target.q[n, best]
-        batch.reward[n] += batch.discount[n] * next_q  # the target y
+        best = selection[n].argmax()
+        batch.reward[n] += batch.discount[n] * evaluation[n, best]  # the target y
     evaluate(online, windows, batch.scenario, batch.cell)
     gradient.q[:] = 0
     for n in range(size):

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -186,12 +186,10 @@ class Trainer:
                 saved = json.loads(metadata[CHECKPOINT_KEY])
                 if saved["scenarios"] != now["scenarios"]:
                     raise CheckpointError("was made with another map, start or goal; give that one")
-                parameters = replace(
-                    HyperParameters(**saved["parameters"]), steps=self.parameters.steps
-                )
-                names = "seed", "move_rule", *now["parameters"]
-                before, now = saved | asdict(parameters), now | now["parameters"]
-                if changed := differences({name: before[name] for name in names}, now):
+                before = {name: saved[name] for name in ("seed", "move_rule")}
+                others = saved["parameters"] | {"steps": self.parameters.steps}
+                before |= asdict(HyperParameters(**others))
+                if changed := differences(before, now | now["parameters"]):
                     raise CheckpointError(f"was made with {changed}; give those values")
                 self.steps, self.updates, self.episodes, self._replay.added = saved["counters"]
                 tensors = self._tensors()

@@ -141,8 +141,9 @@ def test_weights_whose_gradients_fade_move_as_those_of_torch(small: Scenario) ->
     parameters = HyperParameters(hidden_units=6, filters=4)
     trainer = Trainer([small], MoveRule.ROBOT_SAFE, parameters, seed=2)
     zeros = ({name: 0 * t for name, t in trainer.network.tensors.items()} for _ in range(3))
-    parts = trainer.network.tensors, *zeros
-    windows, (online, gradient, *moments) = networks_of(trainer.environment, parts, batch=1)
+    e, parts = trainer.environment, (trainer.network.tensors, *zeros)
+    windows, networks = networks_of(e.background, e.shape, parts, batch=1)
+    online, gradient, *moments = networks
     moved = [each.weights for each in (online, gradient, *moments)]
     weight = torch.tensor(online.weights)
     optimiser = torch.optim.Adam([weight], 0.01)
