@@ -16,12 +16,9 @@ Array = NDArray[np.float64]
 
 # As in Nav2's lattices (Pivtoraiko and Kelly 2005), a robot that drives straight ahead passes
 # through the centres of cells: the headings are not evenly spaced.
-QUARTER: Final = ((1, 0), (2, 1), (1, 1), (1, 2))
-DIRECTIONS: Final = (
-    np.array([[(x, y), (-y, x), (-x, -y), (y, -x)] for x, y in QUARTER], dtype=np.int64)
-    .swapaxes(0, 1)
-    .reshape(-1, 2)
-)
+QUARTER: Final = np.array([(1, 0), (2, 1), (1, 1), (1, 2)])
+TURNED: Final = QUARTER[:, ::-1] * (-1, 1)
+DIRECTIONS: Final = np.concatenate([QUARTER, TURNED, -QUARTER, -TURNED])
 HEADINGS: Final = len(DIRECTIONS)
 
 STRIDE = 0.4  # metres of a long step straight ahead

@@ -1,5 +1,7 @@
 """The least costs of poses toward a goal: grown as far as a start needs, with a proved bound."""
 
+from __future__ import annotations
+
 import math
 import mmap
 from typing import Any
@@ -9,9 +11,9 @@ from numpy.typing import DTypeLike, NDArray
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.planning import pose_kernels as kernels
-from ddqn_planner.planning.pose_kernels import Aim, Known, Search, heap_of
+from ddqn_planner.planning.pose_kernels import Aim, Search, heap_of
 from ddqn_planner.planning.pose_paths import SAME, Way
-from ddqn_planner.planning.pose_world import SHIFT, TILE, Body, State, World
+from ddqn_planner.planning.pose_world import SHIFT, TILE, State, World
 
 NO_RESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)  # not in all versions of Python
 HEAP = 2**18  # entries that a heap has room for, at least
@@ -41,23 +43,20 @@ class PoseField:
     # else the start's is. So the least cost of one of these, plus what is left from there at least,
     # is a lower bound, which proves how good the start's cost is.
 
-    def __init__(self, goals: NDArray[np.int64], grid: GridMap, world: World, body: Body) -> None:
-        self.goals = goals  # (N, 3): x, y, heading
-        self.body, self._aim, self.visits = body, NOWHERE, 0
+    def __init__(
+        self, goals: NDArray[np.int64], grid: GridMap, world: World, aim: Aim = NOWHERE
+    ) -> None:
+        self.goals, self.grid, self.world = goals, grid, world  # (N, 3): x, y, heading
         self.way: Way | None = None  # the last path that followed it
-        self._begin(grid, world)
-
-    def _begin(self, grid: GridMap, world: World) -> None:
-        """Know nothing but the goals."""
-        self.grid, self.world, tiles = grid, world, world.tile.size
-        states, touched = tiles << kernels.TILE_BITS, np.zeros(tiles, np.bool_)
-        self.known = Known(_untouched(states, np.float32), _untouched(states, np.uint8), touched)
-        x, y, heading = self.goals.T
+        self.visits, tiles = 0, world.tile.size
+        self._aim, self._heap, self._least = aim._replace(number=-1), heap_of(0), math.inf
+        states = tiles << kernels.TILE_BITS
+        self._distance, self._mark = _untouched(states, np.float32), _untouched(states, np.uint8)
+        self._touched = np.zeros(tiles, np.bool_)
+        x, y, heading = goals.T
         numbers = kernels.number_of(x, y, heading, world)
-        self.known.mark[numbers] = kernels.OPEN
-        touched[numbers >> kernels.TILE_BITS] = True
-        self._aim, self._heap = self._aim._replace(number=-1), heap_of(0)
-        self._size, self._least = 0, math.inf
+        self._mark[numbers] = kernels.OPEN
+        self._touched[numbers >> kernels.TILE_BITS] = True
 
     def reach(self, start: State, bound: float, limit: int) -> float | None:
         """Grow until the cost from a start is known within a bound, or known not to exist.
@@ -76,17 +75,15 @@ class PoseField:
             # Tiles of half the size take 4 times as long, and show that narrower gaps are closed.
             # Once a path is known, they hardly prove more.
             shift = self._aim.shift - 1
-            if self.visits >= UNGUIDED << 3 * (SHIFT - shift) and (
-                shift == SHIFT or (shift >= FINEST and proved == math.inf)
-            ):
+            pays = self.visits >= UNGUIDED << 3 * (SHIFT - shift)
+            if pays and (shift == SHIFT or (shift >= FINEST and proved == math.inf)):
                 if proved == math.inf and not self._can_leave():
                     return math.inf
                 self._look_at_map(shift)
                 self._order(self._aim.weight)
                 continue
             share, most = 1.0 if self._aim.weight > 1 else 1 / bound, min(limit, UNGUIDED)
-            given = self._search, self._size, bound * self._least, share, most
-            self._size, visits, done = kernels.grow(*given)
+            visits, done = kernels.grow(self._search, bound * self._least, share, most)
             limit, self.visits = limit - visits, self.visits + visits
             if self._proved() > bound * SAME and visits < most:  # or else the heap is full
                 self._order(1.0 if done else self._aim.weight)
@@ -94,13 +91,14 @@ class PoseField:
 
     @property
     def _search(self) -> Search:
-        return Search(self.known, self._heap, self._aim, self.world, self.body)
+        of_states = self._distance, self._mark, self._touched
+        return Search(*of_states, self._heap, self._aim, self.world)
 
     def _cost(self) -> float:
         """Return the least cost that was found from the start, infinite before."""
         number = self._aim.number
-        is_known = number >= 0 and self.known.mark[number] != kernels.UNREACHED
-        return float(self.known.distance[number]) if is_known else math.inf
+        is_known = number >= 0 and self._mark[number] != kernels.UNREACHED
+        return float(self._distance[number]) if is_known else math.inf
 
     def _proved(self) -> float:
         """Return how many times the least cost that of the start may be."""
@@ -111,16 +109,15 @@ class PoseField:
 
     def _order(self, weight: float) -> None:
         """Begin a round: what is open or waits is ordered toward the start."""
-        tiles = np.flatnonzero(self.known.touched)
+        tiles = np.flatnonzero(self._touched)
         self._heap = heap_of((len(tiles) << kernels.TILE_BITS) + HEAP)
         self._aim = self._aim._replace(weight=weight)
-        self._size, self._least = kernels.order(self._search, tiles)
+        self._least = kernels.order(self._search, tiles)
 
     def _can_leave(self) -> bool:
         """Return whether primitives lead from the start to more than a few states."""
-        mark, queue = _untouched(self.known.mark.size, np.uint8), np.empty(UNGUIDED, np.int64)
-        given = self._aim.number, mark, queue, self.world, self.body
-        return bool(kernels.leads_to(*given) == len(queue))
+        mark, queue = _untouched(self._mark.size, np.uint8), np.empty(UNGUIDED, np.int64)
+        return kernels.leads_to(self._aim.number, mark, queue, self.world) == len(queue)
 
     def _look_at_map(self, shift: int) -> None:
         """Look at tiles of 2**shift cells of a side for what is left to the start."""
@@ -136,35 +133,37 @@ class PoseField:
         heap = heap_of(8 * left.size + 4)  # each corner opens its neighbours once
         kernels.look(self._search._replace(heap=heap), room, is_goal, box)
 
-    def rollout(self, start: State) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-        """Return the primitives from a start to a goal, and their costs; None without a way."""
-        number = int(kernels.number_of(*start, self.world))
-        if self.known.mark[number] == kernels.UNREACHED:
+    def rollout(self, start: State) -> NDArray[np.float64] | None:
+        """Return poses to a goal: x and y in cells, yaw, what is spent, (4, N); None if no way."""
+        number, body = int(kernels.number_of(*start, self.world)), self.world.body
+        if self._mark[number] == kernels.UNREACHED:
             return None
-        most = int(self.known.distance[number] / self.body.cost.min()) + 1
-        primitives, costs = np.empty(most, np.int64), np.empty(most)
-        count = kernels.follow(self._search, number, primitives, costs)
-        return primitives[:count], costs[:count]
+        most = int(self._distance[number] / body.cost.min()) + 1
+        way = np.empty((4, 1 + most * int(np.diff(body.first_pose).max())))
+        return way[:, : kernels.follow(self._search, number, most, way)]
 
-    def repair(self, grid: GridMap, world: World, cells: NDArray[np.int64], opens: bool) -> None:
-        """Hold for a map that differs in some cells (N, 2); begin anew where that is quicker."""
+    def repaired(
+        self, grid: GridMap, world: World, cells: NDArray[np.int64], opens: bool
+    ) -> PoseField:
+        """Return it for a map that differs in cells (N, 2), or a new one where that is quicker."""
         # `opens` tells whether a way may have got cheaper: what is left to the start, too. If not,
         # what is open is in order still, and nothing costs less than was known to be the least.
         self.grid, self.world, self.way, self.visits = grid, world, None, 0
-        touched, is_near = self.known.touched, np.zeros(world.tile.shape, np.bool_)
-        far = self.body.reach // TILE + 1
+        is_near = np.zeros(world.tile.shape, np.bool_)
+        far = world.body.reach // TILE + 1
         for x, y in set(zip(*(cells // TILE).T.tolist(), strict=True)):
             is_near[max(y - far, 0) : y + far + 1, max(x - far, 0) : x + far + 1] = True
-        near, tiles = np.flatnonzero(is_near.ravel() & touched), np.flatnonzero(touched)
-        cost = self._cost()
+        near, tiles = np.flatnonzero(is_near.ravel() & self._touched), np.flatnonzero(self._touched)
+        cost, room = self._cost(), len(tiles) << kernels.TILE_BITS
         self._least = min(self._least, cost)
-        if opens or self._size + (len(tiles) << kernels.TILE_BITS) > self._heap.keys.size:
+        if opens or self._heap.size[0] + room > self._heap.keys.size:
             self._aim = NOWHERE if opens else self._aim._replace(number=-1)
-            self._heap, self._size = heap_of(len(tiles) << kernels.TILE_BITS), 0
+            self._heap = heap_of(room)
         kept = LOST * cost if cost < math.inf else 0.0
-        lost, self._size = kernels.take_back(self._search, self._size, near, tiles, kept)
+        lost = kernels.take_back(self._search, near, tiles, kept)
         if lost < kept:
-            self._begin(grid, world)
-        elif opens:
-            mark = self.known.mark.reshape(world.tile.size, -1)
+            return PoseField(self.goals, grid, world, self._aim)
+        if opens:
+            mark = self._mark.reshape(world.tile.size, -1)
             mark[near] = np.minimum(mark[near], kernels.OPEN)
+        return self

@@ -8,17 +8,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place, inlined
 from ddqn_planner.grid.motions import HEADINGS
-from ddqn_planner.planning.pose_world import (
-    SHIFT,
-    TILE,
-    Body,
-    World,
-    cost_of,
-    is_far,
-    is_inside,
-    is_possible,
-    touches,
-)
+from ddqn_planner.planning.pose_world import SHIFT, TILE, World, cost_of, is_inside, is_possible
 
 # A state is a cell and one of 16 headings. Its number counts headings, then the cells of a tile of
 # 4 x 4, then tiles: so what a request visits lies on few pages of memory, 4 bytes a distance.
@@ -30,14 +20,6 @@ TILE_BITS: Final = HEADING_BITS + 2 * SHIFT
 UNREACHED, OPEN, WAITING, CLOSED = 0, 1, 2, 3
 
 
-class Known(NamedTuple):
-    """What a field knows, in memory that is not used before it is touched."""
-
-    distance: NDArray[np.float32]  # (N,): the least cost that was found, in cells
-    mark: NDArray[np.uint8]  # (N,)
-    touched: NDArray[np.bool_]  # (T,): whether a state of a tile was reached
-
-
 class Aim(NamedTuple):
     """Where a field grows to: a start, and what is left to it at least, from corners of tiles."""
 
@@ -47,6 +29,25 @@ class Aim(NamedTuple):
     weight: float  # times what is left, in the order in which states are visited
     left: NDArray[np.float32]  # (rows, columns) of corners, in cells; empty before a look at them
     shift: int  # those of tiles with 2**shift cells of a side
+
+
+class Heap(NamedTuple):
+    """Numbers of what is visited next: the one of the least key comes first."""
+
+    keys: NDArray[np.float32]
+    numbers: NDArray[np.int64]
+    size: NDArray[np.int64]  # (1,)
+
+
+class Search(NamedTuple):
+    """All that a field grows with, or is repaired with; N states in T tiles."""
+
+    distance: NDArray[np.float32]  # (N,): the least cost that was found, in cells
+    mark: NDArray[np.uint8]  # (N,)
+    touched: NDArray[np.bool_]  # (T,): whether a state of a tile was reached
+    heap: Heap
+    aim: Aim
+    world: World
 
 
 @inlined
@@ -68,31 +69,22 @@ def place_of(number: int, world: Any) -> tuple[int, int, int]:
 
 
 @inlined
-def after(x: int, y: int, primitive: int, world: Any, body: Any) -> int:
+def after(x: int, y: int, primitive: int, world: Any) -> int:
     """Return the number of the state to which a primitive leads; -1 outside the map."""
-    x, y = x + body.offset[primitive, 0], y + body.offset[primitive, 1]
-    return number_of(x, y, body.end[primitive], world) if is_inside(x, y, world) else -1
-
-
-# A heap: the entry of the least key comes first
-
-
-class Heap(NamedTuple):
-    """Room for entries."""
-
-    keys: NDArray[np.float32]
-    numbers: NDArray[np.int64]
+    x, y = x + world.body.offset[primitive, 0], y + world.body.offset[primitive, 1]
+    return number_of(x, y, world.body.end[primitive], world) if is_inside(x, y, world) else -1
 
 
 def heap_of(entries: int) -> Heap:
     """Return a heap with room for so many entries."""
-    return Heap(np.empty(entries, np.float32), np.empty(entries, np.int64))
+    return Heap(np.empty(entries, np.float32), np.empty(entries, np.int64), np.zeros(1, np.int64))
 
 
 @inlined
-def push(key: Any, number: int, heap: Heap, size: int) -> int:
-    """Add an entry; return the new size."""
-    place = size
+def push(key: Any, number: int, heap: Heap) -> None:
+    """Add an entry."""
+    place = heap.size[0]
+    heap.size[0] = place + 1
     while place > 0:
         parent = (place - 1) >> 2
         if heap.keys[parent] <= key:
@@ -100,14 +92,13 @@ def push(key: Any, number: int, heap: Heap, size: int) -> int:
         heap.keys[place], heap.numbers[place] = heap.keys[parent], heap.numbers[parent]
         place = parent
     heap.keys[place], heap.numbers[place] = key, number
-    return size + 1
 
 
 @inlined
-def pop(heap: Heap, size: int) -> int:
-    """Take the first entry away; return the new size."""
-    size -= 1
-    key, number, place = heap.keys[size], heap.numbers[size], 0
+def pop(heap: Heap) -> Any:
+    """Take the first entry away, and return its number."""
+    taken, size, place = heap.numbers[0], heap.size[0] - 1, 0
+    key, number, heap.size[0] = heap.keys[size], heap.numbers[size], size
     while True:
         least, first, best = place, 4 * place + 1, key
         for child in range(first, min(first + 4, size)):
@@ -118,20 +109,10 @@ def pop(heap: Heap, size: int) -> int:
         heap.keys[place], heap.numbers[place] = best, heap.numbers[least]
         place = least
     heap.keys[place], heap.numbers[place] = key, number
-    return size
+    return taken
 
 
 # The growth toward a start
-
-
-class Search(NamedTuple):
-    """All that a field grows with, or is repaired with."""
-
-    known: Known
-    heap: Heap
-    aim: Aim
-    world: World
-    body: Body
 
 
 @inlined
@@ -150,37 +131,33 @@ def way_left(x: int, y: int, aim: Any) -> float:
 
 
 @in_place
-def order(search: Search, tiles: NDArray[np.int64]) -> tuple[int, float]:
+def order(search: Search, tiles: NDArray[np.int64]) -> float:
     """Make a heap of all states in some tiles that are open or wait, ordered toward a start."""
-    # Returns how many there are, and a lower bound of what may still be found for the start.
-    known, aim, size, least = search.known, search.aim, 0, np.inf
+    # Returns a lower bound of what may still be found for the start.
+    aim, least = search.aim, np.inf
     for tile in tiles:
         for number in range(tile << TILE_BITS, (tile + 1) << TILE_BITS):
-            if OPEN <= known.mark[number] <= WAITING:
-                known.mark[number] = OPEN
+            if OPEN <= search.mark[number] <= WAITING:
+                search.mark[number] = OPEN
                 x, y, _ = place_of(number, search.world)
-                here, far = known.distance[number], way_left(x, y, aim)
-                size = push(np.float32(here + aim.weight * far), number, search.heap, size)
+                here, far = search.distance[number], way_left(x, y, aim)
+                push(np.float32(here + aim.weight * far), number, search.heap)
                 least = min(least, here + far)
-    return size, least
+    return least
 
 
 @in_place
-def grow(
-    search: Search, size: int, enough: float, share: float, limit: int
-) -> tuple[int, int, bool]:
+def grow(search: Search, enough: float, share: float, limit: int) -> tuple[int, bool]:
     """Close states until a start's cost is enough, or a share of it comes next; see `PoseField`."""
-    # Returns the heap's size, the visits, and whether it is done.
-    known, heap, aim, world, body = search
-    distance, mark, target = known.distance, known.mark, aim.number
-    keys, most, visits = heap.keys, heap.keys.size - body.start.size, 0
-    while size > 0 and (
-        mark[target] == UNREACHED or max(enough, keys[0] / share) < distance[target]
+    # Returns the visits, and whether it is done.
+    distance, mark, _, heap, aim, world = search
+    body, size, target, visits = world.body, heap.size, aim.number, 0
+    while size[0] > 0 and (
+        mark[target] == UNREACHED or max(enough, heap.keys[0] / share) < distance[target]
     ):
-        if visits == limit or size > most:
-            return size, visits, False
-        number = heap.numbers[0]
-        size = pop(heap, size)
+        if visits == limit or size[0] > heap.keys.size - body.start.size:
+            return visits, False
+        number = pop(heap)
         if mark[number] != OPEN:
             continue
         mark[number] = CLOSED
@@ -195,9 +172,9 @@ def grow(
             before = number_of(column, line, body.start[primitive], world)
             if mark[before] != UNREACHED and here + body.cost[primitive] >= distance[before]:
                 continue
-            if not is_possible(column, line, primitive, world, body):
+            if not is_possible(column, line, primitive, world):
                 continue
-            found = here + cost_of(column, line, primitive, world, body)
+            found = here + cost_of(column, line, primitive, world)
             if found == np.inf or (mark[before] != UNREACHED and found >= distance[before]):
                 continue
             distance[before] = found
@@ -205,62 +182,65 @@ def grow(
                 mark[before] = WAITING
                 continue
             mark[before] = OPEN
-            known.touched[before >> TILE_BITS] = True
-            key = np.float32(found + aim.weight * way_left(column, line, aim))
-            size = push(key, before, heap, size)
-    return size, visits, True
+            search.touched[before >> TILE_BITS] = True
+            push(np.float32(found + aim.weight * way_left(column, line, aim)), before, heap)
+    return visits, True
 
 
 @inlined
-def next_best(
-    number: int, limit: Any, most: Any, known: Known, world: World, body: Body
-) -> tuple[Any, int]:
+def next_best(number: int, limit: Any, most: Any, search: Any) -> tuple[Any, int]:
     """Return the least cost by way of a state of less than a limit, and the primitive there."""
     # Only what costs at most so much counts; -1 if there is none.
+    world, body = search.world, search.world.body
     x, y, heading = place_of(number, world)
     best, chosen = most, -1
     for primitive in range(body.out[heading], body.out[heading + 1]):
-        end = after(x, y, primitive, world, body)
-        if end < 0 or known.mark[end] == UNREACHED or known.distance[end] >= limit:
+        end = after(x, y, primitive, world)
+        if end < 0 or search.mark[end] == UNREACHED or search.distance[end] >= limit:
             continue
-        beyond = known.distance[end]
-        if beyond + body.cost[primitive] <= best and is_possible(x, y, primitive, world, body):
-            found = beyond + cost_of(x, y, primitive, world, body)
+        beyond = search.distance[end]
+        if beyond + body.cost[primitive] <= best and is_possible(x, y, primitive, world):
+            found = beyond + cost_of(x, y, primitive, world)
             if found <= best:
                 best, chosen = found, primitive
     return best, chosen
 
 
 @in_place
-def follow(
-    search: Search, number: int, primitives: NDArray[np.int64], costs: NDArray[np.float64]
-) -> int:
-    """Write the greedy primitives from a state to the goal, and their costs; return their count."""
-    known, world, body, count = search.known, search.world, search.body, 0
-    while known.distance[number] > 0 and count < primitives.size:
-        here, most = known.distance[number], np.float32(np.inf)
-        _, chosen = next_best(number, here, most, known, world, body)
+def follow(search: Search, number: int, limit: int, way: NDArray[np.float64]) -> int:
+    """Write poses of greedy primitives from a state to the goal, and what was spent; count them."""
+    # x and y in cells, yaw, and the cost until there: (4, room for so many primitives).
+    world, body, count, total = search.world, search.world.body, 1, 0.0
+    x, y, heading = place_of(number, world)
+    way[0, 0], way[1, 0], way[2, 0], way[3, 0] = x, y, body.angle[heading], 0.0
+    for _ in range(limit):
+        if search.distance[number] == 0:
+            break
+        _, chosen = next_best(number, search.distance[number], np.float32(np.inf), search)
+        cost = np.float64(cost_of(x, y, chosen, world))
+        total += cost
+        for place in range(body.first_pose[chosen], body.first_pose[chosen + 1]):
+            way[0, count], way[1, count] = x + body.pose[place, 0], y + body.pose[place, 1]
+            way[2, count] = body.pose[place, 2]
+            way[3, count] = total - cost + body.pose[place, 3] * cost
+            count += 1
+        number = after(x, y, chosen, world)
         x, y, _ = place_of(number, world)
-        primitives[count], costs[count] = chosen, cost_of(x, y, chosen, world, body)
-        number = after(x, y, chosen, world, body)
-        count += 1
     return count
 
 
 @in_place
-def leads_to(
-    number: int, mark: NDArray[np.uint8], queue: NDArray[np.int64], world: World, body: Body
-) -> int:
+def leads_to(number: int, mark: NDArray[np.uint8], queue: NDArray[np.int64], world: World) -> int:
     """Return to how many states primitives lead from one, at most so many as the queue holds."""
     queue[0], mark[number], read, count = number, OPEN, 0, 1
     while read < count < queue.size:
         x, y, heading = place_of(queue[read], world)
         read += 1
-        for primitive in range(body.out[heading], body.out[heading + 1]):
-            end = after(x, y, primitive, world, body)
+        for primitive in range(world.body.out[heading], world.body.out[heading + 1]):
+            end = after(x, y, primitive, world)
             if end < 0 or mark[end] == OPEN or count == queue.size:
                 continue
-            if is_possible(x, y, primitive, world, body):
+            if is_possible(x, y, primitive, world):
                 queue[count], mark[end] = end, OPEN
                 count += 1
     return count
@@ -271,39 +251,38 @@ def leads_to(
 
 @in_place
 def take_back(
-    search: Search, size: int, near: NDArray[np.int64], tiles: NDArray[np.int64], kept: float
-) -> tuple[float, int]:
+    search: Search, near: NDArray[np.int64], tiles: NDArray[np.int64], kept: float
+) -> Any:
     """Take back what costs as much as a state in near tiles that lost its support, or more."""
     # What costs less is supported still. What is reached from there is open anew. Returns the least
-    # cost that lost its support, and the heap's size; if less is to be kept, it changes nothing.
-    known, heap, aim, world, body = search
+    # cost that lost its support; if less is to be kept, it changes nothing.
+    distance, mark, _, heap, aim, world = search
     limit = np.float32(np.inf)
     for tile in near:
         for number in range(tile << TILE_BITS, (tile + 1) << TILE_BITS):
-            here = known.distance[number]
-            if known.mark[number] != UNREACHED and 0 < here < limit:
-                _, chosen = next_best(number, here, here, known, world, body)
+            here = distance[number]
+            if mark[number] != UNREACHED and 0 < here < limit:
+                _, chosen = next_best(number, here, here, search)
                 limit = here if chosen < 0 else limit
     if limit < kept or limit == np.inf:
-        return limit, size
+        return limit
     # What costs more than a primitive beyond the limit is not reached from a closed state below it.
     last = limit if world.cost.size + world.slowness.size == 0 else np.float32(np.inf)
-    for cost in body.cost:
+    for cost in world.body.cost:
         last = max(last, limit + cost)
     for tile in tiles:
         for number in range(tile << TILE_BITS, (tile + 1) << TILE_BITS):
-            if known.mark[number] == UNREACHED or known.distance[number] < limit:
+            if mark[number] == UNREACHED or distance[number] < limit:
                 continue
             found = np.float32(np.inf)
-            if known.distance[number] <= last:
-                found, _ = next_best(number, limit, found, known, world, body)
-            known.mark[number] = OPEN if found < np.inf else UNREACHED
+            if distance[number] <= last:
+                found, _ = next_best(number, limit, found, search)
+            mark[number] = OPEN if found < np.inf else UNREACHED
             if found < np.inf:
-                known.distance[number] = found
+                distance[number] = found
                 x, y, _ = place_of(number, world)
-                key = np.float32(found + aim.weight * way_left(x, y, aim))
-                size = push(key, number, heap, size)
-    return limit, size
+                push(np.float32(found + aim.weight * way_left(x, y, aim)), number, heap)
+    return limit
 
 
 # A lower bound from the map. The robot's origin stays in tiles that it may pass. A shortest way in
@@ -317,33 +296,32 @@ ROOM, NO_ROOM = 1, 2  # what is known of a tile, once it was looked at
 
 
 @inlined
-def may_pass(x: int, y: int, world: Any, body: Any) -> bool:
+def may_pass(x: int, y: int, world: Any) -> bool:
     """Return whether the body stands in a cell, or moves its origin through it."""
+    body = world.body
     standing, core = body.start.size, body.start.size + HEADINGS
-    if is_far(x, y, world, body):
-        return True
-    for heading in range(0 if touches(x, y, core + HEADINGS, world, body) else HEADINGS):
-        if not touches(x, y, standing + heading, world, body):
+    for heading in range(HEADINGS if is_possible(x, y, core + HEADINGS, world) else 0):
+        if is_possible(x, y, standing + heading, world):
             return True
-        if touches(x, y, core + heading, world, body):
+        if not is_possible(x, y, core + heading, world):
             continue
         for primitive in range(body.out[heading], body.out[heading + 1]):
             for place in range(body.first_passed[primitive], body.first_passed[primitive + 1]):
                 column, line = x - body.passed[place, 0], y - body.passed[place, 1]
                 inside = is_inside(column, line, world)
-                if inside and is_possible(column, line, primitive, world, body):
+                if inside and is_possible(column, line, primitive, world):
                     return True
     return False
 
 
 @inlined
-def has_room(row: int, column: int, shift: int, room: Any, world: Any, body: Any) -> bool:
+def has_room(row: int, column: int, shift: int, room: Any, world: Any) -> bool:
     """Return whether the origin may pass a tile; looks once."""
     if room[row, column] == 0:
         room[row, column] = NO_ROOM
         for y in range(row << shift, min((row + 1) << shift, world.height)):
             for x in range(column << shift, min((column + 1) << shift, world.width)):
-                if room[row, column] == NO_ROOM and may_pass(x, y, world, body):
+                if room[row, column] == NO_ROOM and may_pass(x, y, world):
                     room[row, column] = ROOM
     return bool(room[row, column] == ROOM)
 
@@ -366,17 +344,16 @@ def look(
 ) -> None:
     """Write to an aim what is left from corners of tiles, infinite where no way leads."""
     # By A*, to the nearest goal and as much further: what is not on the way there is left out.
-    _, heap, aim, world, body = search
+    heap, aim, world = search.heap, search.aim, search.world
     left, (rows, columns) = aim.left, room.shape
-    size, end, limit = 0, np.float32(0), np.inf
+    end, limit = np.float32(0), np.inf
     left[:] = np.inf
     for y in range(aim.y >> aim.shift, (aim.y >> aim.shift) + 2):
         for x in range(aim.x >> aim.shift, (aim.x >> aim.shift) + 2):
             left[y, x] = 0
-            size = push(np.float32(way_to_box(x, y, box)), y * (columns + 1) + x, heap, size)
-    while size > 0 and heap.keys[0] <= limit:
-        end, number = heap.keys[0], heap.numbers[0]
-        size = pop(heap, size)
+            push(np.float32(way_to_box(x, y, box)), y * (columns + 1) + x, heap)
+    while heap.size[0] > 0 and heap.keys[0] <= limit:
+        end, number = heap.keys[0], pop(heap)
         y = number // (columns + 1)
         x = number - y * (columns + 1)
         here = left[y, x]
@@ -391,13 +368,13 @@ def look(
                     up, over = row + (corner >> 1), column + (corner & 1)
                     cost = here + steps(abs(over - x), abs(up - y))
                     is_less = cost < left[up, over]
-                    if is_less and has_room(row, column, aim.shift, room, world, body):
+                    if is_less and has_room(row, column, aim.shift, room, world):
                         left[up, over] = cost
                         key = np.float32(cost + way_to_box(over, up, box))
-                        size = push(key, up * (columns + 1) + over, heap, size)
+                        push(key, up * (columns + 1) + over, heap)
     for y in range(rows + 1):
         for x in range(columns + 1):
             # What was not reached is no nearer than where it ended.
-            least = end - way_to_box(x, y, box) if size > 0 else np.inf
+            least = end - way_to_box(x, y, box) if heap.size[0] > 0 else np.inf
             cost = min(left[y, x], least)
             left[y, x] = (cost / (STRAIGHT * LONGER) - math.sqrt(2.0)) * (1 << aim.shift)

@@ -26,7 +26,7 @@ Pose: TypeAlias = tuple[float, float, float]  # metres, metres, radians; in the 
 
 VISITS = 2**16  # states that a field visits in one step of a plan: some 30 ms
 KEPT: Final = 3  # fields, those used last
-TWO_NEAREST = 0.5  # radians: no yaw is farther from the two headings nearest to it
+SAME_END = 1.0, 0.5  # cells and radians: no yaw is farther from the two headings nearest to it
 # So near to its path, a robot keeps it even if there is none from the state nearest to its pose:
 # a controller has driven it a little aside, where the body of that state has no room.
 BESIDE_PATH = 1.0, 2 * math.pi / HEADINGS
@@ -67,10 +67,6 @@ class PosePlanner:
         self.motions, self.footprint = network.motions, network.footprint
         self.body = body_of(network.motions, network.swept())
         self.points = paths.points_of(self.footprint, self.motions.resolution)
-        # After its first pose, those of each primitive, and the share of its cost until there.
-        ways = [np.column_stack([way, np.linspace(0, 1, len(way))]) for way in self.motions.poses]
-        self._after = np.concatenate([way[1:] for way in ways])
-        self._counts = np.array([len(way) - 1 for way in ways])
         self._fields: dict[tuple[Any, ...], PoseField] = {}  # used last at the end
         self._map: tuple[GridMap, World] | None = None  # the last one
         self._differences = lru_cache(maxsize=1)(differences)
@@ -81,14 +77,14 @@ class PosePlanner:
         with self._lock:
             plan = self._rest_of_path(request)
         if plan is None:
-            plan = yield from self._find(request, time.perf_counter())
+            plan = yield from self._find(request)
         is_outside = plan.status in (PlanStatus.START_OUTSIDE_MAP, PlanStatus.GOAL_OUTSIDE_MAP)
         has_path = len(request.under_way) > 0 and not is_outside
         yield self._keep_or_switch(request, plan) if has_path else plan
 
-    def _find(self, request: PoseRequest, began: float) -> Generator[None, None, PosePlan]:
+    def _find(self, request: PoseRequest) -> Generator[None, None, PosePlan]:
         """Return a new plan, after None before each slow step."""
-        grid = request.grid
+        grid, began = request.grid, time.perf_counter()
         self._check(grid)
         is_start_inside, *inside = (grid.contains(cell) for cell in request.cells)
         if not any(inside):
@@ -130,7 +126,8 @@ class PosePlanner:
         has_plan, grid = plan.poses.size > 0, request.grid
         reach = paths.REACH if has_plan else BESIDE_PATH
         rest = self.rest_of(request.under_way, request.start, grid, reach)
-        if not any(_meets(rest[-1:], end, grid) for end in (*plan.poses[-1:], *request.goals)):
+        ends = np.array([*plan.poses[-1:], *request.goals])
+        if not len(rest) or paths.nearest_pose(ends, rest[-1], grid, SAME_END) < 0:
             return plan
         cost, new = (paths.cost_of_poses(way, grid) for way in (rest, plan.poses))
         if has_plan and cost > (1 + request.switch_threshold) * new * SAME_COST:
@@ -156,7 +153,7 @@ class PosePlanner:
         apart = np.abs(turn_between(self.motions.angles, pose[2] - grid.origin[2]))
         cell = grid.world_to_cell(*pose[:2])
         states = np.array([(*cell, heading) for heading in np.argsort(apart, kind="stable")[:2]])
-        return states[: min(standing(states, world, self.body), 1)]
+        return states[: min(standing(states, world), 1)]
 
     def _around(self, request: PoseRequest, start: State, world: World) -> NDArray[np.int64]:
         """Return the states (N, 3) within the tolerance of the goal at which a path may end."""
@@ -169,17 +166,15 @@ class PosePlanner:
             return np.array([start])
         columns, rows = np.arange(grid.width) - column, np.arange(grid.height) - line
         columns, rows = columns[abs(columns) <= far], rows[abs(rows) <= far]
-        apart, found = np.hypot(columns, rows[:, None]), []
+        nearer, apart = np.where(is_meant, -1.0, far), np.hypot(columns, rows[:, None])
         for heading in np.flatnonzero(is_meant):
             into = self.motions.end == heading
-            is_end = apart <= far
             if is_meant[self.motions.start[into]].all():
                 # A path ends where it first may: it comes to what is further inside from such.
-                is_end &= apart > far - np.hypot(*self.motions.offset[into].T).max()
-            row, place = np.nonzero(is_end)
-            found.append(np.column_stack([columns[place], rows[row], np.full(len(row), heading)]))
-        states: NDArray[np.int64] = np.concatenate(found) + np.array([column, line, 0])
-        return states[: standing(states, world, self.body)]
+                nearer[heading] = far - np.hypot(*self.motions.offset[into].T).max()
+        end, row, place = np.nonzero((nearer[:, None, None] < apart) & (apart <= far))
+        states = np.column_stack([column + columns[place], line + rows[row], end])
+        return states[: standing(states, world)]
 
     def _rest_of_path(self, request: PoseRequest) -> PosePlan | None:
         """Return the rest of the path that was planned last, if the start lies on it."""
@@ -199,20 +194,18 @@ class PosePlanner:
         """Return a map for kernels, from the last one where that is quicker."""
         found = self._differences(self._map[0], grid) if self._map else None
         older = (self._map[1], found[0]) if self._map and found else ()
-        self._map = grid, world_of(grid, *older)
+        self._map = grid, world_of(grid, self.body, *older)
         return self._map[1]
 
     def _field(self, request: PoseRequest, states: NDArray[np.int64]) -> PoseField:
         """Return a field toward some states: as it is, repaired, or new."""
         grid, asked = request.grid, (request.goals, request.tolerance, states.tobytes())
         field = self._fields.pop(asked, None)
-        if field is not None and field.grid is not grid:
-            found = self._differences(field.grid, grid)
-            if found is None:
-                field = None
-            else:
-                field.repair(grid, self._world(grid), *found)
-        field = field or PoseField(states, grid, self._world(grid), self.body)
+        if field is None or field.grid is not grid:
+            found = self._differences(field.grid, grid) if field else None
+            world = self._world(grid)
+            kept = field.repaired(grid, world, *found) if field and found else None
+            field = kept or PoseField(states, grid, world)
         self._fields = dict([*self._fields.items(), (asked, field)][-KEPT:])
         return field
 
@@ -220,6 +213,7 @@ class PosePlanner:
         self, request: PoseRequest, states: NDArray[np.int64], start: State, began: float
     ) -> PosePlan | None:
         """Grow the field by a step; return the path from the start if it is known then."""
+        grid = request.grid
         with self._lock:  # between two steps another request may use the field
             field = self._field(request, states)
             bound = field.reach(start, request.bound, VISITS)
@@ -229,36 +223,9 @@ class PosePlanner:
             field_ms, found = 1e3 * (grown - began), field.rollout(start)
             if found is None:
                 return PosePlan(PlanStatus.NO_PATH, field_ms=field_ms)
-            field.way = self._way(request.grid, start, bound, *found)
-            plan = field.way.plan(0, request.grid)
+            x, y, yaw, spent = found
+            poses = np.column_stack([*grid.centres(x, y), turn_between(0, yaw + grid.origin[2])])
+            cells = paths.cells_of(np.column_stack([x, y]))
+            field.way = paths.Way(poses, cells, spent.copy(), float(spent[-1]) / bound)
+            plan = field.way.plan(0, grid)
         return replace(plan, field_ms=field_ms, rollout_ms=1e3 * (time.perf_counter() - grown))
-
-    def _way(
-        self,
-        grid: GridMap,
-        start: State,
-        bound: float,
-        primitives: NDArray[np.int64],
-        costs: NDArray[np.float64],
-    ) -> paths.Way:
-        """Return the poses of primitives from a start, and what is spent before each."""
-        counts, offset = self._counts[primitives], self.motions.offset[primitives]
-        number, end = np.repeat(np.arange(len(counts)), counts), np.cumsum(counts)
-        skipped = np.cumsum(self._counts)[primitives] - end
-        begins = np.cumsum(offset, axis=0) - offset + start[:2]
-        before = np.column_stack([begins, np.cumsum(costs) - costs, costs])
-        poses = self._after.take(np.arange(len(number)) + skipped[number], axis=0)
-        (x, y, yaw, share), (over, up, spent, cost) = poses.T, before.take(number, axis=0).T
-        begin = *start[:2], self.motions.angles[start[2]], 0.0
-        way = zip(begin, (x + over, y + up, yaw, spent + share * cost), strict=True)
-        x, y, yaw, spent = (np.append(first, others) for first, others in way)
-        poses = np.column_stack([*grid.centres(x, y), turn_between(0, yaw + grid.origin[2])])
-        cells = paths.cells_of(np.column_stack([x, y]))
-        return paths.Way(poses, cells, spent, float(costs.sum()) / bound)
-
-
-def _meets(ends: NDArray[np.float64], pose: Any, grid: GridMap) -> bool:
-    """Return whether a path ends at a pose, as far as states do."""
-    x, y, yaw = np.abs(ends - pose).T
-    near = np.hypot(x, y) <= grid.resolution, np.abs(turn_between(0, yaw)) <= TWO_NEAREST
-    return bool(np.all(near)) and len(ends) > 0

@@ -3,10 +3,10 @@
 from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place, inlined
-from ddqn_planner.grid import GridMap
+from ddqn_planner.grid import GridMap, MoveRule
 from ddqn_planner.grid.arguments import OCCUPIED
 from ddqn_planner.grid.copies import Box
 from ddqn_planner.grid.grid_map import MULTIPLIERS
@@ -18,7 +18,6 @@ from ddqn_planner.planning.segments import ACTIONS
 SHIFT: Final = 2  # so many bits tell where in its tile a cell lies, along a side
 TILE: Final = 1 << SHIFT  # cells of a side
 BORDER: Final = 128  # occupied cells around the map, so that a body sweeps none beyond the bits
-PER_COST: Final = np.append(MULTIPLIERS, MULTIPLIERS[-1:])  # of costs 0 to 100 and, last, unknown
 State: TypeAlias = tuple[int, int, int]  # x, y, heading
 FINE = 0.01  # cells between two points of the origin's way, which tell the cells that it passes
 WORD, LAST_BIT, ONE, FULL = np.uint64(64), np.uint64(63), np.uint64(1), np.uint64(2**64 - 1)
@@ -44,21 +43,25 @@ class Body(NamedTuple):
     passed: NDArray[np.int64]  # (C, 4): x, y, how the origin leaves the cell, and moves in it
     share: NDArray[np.float32]  # (C,): which part of the cost counts in this cell
     first_passed: NDArray[np.int64]  # (P + 1,)
+    pose: NDArray[np.float64]  # (N, 4): all but the first of each, and its share of the cost
+    first_pose: NDArray[np.int64]  # (P + 1,)
+    angle: NDArray[np.float64]  # (16,)
     reach: int  # cells that a primitive sweeps to any side of its begin or end, at most
 
 
 class World(NamedTuple):
-    """A map as kernels use it; empty arrays for layers that it does not have."""
+    """A body on a map as kernels use it; empty arrays for layers that the map does not have."""
 
+    body: Body
     bits: NDArray[np.uint64]  # (rows, words): a bit for each occupied cell, with the border
-    cost: NDArray[np.int8]  # (H, W)
-    slowness: NDArray[np.float32]  # (H, W)
-    forbidden: NDArray[np.uint8]  # (H, W)
-    uphill: NDArray[np.uint8]  # (H, W)
     tile: NDArray[np.uint8]  # by tile: whether the body can reach an occupied cell, once known
     room: NDArray[np.uint8]  # by tile: whether the body may pass one of its cells, likewise
     height: int
     width: int
+    forbidden: NDArray[np.uint8]  # (H, W)
+    cost: NDArray[np.int8]  # (H, W)
+    slowness: NDArray[np.float32]  # (H, W)
+    uphill: NDArray[np.uint8]  # (H, W)
 
 
 def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
@@ -81,6 +84,7 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
     parts = [rows_of(masks) for masks in (swept, standing, core, core.all(axis=0)[None], around)]
     row, bits, counts = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     ending = np.argsort(end, kind="stable")
+    ways = [np.column_stack([way, np.linspace(0, 1, len(way))])[1:] for way in motions.poses]
     return Body(
         into=np.searchsorted(end[ending], headings),
         ending=ending,
@@ -95,6 +99,9 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
         passed=np.concatenate([cells for cells, _ in passed]),
         share=np.concatenate([share for _, share in passed]).astype(np.float32),
         first_passed=np.cumsum([0, *(len(share) for _, share in passed)]),
+        pose=np.concatenate(ways),
+        first_pose=np.cumsum([0, *map(len, ways)]),
+        angle=motions.angles,
         reach=reach,
     )
 
@@ -136,28 +143,20 @@ def body_costs(grid: GridMap) -> NDArray[np.int8] | None:
     if grid.cost is None or grid.obstacles is None:
         return grid.cost
     costs: NDArray[np.int8] = grid.cost + np.int8(OCCUPIED) * grid.occupancy  # there it is 0
+    costs.flags.writeable = False  # as all layers: for others numba compiles the kernels again
     return costs
 
 
-def _layer(layer: NDArray[Any] | None, dtype: DTypeLike) -> NDArray[Any]:
-    """Return a layer, or an empty one, read-only: for others numba compiles the kernels again."""
-    array = np.empty((0, 0), dtype) if layer is None else layer.view()
-    array.flags.writeable = False
-    return array
-
-
-def world_of(
-    grid: GridMap, older: World | None = None, cells: NDArray[np.int64] | None = None
-) -> World:
+def world_of(grid: GridMap, body: Body, older: World | None = None, cells: Any = None) -> World:
     """Return a map for kernels: from scratch, or from an older one that differs in cells (N, 2)."""
     occupied = occupied_for_body(grid)
     height, width = occupied.shape
-    if older is not None and cells is not None and not len(cells):
-        return older
-    if older is None or cells is None:
+    if older is None:
         bits = np.full((height + 2 * BORDER, (width + 2 * BORDER + 63) // 64 + 1), FULL)
         tile, room = np.zeros((2, -(-height // TILE), -(-width // TILE)), dtype=np.uint8)
         (left, bottom), (right, top) = (0, 0), (width, height)
+    elif not len(cells):
+        return older
     else:
         bits, tile, room = older.bits.copy(), older.tile.copy(), older.room.copy()
         (left, bottom), (right, top) = cells.min(axis=0), cells.max(axis=0) + 1
@@ -167,17 +166,10 @@ def world_of(
     line = np.ones((top - bottom, 64 * bits.shape[1]), dtype=np.bool_)
     line[:, BORDER : BORDER + width] = occupied[bottom:top]
     bits[BORDER + bottom : BORDER + top] = np.packbits(line, axis=1, bitorder="little").view("<u8")
-    return World(
-        bits,
-        _layer(body_costs(grid), np.int8),
-        _layer(grid.slowness, np.float32),
-        _layer(grid.forbidden, np.uint8),
-        _layer(grid.uphill, np.uint8),
-        tile,
-        room,
-        height,
-        width,
-    )
+    _, *layers, _, _ = grid.for_kernels(MoveRule.ROBOT_SAFE)
+    if (costs := body_costs(grid)) is not None:
+        layers[1] = costs
+    return World(body, bits, tile, room, height, width, *layers)
 
 
 def differences(old: GridMap, new: GridMap) -> tuple[NDArray[np.int64], bool] | None:
@@ -195,8 +187,9 @@ def differences(old: GridMap, new: GridMap) -> tuple[NDArray[np.int64], bool] | 
 
 
 @inlined
-def touches(x: int, y: int, mask: int, world: Any, body: Any) -> bool:
+def touches(x: int, y: int, mask: int, world: Any) -> bool:
     """Return whether an occupied cell lies in a mask around a cell."""
+    body = world.body
     for number in range(body.first[mask], body.first[mask + 1]):
         column = np.uint64(x + body.row[number, 1] + BORDER)
         line, word, place = y + body.row[number, 0] + BORDER, column // WORD, column & LAST_BIT
@@ -215,58 +208,51 @@ def is_inside(x: int, y: int, world: Any) -> bool:
 
 
 @inlined
-def is_far(x: int, y: int, world: Any, body: Any) -> bool:
+def is_far(x: int, y: int, world: Any) -> bool:
     """Return whether no occupied cell is within reach of a tile; looks at most once."""
     row, column = y >> SHIFT, x >> SHIFT
     if world.tile[row, column] == 0:
         x, y = (x & -TILE) + TILE // 2, (y & -TILE) + TILE // 2
-        world.tile[row, column] = 2 if touches(x, y, body.first.size - 2, world, body) else 1
+        world.tile[row, column] = 2 if touches(x, y, world.body.first.size - 2, world) else 1
     return bool(world.tile[row, column] == 1)
 
 
 @inlined
-def multiplier_in(x: int, y: int, world: Any) -> Any:
-    """Return what a cell of the origin's way costs per cell of its length."""
-    factor = np.float32(1)
-    if world.cost.size > 0:
-        factor = PER_COST[world.cost[y, x]]
-    if world.slowness.size > 0:
-        factor *= world.slowness[y, x]
-    return factor
-
-
-@inlined
-def cost_of(x: int, y: int, number: int, world: Any, body: Any) -> Any:
+def cost_of(x: int, y: int, number: int, world: Any) -> Any:
     """Return the cost of a primitive that the body has room for, infinite if it is forbidden."""
-    cost = body.cost[number]
+    body, total = world.body, np.float32(0)
     if world.cost.size + world.slowness.size + world.forbidden.size == 0:
-        return cost
-    total = np.float32(0)
+        return body.cost[number]
     for place in range(body.first_passed[number], body.first_passed[number + 1]):
         column, line = x + body.passed[place, 0], y + body.passed[place, 1]
-        part = body.share[place] * multiplier_in(column, line, world)
+        if world.forbidden.size > 0 and world.forbidden[line, column] >> body.passed[place, 2] & 1:
+            return np.float32(np.inf)
+        factor = np.float32(1)
+        if world.cost.size > 0:
+            factor = MULTIPLIERS[world.cost[line, column]]
+        if world.slowness.size > 0:
+            factor *= world.slowness[line, column]
+        part = body.share[place] * factor
         if world.uphill.size > 0:
             part *= UPHILL[world.uphill[line, column], body.passed[place, 3]]
         total += part
-        if world.forbidden.size > 0 and world.forbidden[line, column] >> body.passed[place, 2] & 1:
-            return np.float32(np.inf)
     # Rounded, the shares may be less than 1 together; what counts on the least cost relies on it.
-    return cost * max(total, np.float32(1))
+    return body.cost[number] * max(total, np.float32(1))
 
 
 @inlined
-def is_possible(x: int, y: int, mask: int, world: Any, body: Any) -> bool:
+def is_possible(x: int, y: int, mask: int, world: Any) -> bool:
     """Return whether the body can take a primitive from a cell, or has room for another mask."""
-    return is_far(x, y, world, body) or not touches(x, y, mask, world, body)
+    return is_far(x, y, world) or not touches(x, y, mask, world)
 
 
 @in_place
-def standing(states: NDArray[np.int64], world: World, body: Body) -> int:
+def standing(states: NDArray[np.int64], world: World) -> int:
     """Move the states (N, 3) at which the body has room to the front; return how many."""
     count = 0
     for place in range(len(states)):
         x, y, heading = states[place, 0], states[place, 1], states[place, 2]
-        if is_possible(x, y, body.start.size + heading, world, body):
+        if is_possible(x, y, world.body.start.size + heading, world):
             states[count, 0], states[count, 1], states[count, 2] = x, y, heading
             count += 1
     return count

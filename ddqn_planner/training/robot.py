@@ -42,17 +42,6 @@ CHECKED: Final = 100  # updates between two proofs
 MARGIN: Final = 0.02  # of the proof, with which the training ends
 
 
-def random_maps(
-    side: int, random: np.random.Generator
-) -> tuple[int, NDArray[np.int64], NDArray[np.int64]]:
-    """Draw maps with one obstacle, so it is known what was hit: width, goals (M,), obstacles."""
-    width = side + 5  # more than what the robot sees
-    count = max(4, min(16, 60_000 // width**2))  # fewer, if they are large
-    # Three cells are drawn, and two used: the draws belong to what one seed gives.
-    drawn = np.array([random.choice(width**2, 3, replace=False) for _ in range(count)])
-    return width, drawn[:, 1] * HEADINGS, np.column_stack(np.divmod(drawn[:, 2], width))
-
-
 class RobotTrainer:
     """Trains a `RobotNetwork` by Double DQN; the same arguments give the same network."""
 
@@ -81,7 +70,14 @@ class RobotTrainer:
         maps, *generators = map(np.random.default_rng, draws)
         self._initial, self._exploration, self._sampling = generators
         swept = self.network.swept_by_unit
-        self.width, self.goal_M, self.obstacle_M2 = random_maps(swept.shape[1], maps)
+
+        # Maps with one obstacle, so it is known what was hit. Three cells are drawn, and two used:
+        # the draws belong to what one seed gives.
+        self.width = width = swept.shape[1] + 5  # more than what the robot sees
+        count = max(4, min(16, 60_000 // width**2))  # fewer, if they are large
+        drawn = np.array([maps.choice(width**2, 3, replace=False) for _ in range(count)])
+        self.goal_M = drawn[:, 1] * HEADINGS
+        self.obstacle_M2 = np.column_stack(np.divmod(drawn[:, 2], width))
 
         of_heading = [np.flatnonzero(motions.start == heading) for heading in range(HEADINGS)]
         most = max(map(len, of_heading))
