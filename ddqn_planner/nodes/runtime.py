@@ -38,7 +38,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.service import Service
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
-from rclpy.task import Future
+from rclpy.task import Task
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
@@ -114,9 +114,7 @@ class BaseNode(Node):
         self._declared = parameters
         for parameter, declared in parameters.items():
             self.declare_parameter(parameter, declared.default, declared.descriptor())
-        result = self._check(self.get_parameters([*parameters]))
-        if not result.successful:
-            raise ParameterException("a parameter is invalid", result.reason)
+        self.check_parameters({name: self.value(name) for name in parameters})
         self.add_on_set_parameters_callback(self._check)
         for service in (SetParameters, SetParametersAtomically):
             self.answer_with(service, self._on_set_parameters)
@@ -246,35 +244,31 @@ class Worker:
     """Calls functions one after the other in a thread, for which no end of a process waits."""
 
     def __init__(self, node: Node) -> None:
-        # A future alone does not wake an executor in another thread.
+        # A task alone does not wake an executor in another thread.
         self._wake = node.create_guard_condition(lambda: None)
-        self._calls: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._calls: queue.SimpleQueue[Task | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
     def _work(self) -> None:
-        for future, function, arguments in iter(self._calls.get, None):
-            if not future.cancelled():
-                try:
-                    future.set_result(function(*arguments))
-                except Exception as error:
-                    future.set_exception(error)
-                with suppress(InvalidHandle):  # the node was destroyed meanwhile
-                    self._wake.trigger()
-            del future, function, arguments  # they hold a map
+        for task in iter(self._calls.get, None):
+            task()  # unless it was cancelled
+            with suppress(InvalidHandle):  # the node was destroyed meanwhile
+                self._wake.trigger()
+            del task  # it holds a map
 
-    def call(self, function: Callable[..., Any], *arguments: object) -> Future:
+    def call(self, function: Callable[..., Any], *arguments: object) -> Task:
         """Return the future of a call; it has the exception if the function raises one."""
-        self._calls.put((future := Future(), function, arguments))
-        return future
+        self._calls.put(task := Task(function, arguments))
+        return task
 
     async def run(self, function: Callable[..., Any], *arguments: object) -> Any:
         """Return the result of a call, which is left out if the caller gives it up before."""
-        future = self.call(function, *arguments)
+        task = self.call(function, *arguments)
         try:
-            return await future
+            return await task
         finally:
-            future.cancel()
+            task.cancel()
 
     def close(self) -> None:
         """Wait until all calls have ended; take no more."""
@@ -327,7 +321,7 @@ def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | 
         # A task, not a flag: the executor wakes and returns.
         _at_signals(lambda: executor.create_task(stopping.set))
         node = make_node()
-    except (NameValidationException, ParameterException, RuntimeError) as error:  # also ROS's own
+    except (NameValidationException, ParameterException, RuntimeError, ValueError) as error:
         get_logger("ddqn_planner").fatal(f"cannot start: {error}")
         rclpy.try_shutdown()
         return 1
@@ -350,9 +344,4 @@ def _at_signals(function: Callable[[], object]) -> None:
     signal.set_wakeup_fd(told, warn_on_full_buffer=False)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: None)
-
-    def wait() -> None:
-        os.read(heard, 1)
-        function()
-
-    threading.Thread(target=wait, daemon=True).start()
+    threading.Thread(target=lambda: os.read(heard, 1) and function(), daemon=True).start()
