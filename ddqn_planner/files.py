@@ -7,7 +7,7 @@ import os
 import re
 import reprlib
 import secrets
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -77,6 +77,7 @@ class WorkFolder:
             raise ValueError(f"{held}; give a new or empty folder")
         self.folder, self._after = folder, after
         self.save_error = ""  # why the last save failed; empty if it did not
+        self.on_saved: Callable[[Any], None] = lambda _: None  # hears of each save, whatever came
         self._open_files = ExitStack()
         with self.opening() as files:
             # The system closes the file, and so unlocks it, when the process ends.
@@ -107,6 +108,7 @@ class WorkFolder:
             reason = error.strerror or error  # no file name: it is often that of a temporary file
             remedy = f"make room or allow writing there: {self._after}"
             self.save_error = f"cannot save to {self.folder} ({reason}); {remedy}"
+        self.on_saved(self)
 
     def close(self) -> None:
         """Close the files and unlock the folder, without saving."""
