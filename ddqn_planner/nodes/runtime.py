@@ -16,13 +16,7 @@ from typing import Any, NamedTuple
 
 import rclpy
 from nav_msgs.msg import Odometry
-from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
-from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rcl_interfaces import msg, srv
 from rclpy.clock import Clock, JumpThreshold, TimeJump
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
@@ -74,17 +68,18 @@ class Declared(NamedTuple):
             return form.format(*self.allowed)
         return self.allowed if isinstance(self.allowed, str) else f"one of {self.allowed}"
 
-    def descriptor(self) -> ParameterDescriptor:
+    def descriptor(self) -> msg.ParameterDescriptor:
         """Return what ROS stores of it, and checks: a number's type and range."""
-        descriptor = ParameterDescriptor(description=self.description, read_only=self.read_only)
+        descriptor = msg.ParameterDescriptor(description=self.description, read_only=self.read_only)
         if not isinstance(self.allowed, tuple):
             descriptor.additional_constraints = self.limits
             return descriptor
         low, high = map(type(self.default), self.allowed)
+        ends = {"from_value": low, "to_value": high}
         if isinstance(self.default, int):
-            descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
+            descriptor.integer_range = [msg.IntegerRange(**ends)]
         else:
-            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+            descriptor.floating_point_range = [msg.FloatingPointRange(**ends)]
         return descriptor
 
     def check(self, name: str, value: Any) -> None:
@@ -116,7 +111,7 @@ class BaseNode(Node):
             self.declare_parameter(parameter, declared.default, declared.descriptor())
         self.check_parameters({name: self.value(name) for name in parameters})
         self.add_on_set_parameters_callback(self._check)
-        for service in (SetParameters, SetParametersAtomically):
+        for service in (srv.SetParameters, srv.SetParametersAtomically):
             self.answer_with(service, self._on_set_parameters)
 
     def _on_jump(self, jump: TimeJump) -> None:
@@ -126,12 +121,12 @@ class BaseNode(Node):
         for forget in self.after_jump_back:
             forget()
 
-    def _check(self, parameters: list[Parameter]) -> SetParametersResult:
+    def _check(self, parameters: list[Parameter]) -> msg.SetParametersResult:
         try:
             self.check_parameters({parameter.name: parameter.value for parameter in parameters})
         except (ValueError, OSError, RuntimeError, MemoryError) as error:
-            return SetParametersResult(successful=False, reason=str(error) or repr(error))
-        return SetParametersResult(successful=True)
+            return msg.SetParametersResult(successful=False, reason=str(error) or repr(error))
+        return msg.SetParametersResult(successful=True)
 
     def check_parameters(self, new: dict[str, Any]) -> None:
         """Check new values beyond their types and ranges; an error refuses them all."""
@@ -149,13 +144,13 @@ class BaseNode(Node):
 
     def _on_set_parameters(self, request: Any, response: Any) -> Any:
         """Set parameters one by one or together: rclpy's own answer to bad ones ends the node."""
-        if isinstance(response, SetParameters.Response):
+        if isinstance(response, srv.SetParameters.Response):
             response.results = [self._set(each) for each in request.parameters]
         else:
             response.result = self._set(*request.parameters)
         return response
 
-    def _set(self, *messages: Any) -> SetParametersResult:
+    def _set(self, *messages: Any) -> msg.SetParametersResult:
         reason = "a parameter has no name; give one"
         try:
             if all(each.name for each in messages):
@@ -165,7 +160,7 @@ class BaseNode(Node):
             reason = str(error)
         except ValueError as error:
             reason = f"{error}; give one of rcl_interfaces/msg/ParameterType"
-        return SetParametersResult(successful=False, reason=reason)
+        return msg.SetParametersResult(successful=False, reason=reason)
 
     def answer_with(self, service_type: Any, callback: Callable[..., Any]) -> None:
         """Answer the service of a type, which rclpy has created, with another callback."""

@@ -1,7 +1,7 @@
 """A training run: a trainer with a folder for its episodes, its checkpoint and its model."""
 
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 from ddqn_planner.files import WorkFolder, write_atomically
@@ -31,12 +31,12 @@ class TrainingRun(WorkFolder):
         super().__init__(Path(folder), MARKS, "training", "trains", after)
         self.model_path = self.folder / "model.safetensors"
         self.checkpoint_path = self.folder / CHECKPOINT
-        with self.opening() as files, _memory_with_remedy():
+        with self.opening(), _memory_with_remedy():
             self.trainer = Trainer(scenarios, move_rule, parameters, seed)
             if self.checkpoint_path.exists():
                 self.trainer.restore(self.checkpoint_path)
             self._record = open_record(self.folder / "episodes.csv", self.trainer.episodes)
-            files.enter_context(closing(self._record))
+            self.callback(self._record.close)
         first = self.saved_at = self.trainer.steps
         self.description = f"training in {self.folder} from step {first} to {parameters.steps}"
 
