@@ -284,10 +284,9 @@ def _run_training(options: Any, scenarios: Callable[[], Sequence[Scenario]]) -> 
     with TrainingRun(options.out, scenarios(), rule, parameters, options.seed) as run:
         trainer = run.trainer
         print(run.description)
-        signals: list[int] = []
-        # An exception could interrupt a step; a flag is read between two steps.
+        # An exception could interrupt a step; what is asked for is read between two steps.
         for number in (signal.SIGINT, signal.SIGTERM):
-            before = signal.signal(number, lambda number, _: signals.append(number))
+            before = signal.signal(number, lambda *_: run.asked.add("stop"))
             run.callback(signal.signal, number, before)
         # disable=None: no bar if the output is not a terminal.
         with tqdm(total=parameters.steps, initial=trainer.steps, disable=None) as bar:
@@ -296,10 +295,8 @@ def _run_training(options: Any, scenarios: Callable[[], Sequence[Scenario]]) -> 
                 for episode in finished:
                     figures = {"episode": episode.number, "average reward": episode.average_reward}
                     bar.set_postfix(figures, refresh=False)
-                if signals:
-                    run.try_to_save()
-                    print(f"stopped at step {trainer.steps}; run the same command to resume")
-                    break
+        if run.asked:
+            print(f"stopped at step {trainer.steps}; run the same command to resume")
     if run.save_error:
         raise OSError(run.save_error)
     print(f"{trainer.steps} steps, {trainer.episodes} episodes, saved {run.model_path}")

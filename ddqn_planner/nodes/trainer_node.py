@@ -78,7 +78,6 @@ class TrainerNode(BaseNode):
         self.episodes = self.create_publisher(Path, "~/episode", 10)
         self._poses: dict[str, PoseStamped] = {}
         self._run: TrainingRun | None = None
-        self._is_stopping = self._is_saving = False
         self._read_map_file()
         self.create_subscription(OccupancyGrid, "map", self._on_map, LATCHED)
         self._is_driving = self.value("learn_from") == "driving"
@@ -246,7 +245,6 @@ class TrainerNode(BaseNode):
         except Exception as error:  # the node must survive any error
             return self.fail("the training cannot start", error)
         self.state, self.error, self.save_error = "training", "", ""
-        self._is_stopping = self._is_saving = False
         self.refusals.refused.clear()
         self._run, self._run_map = run, place
         run.on_saved = self._tell_saved
@@ -271,16 +269,16 @@ class TrainerNode(BaseNode):
 
     def stop(self) -> tuple[bool, str]:
         """Stop the training, which saves."""
-        if self.state != "training":
+        if self._run is None or self.state != "training":
             return True, "no training was running"
-        self._is_stopping = True
+        self._run.asked.add("stop")
         return True, "the training saves and stops, and ~/start continues it"
 
     def save(self) -> tuple[bool, str]:
         """Save after the step that is under way."""
-        if self.state != "training":
+        if self._run is None or self.state != "training":
             return False, "no training is running; it was saved when it ended"
-        self._is_saving = True
+        self._run.asked.add("save")
         return True, "saving after this step; ~/model_saved or an error follows"
 
     def _train(self, run: TrainingRun, place: MapInFrame) -> None:
@@ -292,13 +290,7 @@ class TrainerNode(BaseNode):
                     is_due = episode.number % self.value("episode_interval") == 0
                     if is_due and self.replaying is None:
                         self.draw(place.frame, conversions.along(episode.cells, place.grid)[0])
-                is_stopping = self._is_stopping  # it may begin at any time
-                if is_stopping or self._is_saving:
-                    self._is_saving = False
-                    run.try_to_save()
-                if is_stopping:
-                    break
-            ends = "stopped" if self._is_stopping else "finished"
+            ends = "stopped" if "stop" in run.asked else "finished"
         except Exception as error:  # the node must survive any error
             ends = "failed"
             self.fail("the training failed, and ~/start continues from its checkpoint", error)
