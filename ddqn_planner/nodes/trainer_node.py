@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import fields
 from functools import partial
+from importlib import import_module
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Final
 
@@ -329,9 +329,7 @@ class TrainerNode(BaseNode):
 def import_training() -> None:
     """Import torch and the trainer."""
     with suppress(ImportError):  # without torch, ~/start says what is missing
-        torch = importlib.import_module("torch")
-        importlib.import_module("ddqn_planner.training.run")
-        torch.optim.Adam([torch.zeros(1)])  # the first optimiser imports for a second
+        import_module("ddqn_planner.training.run")
 
 
 main = partial(runtime.spin_until_shutdown, TrainerNode, PARAMETERS)
