@@ -71,11 +71,8 @@ class NodeProcess:
         return self.process.wait(TIMEOUT)
 
 
-RunNode = Callable[..., Any]
-
-
 @pytest.fixture(scope="session")
-def run_node(tmp_path_factory: pytest.TempPathFactory) -> RunNode:
+def run_node(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Any]:
     """Return a context manager that runs an executable, stops it by SIGINT and sees it exit."""
 
     @contextmanager
@@ -141,7 +138,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def planner(run_node: RunNode, model: Path) -> Iterator[Any]:
+def planner(run_node: Any, model: Path) -> Iterator[Any]:
     """A planner that test files share: `Robot.reset` gives it its parameters back."""
     parameters = {"model": str(model), "follow_trainer": True}
     with run_node("planner_node", parameters, namespace="/robot") as node:
@@ -160,7 +157,7 @@ def make_robot(make_client: Any, small_values: np.ndarray, model: Path) -> Calla
 
 
 @pytest.fixture(scope="module")
-def run_robot(run_node: RunNode, make_robot: Any, small_values: np.ndarray) -> Callable[..., Any]:
+def run_robot(run_node: Any, make_robot: Any, small_values: np.ndarray) -> Callable[..., Any]:
     """Return a context manager that runs a planner in a namespace, and gives its user."""
 
     @contextmanager
