@@ -9,7 +9,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -281,15 +281,13 @@ def _run_training(options: Any, scenarios: Callable[[], Sequence[Scenario]]) -> 
     torch.set_num_threads(1)  # as fast as two for such small networks, and always the same result
     values = {entry.name: getattr(options, entry.name) for entry in fields(HyperParameters)}
     parameters, rule = HyperParameters(**values), api.MoveRule(options.move_rule)
-    with ExitStack() as stack:
-        run = TrainingRun(options.out, scenarios(), rule, parameters, options.seed)
-        trainer = stack.enter_context(closing(run)).trainer
+    with TrainingRun(options.out, scenarios(), rule, parameters, options.seed) as run:
+        trainer = run.trainer
         print(run.description)
-        signals: list[int] = []
-        # An exception could interrupt a step; a flag is read between two steps.
+        # An exception could interrupt a step; what is asked for is read between two steps.
         for number in (signal.SIGINT, signal.SIGTERM):
-            before = signal.signal(number, lambda number, _: signals.append(number))
-            stack.callback(signal.signal, number, before)
+            before = signal.signal(number, lambda *_: run.asked.add("stop"))
+            run.callback(signal.signal, number, before)
         # disable=None: no bar if the output is not a terminal.
         with tqdm(total=parameters.steps, initial=trainer.steps, disable=None) as bar:
             for finished in run.steps():
@@ -297,10 +295,8 @@ def _run_training(options: Any, scenarios: Callable[[], Sequence[Scenario]]) -> 
                 for episode in finished:
                     figures = {"episode": episode.number, "average reward": episode.average_reward}
                     bar.set_postfix(figures, refresh=False)
-                if signals:
-                    run.try_to_save()
-                    print(f"stopped at step {trainer.steps}; run the same command to resume")
-                    break
+        if run.asked:
+            print(f"stopped at step {trainer.steps}; run the same command to resume")
     if run.save_error:
         raise OSError(run.save_error)
     print(f"{trainer.steps} steps, {trainer.episodes} episodes, saved {run.model_path}")
@@ -354,7 +350,7 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     with ExitStack() as stack:
         for source in options.drives:
             if (source / RECORD).is_file():
-                stack.callback(WorkFolder(source, [LOCK, RECORD], "drives", "records").close)
+                stack.enter_context(WorkFolder(source, [LOCK, RECORD], "drives", "records"))
             how = options.topic, options.frame, options.robot_frame
             name, found = read_recording(source, grid, *how)
             print(f"{source}: {name}")

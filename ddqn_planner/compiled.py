@@ -54,10 +54,8 @@ def in_place(function: Function) -> Function:
 
 
 def inner(function: Function, **options: Any) -> Function:
-    """Let compiled functions call a function without its entry for Python, so they compile sooner.
-
-    For tuples of many arrays that entry is most of the code.
-    """
+    """Let compiled functions call it without its entry for Python, so that they compile sooner."""
+    # For tuples of many arrays that entry is most of the code.
     with_entry = compiled(function, **options)
     without = compiled(function, no_cpython_wrapper=True, **options)
     with_entry.dispatcher = without.dispatcher  # type: ignore[attr-defined]

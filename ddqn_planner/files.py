@@ -7,7 +7,7 @@ import os
 import re
 import reprlib
 import secrets
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -62,7 +62,7 @@ def differences(saved: Mapping[str, object], now: Mapping[str, object]) -> str:
     return ", ".join(f"{name} {value} (now {new})" for name, value, new in pairs if value != new)
 
 
-class WorkFolder:
+class WorkFolder(ExitStack):
     """A folder in which one process works until `close` or its end; a missing folder is made."""
 
     # A folder with one of the files `marks` is the right one; the first of them is the lock. The
@@ -75,12 +75,13 @@ class WorkFolder:
         if names and not any((folder / name).is_file() for name in marks):
             held = f"{folder} holds {reprlib.repr(names)} but no {content}"
             raise ValueError(f"{held}; give a new or empty folder")
+        super().__init__()
         self.folder, self._after = folder, after
         self.save_error = ""  # why the last save failed; empty if it did not
-        self._open_files = ExitStack()
-        with self.opening() as files:
+        self.on_saved: Callable[[Any], None] = lambda _: None  # hears of each save, whatever came
+        with self.opening():
             # The system closes the file, and so unlocks it, when the process ends.
-            file = files.enter_context((folder / marks[0]).open("ab"))
+            file = self.enter_context((folder / marks[0]).open("ab"))
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -91,11 +92,13 @@ class WorkFolder:
                     path.unlink()
 
     @contextmanager
-    def opening(self) -> Iterator[ExitStack]:
-        """Give what shall be closed with the folder; if the block fails, close all of it."""
-        with self._open_files as files:
-            yield files
-            self._open_files = files.pop_all()
+    def opening(self) -> Iterator[None]:
+        """Close what is open, and unlock the folder, if the block fails."""
+        try:
+            yield
+        except BaseException:
+            self.close()
+            raise
 
     @contextmanager
     def saving(self) -> Iterator[None]:
@@ -107,10 +110,7 @@ class WorkFolder:
             reason = error.strerror or error  # no file name: it is often that of a temporary file
             remedy = f"make room or allow writing there: {self._after}"
             self.save_error = f"cannot save to {self.folder} ({reason}); {remedy}"
-
-    def close(self) -> None:
-        """Close the files and unlock the folder, without saving."""
-        self._open_files.close()
+        self.on_saved(self)
 
 
 class Appender:

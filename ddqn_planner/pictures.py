@@ -26,10 +26,7 @@ ONE_WAY = 1e-9  # the mean direction of a cell that is not one-way is shorter
 
 
 def draw_text(grid: GridMap, cells: Sequence[Cell]) -> str:
-    """Return the map as text, y upwards: # occupied, . or an arrow free, * path, S and G ends.
-
-    A character of a wide map stands for a square of cells, and shows the last of `SIGNS` in it.
-    """
+    """Return the map as text, y upwards: # occupied, . or an arrow free, * path, S and G ends."""
     shown = np.where(grid.occupancy, SIGNS.index("#"), 0)
     if grid.forbidden is not None:
         x, y = _mean_directions(grid.forbidden)

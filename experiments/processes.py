@@ -9,7 +9,7 @@ import sysconfig
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 # A command after this hears SIGTERM when its parent ends, even if by SIGKILL, which tidies nothing.
 TIED = "setpriv", "--pdeathsig", "TERM"
@@ -56,14 +56,14 @@ def _signals_held_back() -> Iterator[None]:
 
 
 @contextmanager
-def running(*command: str) -> Iterator[subprocess.Popen[bytes]]:
+def running(*command: str, **options: Any) -> Iterator[subprocess.Popen[bytes]]:
     """Run a command; at the end ask it to stop. To be used in the main thread."""
     child = None
     try:
         # A signal inside Popen would lose the child that it has just begun.
         with _signals_held_back():
             # In a session of its own, it does not hear Ctrl-C: the parent does, and tidies up.
-            child = subprocess.Popen([*TIED, *command], start_new_session=True)
+            child = subprocess.Popen([*TIED, *command], start_new_session=True, **options)
         yield child
     finally:
         if child is not None:

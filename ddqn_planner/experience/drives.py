@@ -4,7 +4,6 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from enum import Enum
 from pathlib import Path
 from typing import NamedTuple
@@ -184,7 +183,7 @@ class DriveFolder(WorkFolder):
         super().__init__(Path(folder), [LOCK], "drives", "records", after)
         self.record_path, self.experience_path = self.folder / RECORD, self.folder / EXPERIENCE
         self.experience = Experience(nominal_speed, robot_width)
-        with self.opening() as files:
+        with self.opening():
             self.drives = _cut_incomplete_row(self.record_path)
             is_new = not self.experience_path.exists()
             if source := older if is_new else self.experience_path:
@@ -196,7 +195,8 @@ class DriveFolder(WorkFolder):
                         f"folder, or learn anew: ddqn-planner learn {folder} --map MAP"
                     )
                 self.experience = saved
-            self._record = files.enter_context(closing(Appender(self.record_path)))
+            self._record = Appender(self.record_path)
+            self.callback(self._record.close)
             if self.record_path.stat().st_size == 0:
                 self._record.append(HEADER)
             if is_new:  # learn anew from the drives that it holds

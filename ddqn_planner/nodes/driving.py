@@ -19,7 +19,7 @@ from rclpy.time import Time
 
 from ddqn_planner.experience.drives import DriveEnd, DriveFolder, DriveRecorder, read_drives
 from ddqn_planner.grid import GridMap
-from ddqn_planner.nodes.conversions import occupancy_message, path_bytes
+from ddqn_planner.nodes.conversions import occupancy_message
 from ddqn_planner.nodes.poses import Frames, listen
 from ddqn_planner.nodes.runtime import LATCHED, STEADY
 from ddqn_planner.resources import with_remedy
@@ -150,12 +150,7 @@ class Driving:
         self._values["last drive"] = last
         self._node.get_logger().info(f"drive {last}")
         if self._node.replaying is None:
-            self.draw(place, positions)
-        self._tell_saved(folder)
-
-    def _save(self, folder: DriveFolder) -> None:
-        folder.try_to_save()
-        self._tell_saved(folder)
+            self._node.draw(place.frame, positions)
 
     def _tell_saved(self, folder: DriveFolder) -> None:
         self._shown = None
@@ -197,7 +192,7 @@ class Driving:
         evidence = folder.experience.evidence
         if folder is self._folder and len(evidence.table) >= known:  # else it was forgotten
             folder.experience.prior = prior
-            self._save(folder)
+            folder.try_to_save()
 
     def _show_slowness(self) -> None:
         place, folder = self._node.map, self._folder
@@ -225,10 +220,11 @@ class Driving:
             self._node.state, self._is_disk_full = "failed", isinstance(error, OSError)
             return self._node.fail("the recording cannot start", error)
         self._folder, self._node.state, self._node.error = folder, "recording", ""
+        folder.on_saved = self._tell_saved
         for robot in self._robots:
             robot.recorder.forget()
         self._node.get_logger().info(f"recording drives in {folder.folder}")
-        self._save(folder)
+        folder.try_to_save()
         return True, f"recording in {folder.folder} after drive {folder.drives}"
 
     def stop(self) -> tuple[bool, str]:
@@ -238,7 +234,7 @@ class Driving:
             return True, "no drives were being recorded"
         for robot in self._robots:
             robot.recorder.end(DriveEnd.STOPPED)
-        self._save(folder)
+        folder.try_to_save()
         if folder.save_error:
             return False, folder.save_error
         folder.close()
@@ -249,7 +245,7 @@ class Driving:
         """Save now."""
         if (folder := self._folder) is None:
             return False, NOT_RECORDING
-        self._save(folder)
+        folder.try_to_save()
         return not folder.save_error, folder.save_error or f"saved in {folder.folder}"
 
     def forget(self) -> tuple[bool, str]:
@@ -260,27 +256,20 @@ class Driving:
             kept = folder.forget()
         except OSError as error:
             return False, explained(error)
-        self._tell_saved(folder)
         name = folder.experience_path.name
         undo = f"to undo it, call ~/stop, rename that file to {name}, and call ~/start"
         done = f"forgot all but the drives. {kept} has what was known: {undo}"
         return not folder.save_error, folder.save_error or done
 
-    def recorded(self, file: Path) -> tuple[MapInFrame | None, Iterator[Float64]]:
-        """Return the drives of a file, and the map that they are on."""
+    def recorded(self, file: Path, place: MapInFrame) -> tuple[str, Iterator[Float64]]:
+        """Return the drives of a file, and the frame of their map."""
         # Of all poses a replay would take long.
-        return self._node.map, (drive.positions[::5] for drive in read_drives(file))
-
-    def draw(self, place: MapInFrame, positions: Float64) -> None:
-        """Publish a drive."""
-        yaw = np.arctan2(*np.diff(positions, axis=0).T[::-1])
-        yaw = np.append(yaw, yaw[-1] if len(yaw) else 0.0)
-        self._node.episodes.publish(path_bytes(positions, yaw, self._node.header(place.frame)))
+        return place.frame, (drive.positions[::5] for drive in read_drives(file))
 
     def look(self) -> dict[str, str]:
         """Try again what failed for a full disk, show what is learned, and tell of it."""
         if self._folder is not None and self._folder.save_error:
-            self._save(self._folder)
+            self._folder.try_to_save()
         elif self._node.state == "failed" and self._is_disk_full:
             self.start()
         self._show_slowness()

@@ -1,19 +1,17 @@
 """A node that a lifecycle manager, or the node itself, configures, activates, and stops."""
 
-from functools import partialmethod
 from typing import Any
 from uuid import uuid4
 
 from lifecycle_msgs.srv import ChangeState
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
-from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
+from rclpy.lifecycle import LifecycleNodeMixin
 from rclpy.timer import Timer
 
 from ddqn_planner.nodes.executor import KINDS
 from ddqn_planner.nodes.runtime import STEADY, BaseNode, Parameters
 
-SUCCESS = TransitionCallbackReturn.SUCCESS
 BEAT_PERIOD, BEAT_TIMEOUT = 0.5, 4.0  # seconds; the timeout as Nav2's lifecycle manager has it
 
 ENTITIES = {"publisher": "publishers", **KINDS}
@@ -27,11 +25,10 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         BaseNode.__init__(self, name, parameters)
         # Reentrant: the state can be asked for while a transition waits.
         LifecycleNodeMixin.__init__(self, callback_group=ReentrantCallbackGroup())
-        # rclpy's answer ends the process on a transition that the state does not have, and drops
-        # the exceptions of transitions. Here both are logged, and the answer is that it failed.
+        # rclpy's answer ends the process on a transition that the state does not have, and what its
+        # transitions call cannot say why they fail. Here both are logged, and it answers so.
         self.answer_with(ChangeState, self._on_change_state)
         self._is_changing = False
-        self._error: Exception | None = None
         self._beats: Timer | None = None
 
     @property
@@ -39,20 +36,25 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         """The name of the state: unconfigured, inactive, active or finalized."""
         return str(self._state_machine.current_state[1])
 
-    def start(self) -> None:
-        """Configure the node; it raises what that raises."""
-        if self.trigger_configure() is not SUCCESS and self._error is not None:
-            raise self._error
+    def change(self, label: str) -> None:
+        """Do a transition; if that raises an error, the state stays."""
+        try:
+            getattr(self, label)()
+        except Exception:
+            if label == "configure":
+                self.cleanup()
+            raise
+        getattr(self, f"trigger_{label}")()
 
     def destroy_node(self) -> None:
         """Free all that the node has, and destroy it, so that it leaves the graph at once."""
-        last_state = LifecycleState(self.state, 0)
+        last_state = self.state
         # First, as a lifecycle manager calls them when the bond breaks, and waits without end.
         self._state_machine.destroy_when_not_in_use()
         for service in [*self.services]:
             self.destroy_service(service)
         if self.context.ok():
-            self.on_shutdown(last_state)
+            self.shutdown(last_state)
         super().destroy_node()
 
     async def prepare(self, transition: str) -> bool:
@@ -87,31 +89,13 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         for server in servers:
             server.destroy()
 
-    def _attempt(self, what: str, state: LifecycleState) -> TransitionCallbackReturn:
-        try:
-            getattr(self, what)()
-        except Exception as error:
-            self._error = error
-            self.get_logger().error(f"{what} failed: {str(error) or repr(error)}")
-            if what == "configure":
-                self._attempt("cleanup", state)
-            return TransitionCallbackReturn.FAILURE
-        return SUCCESS
-
-    # rclpy calls these
-
-    on_configure = partialmethod(_attempt, "configure")
-    on_activate = partialmethod(_attempt, "activate")
-    on_deactivate = partialmethod(_attempt, "deactivate")
-    on_cleanup = partialmethod(_attempt, "cleanup")
-
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop the node and free all that it has, whatever its state is."""
-        if state.label == "active":
-            self.on_deactivate(state)
-        if state.label in ("active", "inactive"):
-            self.on_cleanup(state)
-        return SUCCESS
+    def shutdown(self, state: str = "") -> None:
+        """Stop the node and free all that it has, in a state or that of now."""
+        state = state or self.state
+        if state == "active":
+            self.deactivate()
+        if state in ("active", "inactive"):
+            self.cleanup()
 
     async def _on_change_state(self, request: Any, response: Any) -> Any:
         asked = request.transition
@@ -126,8 +110,9 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         self._is_changing = True
         try:
             if await self.prepare(label):
-                response.success = getattr(self, f"trigger_{label}")() is SUCCESS
-                if response.success and label == "activate":
+                self.change(label)
+                response.success = True
+                if label == "activate":
                     self._form_bond()
         except Exception as error:  # the node must survive
             self.get_logger().error(f"{label} failed: {str(error) or repr(error)}")

@@ -64,7 +64,7 @@ class PlannerNode(ManagedNode):
 
     def start(self) -> None:
         """Configure the node; what is asked before the model is loaded waits for it."""
-        super().start()
+        self.change("configure")
         self._refusal = None
         self._replan.trigger()
 
@@ -196,7 +196,7 @@ class PlannerNode(ManagedNode):
     async def _plan_for_active_goal(self) -> None:
         await self._model.first()
         if self._refusal is None and self.state == "inactive":
-            self.trigger_activate()
+            self.change("activate")
         active, goals = self._active, self._active.poses
         if not goals:
             return

@@ -16,13 +16,7 @@ from typing import Any, NamedTuple
 
 import rclpy
 from nav_msgs.msg import Odometry
-from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
-from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rcl_interfaces import msg, srv
 from rclpy.clock import Clock, JumpThreshold, TimeJump
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
@@ -38,7 +32,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.service import Service
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
-from rclpy.task import Future
+from rclpy.task import Task
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
@@ -74,17 +68,18 @@ class Declared(NamedTuple):
             return form.format(*self.allowed)
         return self.allowed if isinstance(self.allowed, str) else f"one of {self.allowed}"
 
-    def descriptor(self) -> ParameterDescriptor:
+    def descriptor(self) -> msg.ParameterDescriptor:
         """Return what ROS stores of it, and checks: a number's type and range."""
-        descriptor = ParameterDescriptor(description=self.description, read_only=self.read_only)
+        descriptor = msg.ParameterDescriptor(description=self.description, read_only=self.read_only)
         if not isinstance(self.allowed, tuple):
             descriptor.additional_constraints = self.limits
             return descriptor
         low, high = map(type(self.default), self.allowed)
+        ends = {"from_value": low, "to_value": high}
         if isinstance(self.default, int):
-            descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
+            descriptor.integer_range = [msg.IntegerRange(**ends)]
         else:
-            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+            descriptor.floating_point_range = [msg.FloatingPointRange(**ends)]
         return descriptor
 
     def check(self, name: str, value: Any) -> None:
@@ -114,11 +109,9 @@ class BaseNode(Node):
         self._declared = parameters
         for parameter, declared in parameters.items():
             self.declare_parameter(parameter, declared.default, declared.descriptor())
-        result = self._check(self.get_parameters([*parameters]))
-        if not result.successful:
-            raise ParameterException("a parameter is invalid", result.reason)
+        self.check_parameters({name: self.value(name) for name in parameters})
         self.add_on_set_parameters_callback(self._check)
-        for service in (SetParameters, SetParametersAtomically):
+        for service in (srv.SetParameters, srv.SetParametersAtomically):
             self.answer_with(service, self._on_set_parameters)
 
     def _on_jump(self, jump: TimeJump) -> None:
@@ -128,12 +121,12 @@ class BaseNode(Node):
         for forget in self.after_jump_back:
             forget()
 
-    def _check(self, parameters: list[Parameter]) -> SetParametersResult:
+    def _check(self, parameters: list[Parameter]) -> msg.SetParametersResult:
         try:
             self.check_parameters({parameter.name: parameter.value for parameter in parameters})
         except (ValueError, OSError, RuntimeError, MemoryError) as error:
-            return SetParametersResult(successful=False, reason=str(error) or repr(error))
-        return SetParametersResult(successful=True)
+            return msg.SetParametersResult(successful=False, reason=str(error) or repr(error))
+        return msg.SetParametersResult(successful=True)
 
     def check_parameters(self, new: dict[str, Any]) -> None:
         """Check new values beyond their types and ranges; an error refuses them all."""
@@ -151,13 +144,13 @@ class BaseNode(Node):
 
     def _on_set_parameters(self, request: Any, response: Any) -> Any:
         """Set parameters one by one or together: rclpy's own answer to bad ones ends the node."""
-        if isinstance(response, SetParameters.Response):
+        if isinstance(response, srv.SetParameters.Response):
             response.results = [self._set(each) for each in request.parameters]
         else:
             response.result = self._set(*request.parameters)
         return response
 
-    def _set(self, *messages: Any) -> SetParametersResult:
+    def _set(self, *messages: Any) -> msg.SetParametersResult:
         reason = "a parameter has no name; give one"
         try:
             if all(each.name for each in messages):
@@ -167,7 +160,7 @@ class BaseNode(Node):
             reason = str(error)
         except ValueError as error:
             reason = f"{error}; give one of rcl_interfaces/msg/ParameterType"
-        return SetParametersResult(successful=False, reason=reason)
+        return msg.SetParametersResult(successful=False, reason=reason)
 
     def answer_with(self, service_type: Any, callback: Callable[..., Any]) -> None:
         """Answer the service of a type, which rclpy has created, with another callback."""
@@ -246,35 +239,31 @@ class Worker:
     """Calls functions one after the other in a thread, for which no end of a process waits."""
 
     def __init__(self, node: Node) -> None:
-        # A future alone does not wake an executor in another thread.
+        # A task alone does not wake an executor in another thread.
         self._wake = node.create_guard_condition(lambda: None)
-        self._calls: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._calls: queue.SimpleQueue[Task | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
     def _work(self) -> None:
-        for future, function, arguments in iter(self._calls.get, None):
-            if not future.cancelled():
-                try:
-                    future.set_result(function(*arguments))
-                except Exception as error:
-                    future.set_exception(error)
-                with suppress(InvalidHandle):  # the node was destroyed meanwhile
-                    self._wake.trigger()
-            del future, function, arguments  # they hold a map
+        for task in iter(self._calls.get, None):
+            task()  # unless it was cancelled
+            with suppress(InvalidHandle):  # the node was destroyed meanwhile
+                self._wake.trigger()
+            del task  # it holds a map
 
-    def call(self, function: Callable[..., Any], *arguments: object) -> Future:
+    def call(self, function: Callable[..., Any], *arguments: object) -> Task:
         """Return the future of a call; it has the exception if the function raises one."""
-        self._calls.put((future := Future(), function, arguments))
-        return future
+        self._calls.put(task := Task(function, arguments))
+        return task
 
     async def run(self, function: Callable[..., Any], *arguments: object) -> Any:
         """Return the result of a call, which is left out if the caller gives it up before."""
-        future = self.call(function, *arguments)
+        task = self.call(function, *arguments)
         try:
-            return await future
+            return await task
         finally:
-            future.cancel()
+            task.cancel()
 
     def close(self) -> None:
         """Wait until all calls have ended; take no more."""
@@ -327,7 +316,7 @@ def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | 
         # A task, not a flag: the executor wakes and returns.
         _at_signals(lambda: executor.create_task(stopping.set))
         node = make_node()
-    except (NameValidationException, ParameterException, RuntimeError) as error:  # also ROS's own
+    except (NameValidationException, ParameterException, RuntimeError, ValueError) as error:
         get_logger("ddqn_planner").fatal(f"cannot start: {error}")
         rclpy.try_shutdown()
         return 1
@@ -350,9 +339,4 @@ def _at_signals(function: Callable[[], object]) -> None:
     signal.set_wakeup_fd(told, warn_on_full_buffer=False)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: None)
-
-    def wait() -> None:
-        os.read(heard, 1)
-        function()
-
-    threading.Thread(target=wait, daemon=True).start()
+    threading.Thread(target=lambda: os.read(heard, 1) and function(), daemon=True).start()

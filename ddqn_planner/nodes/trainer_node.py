@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import fields
 from functools import partial
+from importlib import import_module
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import PoseStamped, Quaternion
+from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import OccupancyGrid, Path
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.timer import Timer
@@ -19,7 +20,7 @@ from std_msgs.msg import Float32, Header, String, UInt8MultiArray
 
 from ddqn_planner.grid import Cell, MoveRule, read_map_file
 from ddqn_planner.nodes import conversions, runtime
-from ddqn_planner.nodes.driving import NO_MAP, Driving, MapInFrame, explained
+from ddqn_planner.nodes.driving import NO_MAP, Driving, Float64, MapInFrame, explained
 from ddqn_planner.nodes.parameters import MOVE_RULES, OF_MAPS
 from ddqn_planner.nodes.poses import check_source, listen
 from ddqn_planner.nodes.report import Refusals
@@ -77,25 +78,25 @@ class TrainerNode(BaseNode):
         self.episodes = self.create_publisher(Path, "~/episode", 10)
         self._poses: dict[str, PoseStamped] = {}
         self._run: TrainingRun | None = None
-        self._is_stopping = self._is_saving = False
         self._read_map_file()
         self.create_subscription(OccupancyGrid, "map", self._on_map, LATCHED)
         self._is_driving = self.value("learn_from") == "driving"
         self._learned = "experience" if self._is_driving else "model"
         self._saved = self.create_publisher(String, f"~/{self._learned}_saved", LATCHED)
         self._publisher = self.create_publisher(UInt8MultiArray, f"~/{self._learned}", LATCHED)
-        # What learns, and has these services: this node, or what it hears of robots.
-        driving = Driving(self) if self._is_driving else None
-        self._learner: Any = driving or self
-        if driving is None:
+        # What learns, and has most services: this node, or what it hears of robots.
+        self._learner: Any = self
+        services = {"stop": self._on_stop, "replay": self._on_replay}
+        if self._is_driving:
+            self._learner = driving = Driving(self)
+            services["forget"] = driving.forget
+        else:
             self._rewards = self.create_publisher(Float32, "~/average_reward", 100)
             for which, topic in (("start", "initialpose"), ("goal", "goal_pose")):
                 listen(self, topic, 10, self.refusals, partial(self._on_pose, which))
             # While the node answers already; only ~/start waits for it.
             self._imported = self.worker.call(import_training)
-        services = {"start": self._learner.start, "save": self._learner.save}
-        services |= {"stop": self._on_stop, "replay": self._on_replay}
-        services |= {"forget": driving.forget} if driving is not None else {}
+        services |= {"start": self._learner.start, "save": self._learner.save}
         group = ReentrantCallbackGroup()
         for name, handler in services.items():
             self.create_trigger(f"~/{name}", handler, callback_group=group)
@@ -128,10 +129,9 @@ class TrainerNode(BaseNode):
         self.map = MapInFrame(grid, "map")
         for which, cell in (("start", map_file.start), ("goal", map_file.goal)):
             if cell is not None:
-                path = conversions.path_message(
-                    *conversions.along([cell], grid), Header(frame_id="map"), Quaternion()
-                )
-                self._poses[which] = path.poses[0]
+                self._poses[which] = PoseStamped(header=Header(frame_id="map"))
+                at = self._poses[which].pose.position
+                at.x, at.y = grid.cell_to_world(cell)
 
     def _on_map(self, message: OccupancyGrid) -> None:
         with self.refusals.taking("map"):
@@ -194,20 +194,20 @@ class TrainerNode(BaseNode):
 
     def _on_replay(self) -> tuple[bool, str]:
         """Draw the first place of each recorded episode, its first two, and so on."""
-        file, draw = self.folder / "episodes.csv", self._learner.draw
-        place, episodes = self._learner.recorded(file)
-        if place is None:
+        if self.map is None:
             return False, NO_MAP
-        frames = (places[: n + 1] for places in episodes for n in range(len(places)))
+        file = self.folder / "episodes.csv"
+        frame, episodes = self._learner.recorded(file, self.map)
+        begun = (places[: n + 1] for places in episodes for n in range(len(places)))
 
         def step() -> None:
             try:
-                draw(place, next(frames))
+                self.draw(frame, next(begun))
             except (StopIteration, OSError):
                 self._stop_replay()
 
         try:
-            draw(place, next(frames))
+            self.draw(frame, next(begun))
         except StopIteration:
             return False, f"{file} holds no episode to replay yet; let it learn on"
         except OSError as error:
@@ -220,6 +220,12 @@ class TrainerNode(BaseNode):
         """Stop a replay, and return whether there was one."""
         timer, self.replaying = self.replaying, None
         return timer is not None and self.destroy_timer(timer)
+
+    def draw(self, frame: str, positions: Float64) -> None:
+        """Publish an episode or a drive, each pose of which faces the next."""
+        yaw = np.arctan2(*np.diff(positions, axis=0).T[::-1])
+        yaw = np.append(yaw, yaw[-1] if len(yaw) else 0.0)
+        self.episodes.publish(conversions.path_bytes(positions, yaw, self.header(frame)))
 
     def destroy_node(self) -> None:
         """Save what was learned, and destroy the node."""
@@ -239,9 +245,9 @@ class TrainerNode(BaseNode):
         except Exception as error:  # the node must survive any error
             return self.fail("the training cannot start", error)
         self.state, self.error, self.save_error = "training", "", ""
-        self._is_stopping = self._is_saving = False
         self.refusals.refused.clear()
         self._run, self._run_map = run, place
+        run.on_saved = self._tell_saved
         self.get_logger().info(run.description)
         self.worker.call(self._train, run, place)
         return True, run.description
@@ -263,38 +269,28 @@ class TrainerNode(BaseNode):
 
     def stop(self) -> tuple[bool, str]:
         """Stop the training, which saves."""
-        if self.state != "training":
+        if self._run is None or self.state != "training":
             return True, "no training was running"
-        self._is_stopping = True
+        self._run.asked.add("stop")
         return True, "the training saves and stops, and ~/start continues it"
 
     def save(self) -> tuple[bool, str]:
         """Save after the step that is under way."""
-        if self.state != "training":
+        if self._run is None or self.state != "training":
             return False, "no training is running; it was saved when it ended"
-        self._is_saving = True
+        self._run.asked.add("save")
         return True, "saving after this step; ~/model_saved or an error follows"
 
     def _train(self, run: TrainingRun, place: MapInFrame) -> None:
         """Train, in the worker, until the training has finished or is stopped."""
-        told = run.saved_at
         try:
             for episodes in run.steps():
                 for episode in episodes:
                     self._rewards.publish(Float32(data=episode.average_reward))
                     is_due = episode.number % self.value("episode_interval") == 0
                     if is_due and self.replaying is None:
-                        self.draw(place, episode.cells)
-                if self._is_stopping or self._is_saving:
-                    self._is_saving = False
-                    run.try_to_save()
-                if self._is_stopping:
-                    break
-                if run.saved_at != told:
-                    told = run.saved_at
-                    self._tell_saved(run)
-            self._tell_saved(run)
-            ends = "stopped" if self._is_stopping else "finished"
+                        self.draw(place.frame, conversions.along(episode.cells, place.grid)[0])
+            ends = "stopped" if "stop" in run.asked else "finished"
         except Exception as error:  # the node must survive any error
             ends = "failed"
             self.fail("the training failed, and ~/start continues from its checkpoint", error)
@@ -308,16 +304,12 @@ class TrainerNode(BaseNode):
         if not run.save_error:
             self.get_logger().info(f"step {run.saved_at} is saved in {run.checkpoint_path}")
 
-    def recorded(self, file: FilePath) -> tuple[MapInFrame | None, Iterator[tuple[Cell, ...]]]:
-        """Return the episodes of a file, and the map that they are on."""
-        is_of_run = self._run is not None and self._run.folder == file.parent
-        place = self._run_map if is_of_run else self.map
-        return place, read_cells(file, self.value("episode_interval"))
-
-    def draw(self, place: MapInFrame, cells: tuple[Cell, ...]) -> None:
-        """Publish an episode."""
-        way, header = conversions.along(cells, place.grid), self.header(place.frame)
-        self.episodes.publish(conversions.path_bytes(*way, header, Quaternion()))
+    def recorded(self, file: FilePath, place: MapInFrame) -> tuple[str, Iterator[Float64]]:
+        """Return the episodes of a file, and the frame of the map that they are on."""
+        if self._run is not None and self._run.folder == file.parent:
+            place = self._run_map
+        episodes = read_cells(file, self.value("episode_interval"))
+        return place.frame, (conversions.along(cells, place.grid)[0] for cells in episodes)
 
     def look(self) -> dict[str, str]:
         """Return what the diagnostics say of it, each second."""
@@ -337,9 +329,7 @@ class TrainerNode(BaseNode):
 def import_training() -> None:
     """Import torch and the trainer."""
     with suppress(ImportError):  # without torch, ~/start says what is missing
-        torch = importlib.import_module("torch")
-        importlib.import_module("ddqn_planner.training.run")
-        torch.optim.Adam([torch.zeros(1)])  # the first optimiser imports for a second
+        import_module("ddqn_planner.training.run")
 
 
 main = partial(runtime.spin_until_shutdown, TrainerNode, PARAMETERS)

@@ -1,7 +1,7 @@
 """A training run: a trainer with a folder for its episodes, its checkpoint and its model."""
 
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 from ddqn_planner.files import WorkFolder, write_atomically
@@ -31,26 +31,30 @@ class TrainingRun(WorkFolder):
         super().__init__(Path(folder), MARKS, "training", "trains", after)
         self.model_path = self.folder / "model.safetensors"
         self.checkpoint_path = self.folder / CHECKPOINT
-        with self.opening() as files, _memory_with_remedy():
+        with self.opening(), _memory_with_remedy():
             self.trainer = Trainer(scenarios, move_rule, parameters, seed)
             if self.checkpoint_path.exists():
                 self.trainer.restore(self.checkpoint_path)
             self._record = open_record(self.folder / "episodes.csv", self.trainer.episodes)
-            files.enter_context(closing(self._record))
+            self.callback(self._record.close)
+        self.asked: set[str] = set()  # to save after the step under way, to stop
         first = self.saved_at = self.trainer.steps
         self.description = f"training in {self.folder} from step {first} to {parameters.steps}"
 
     def steps(self, every: int = SAVE_INTERVAL) -> Iterator[list[Episode]]:
-        """Train to the end, and save there too; yield as `Trainer.run` does."""
+        """Train until the end or "stop" is asked for, and save; yield as `Trainer.run` does."""
         rules, until = self.trainer.environment.move_rules, self.trainer.parameters.steps
         with _memory_with_remedy():
             for finished in self.trainer.run(until, every):
                 for episode in finished:
                     self._record.append(record(episode, rules[episode.scenario]))
                 due = self.trainer.steps // SAVE_INTERVAL != self.saved_at // SAVE_INTERVAL
-                if due and self.trainer.steps < until:
+                if (due or "save" in self.asked) and self.trainer.steps < until:
+                    self.asked.discard("save")
                     self.try_to_save()
                 yield finished
+                if "stop" in self.asked:
+                    break
             self.try_to_save()
 
     def try_to_save(self) -> None:

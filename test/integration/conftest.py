@@ -9,6 +9,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from processes import TIED, claim_ros_domain, executable
+from processes import claim_ros_domain, executable, running
 
 from ddqn_planner.model import find_model
 
@@ -35,21 +36,12 @@ _claim = claim_ros_domain()
 HEAVY = {"matplotlib": "matplotlib", "numba": "llvmlite", "scipy": "scipy", "torch": "torch"}
 
 
+@dataclass
 class NodeProcess:
-    """One executable in a process group of its own."""
+    """A running executable, and the file of what it writes."""
 
-    def __init__(self, name: str, arguments: list[str], folder: Path) -> None:
-        self.log_path = folder / "log"
-        path = filter(None, [str(folder), os.environ.get("PYTHONPATH")])
-        with self.log_path.open("ab") as file:
-            self.process = subprocess.Popen(
-                [*TIED, executable(name), *arguments],
-                cwd=folder,  # no node depends on another's
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(path)},
-                stdout=file,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
+    process: subprocess.Popen[bytes]
+    log_path: Path
 
     @property
     def log(self) -> str:
@@ -76,19 +68,11 @@ class NodeProcess:
         """Send a signal to the process, and return its exit code."""
         if self.process.poll() is None:
             self.process.send_signal(signal_number)
-        try:
-            return self.process.wait(TIMEOUT)
-        except subprocess.TimeoutExpired:
-            os.killpg(self.process.pid, signal.SIGKILL)  # the group is its own
-            self.process.wait()
-            raise
-
-
-RunNode = Callable[..., Any]
+        return self.process.wait(TIMEOUT)
 
 
 @pytest.fixture(scope="session")
-def run_node(tmp_path_factory: pytest.TempPathFactory) -> RunNode:
+def run_node(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Any]:
     """Return a context manager that runs an executable, stops it by SIGINT and sees it exit."""
 
     @contextmanager
@@ -110,12 +94,18 @@ def run_node(tmp_path_factory: pytest.TempPathFactory) -> RunNode:
         arguments = ["--ros-args", *(["--params-file", str(file)] if parameters else [])]
         for remap in [*remaps, *([f"__ns:={namespace}"] if namespace else [])]:
             arguments += ["-r", remap]
-        process = NodeProcess(name, arguments, folder)
-        try:
-            yield process
-        finally:
-            ended_with = process.stop()
-        assert ended_with == exit_code, process.log
+        path = filter(None, [str(folder), os.environ.get("PYTHONPATH")])
+        # In a folder of its own, as no node depends on another's.
+        options: Any = {"cwd": folder, "stderr": subprocess.STDOUT}
+        options["env"] = {**os.environ, "PYTHONPATH": os.pathsep.join(path)}
+        with (
+            (folder / "log").open("ab") as log,
+            running(executable(name), *arguments, stdout=log, **options) as process,
+        ):
+            node = NodeProcess(process, folder / "log")
+            yield node
+            node.stop()
+        assert process.returncode == exit_code, node.log
 
     return run
 
@@ -148,7 +138,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def planner(run_node: RunNode, model: Path) -> Iterator[Any]:
+def planner(run_node: Any, model: Path) -> Iterator[Any]:
     """A planner that test files share: `Robot.reset` gives it its parameters back."""
     parameters = {"model": str(model), "follow_trainer": True}
     with run_node("planner_node", parameters, namespace="/robot") as node:
@@ -167,7 +157,7 @@ def make_robot(make_client: Any, small_values: np.ndarray, model: Path) -> Calla
 
 
 @pytest.fixture(scope="module")
-def run_robot(run_node: RunNode, make_robot: Any, small_values: np.ndarray) -> Callable[..., Any]:
+def run_robot(run_node: Any, make_robot: Any, small_values: np.ndarray) -> Callable[..., Any]:
     """Return a context manager that runs a planner in a namespace, and gives its user."""
 
     @contextmanager

@@ -11,14 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from client import cells_of, initial_pose, pose, values_of
-from diagnostic_msgs.msg import DiagnosticArray
-from nav_msgs.msg import OccupancyGrid
+from client import cells_of, initial_pose, pose
 from nav_msgs.msg import Path as PathMessage
 from processes import running
 
 from ddqn_planner.grid import path_length
-from ddqn_planner.nodes.conversions import grid_from_message
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.training.environment import Scenario
 
@@ -107,29 +104,19 @@ def test_nodes_of_the_workspace_plan_with_its_model_on_its_map(
         program = install / "ddqn_planner" / "lib" / "ddqn_planner" / name
         return running(*sourced(install, program, *arguments))
 
-    def names_model(message: DiagnosticArray) -> bool:
-        """The node speaks before it has loaded its model, and other tests' nodes speak too."""
-        (status,) = message.status
-        return status.name == "/planner: plan" and "model file" in values_of(status)
-
     client = make_client()
-    diagnostics = client.subscribe(DiagnosticArray, "/diagnostics")
-    maps = client.subscribe(OccupancyGrid, "map", LATCHED)
     plans = client.subscribe(PathMessage, "plan", LATCHED)
     with (
         node("map_server_node", "--ros-args", "-p", "yaml_filename:=dilemma.yaml") as map_server,
         node("planner_node", "--ros-args", "-p", "path_simplification:=none") as planner,
     ):
-        grid = grid_from_message(maps.wait())
-        diagnosis = diagnostics.wait(names_model).status[0]
-
-        client.publish("initialpose", initial_pose(pose(grid, paper.start)))
-        client.publish("goal_pose", pose(grid, paper.goal))
+        client.publish("initialpose", initial_pose(pose(paper.grid, paper.start)))
+        client.publish("goal_pose", pose(paper.grid, paper.goal))
         plan = plans.wait(lambda message: message.poses)
 
     # The optimum of the default model's rule, which does not cut corners.
-    assert path_length(cells_of(grid, plan)) == pytest.approx(14 + 8 * 2**0.5)
+    assert path_length(cells_of(paper.grid, plan)) == pytest.approx(14 + 8 * 2**0.5)
     assert (map_server.returncode, planner.returncode) == (0, 0)
-    model = package / "models" / "any_map.safetensors"
-    assert values_of(diagnosis)["model file"] == str(model)
-    assert f"serving {package / 'maps' / 'dilemma.yaml'}" in capfd.readouterr().err
+    log = capfd.readouterr().err
+    assert f"serving {package / 'maps' / 'dilemma.yaml'}" in log
+    assert f"planning with the model {package / 'models' / 'any_map.safetensors'}" in log

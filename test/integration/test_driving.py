@@ -25,7 +25,7 @@ from std_msgs.msg import Header, UInt8MultiArray
 
 from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience.drives import read_drives
-from ddqn_planner.nodes.conversions import bytes_message, bytes_of, quaternion
+from ddqn_planner.nodes.conversions import bytes_message, bytes_of
 from ddqn_planner.nodes.driving import NAVIGATION
 from ddqn_planner.nodes.runtime import LATCHED
 
@@ -41,10 +41,6 @@ LOWER = [(0.875, 4.625), (3.0, 3.5), (22.0, 3.5), (24.125, 4.625)]
 
 BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 NAMESPACE = "/drives"  # of the trainer and the planner that most tests share
-
-
-def pose_at(x: float, y: float) -> Pose:
-    return Pose(position=Point(x=x, y=y), orientation=quaternion(0.0))
 
 
 class Site(User):
@@ -67,7 +63,7 @@ class Site(User):
     def odometry(self, x: float, y: float) -> Odometry:
         stamp = Time(sec=int(self.now), nanosec=int(1e9 * (self.now % 1)))
         message = Odometry(header=Header(stamp=stamp, frame_id="map"))
-        message.pose.pose = pose_at(x, y)
+        message.pose.pose.position = Point(x=x, y=y)
         return message
 
     def send(self, message: Odometry) -> None:
@@ -75,7 +71,7 @@ class Site(User):
 
     def send_goal(self, x: float, y: float) -> None:
         """Send a goal, and wait until the trainer has it: poses may overtake it."""
-        goal = PoseStamped(header=Header(frame_id="map"), pose=pose_at(x, y))
+        goal = PoseStamped(header=Header(frame_id="map"), pose=Pose(position=Point(x=x, y=y)))
         self.client.publish(f"{self.space}goal_pose", goal)
         self.state(**{f"goal{self.robot}": re.escape(f"({x:.6g}, {y:.6g})")})
 

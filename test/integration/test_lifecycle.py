@@ -267,32 +267,16 @@ def test_callbacks_resume_in_order_unless_destroyed() -> None:
     assert called == ["begin", "go on", "end"]
 
 
-def test_requests_wait_for_the_first_map(run_waiting: Any, load_gate: Path, model: Path) -> None:
-    load_gate.touch()
-    with run_waiting("/early") as robot:
-        plan = ask_for_plan(robot)
-        robot.node.wait_for_log("planning with the model")
-        assert not plan.done()
-        robot.send_map()
-        wait_for("plan", plan.done)
-        assert plan.result().plan.poses
-        robot.wait_for_path(START, GOAL)
-        assert all(path.poses for path in robot.plans.messages())
-        robot.set(model=str(model))
-        robot.assert_works()
-        # Numba itself loads scipy.
-        assert robot.node.heavy_libraries <= {"numba", "scipy"}
-
-
 @pytest.mark.parametrize("case", ["good", "broken", "replaced"])
-def test_requests_wait_for_the_first_model_and_another_one_that_is_set_meanwhile_stays(
+def test_requests_wait_for_the_first_map_and_model_and_another_one_set_meanwhile_stays(
     run_waiting: Any, model: Path, load_gate: Path, tmp_path: Path, case: str
 ) -> None:
     broken = tmp_path / "any_map.safetensors"
     broken.write_text("a model")
     first = str(broken) if case == "broken" else "any_map"
     with run_waiting(f"/waiting_{case}", {"model": first}) as robot:
-        robot.set_map(robot.map_message())
+        if case != "good":
+            robot.set_map(robot.map_message())
         plan = ask_for_plan(robot)
         assert robot.wait_for_reason("the model is being loaded", {"model": first}).level == WARN
         assert robot.client.get_parameter("planner", "mode") == "greedy"
@@ -301,6 +285,10 @@ def test_requests_wait_for_the_first_model_and_another_one_that_is_set_meanwhile
         if case == "replaced":
             robot.set(model=str(model))
         load_gate.touch()
+        if case == "good":
+            robot.node.wait_for_log("planning with the model")
+            assert not plan.done()
+            robot.send_map()
         wait_for("plan", plan.done)
         assert bool(plan.result().plan.poses) == (case != "broken")
         if case == "broken":
@@ -309,10 +297,13 @@ def test_requests_wait_for_the_first_model_and_another_one_that_is_set_meanwhile
             robot.node.wait_for_log(f"model refused: .*{reason}.*set the parameter")
             return
         robot.wait_for_path(START, GOAL)
+        assert all(path.poses for path in robot.plans.messages())
         if case == "replaced":
             robot.assert_works()
             robot.wait_for_reason("^a path of ", {"model file": str(model)})
         assert "refused" not in robot.node.log
+        # Numba itself loads scipy.
+        assert robot.node.heavy_libraries <= {"numba", "scipy"}
 
 
 def test_a_planner_that_is_stopped_waits_for_no_model(run_waiting: Any) -> None:

@@ -106,7 +106,7 @@ def user(shared_user: Trainee, tmp_path: FilePath) -> Iterator[Trainee]:
 
 
 def test_a_training_is_seen_saved_resumed_and_replayed(user: Trainee, tmp_path: FilePath) -> None:
-    options = {"replay_period": 0.005, "episode_interval": 1, "move_rule": "robot_safe"}
+    options = {"replay_period": 0.02, "episode_interval": 1, "move_rule": "robot_safe"}
     user.configure(tmp_path, **ENDLESS, **options)
     assert user.call("stop") == "no training was running"
     assert "from step 0" in user.call("start")
