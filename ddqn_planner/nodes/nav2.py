@@ -109,21 +109,13 @@ def serve_nav2(
         return
     # Reentrant: the newest goal must be able to preempt another one.
     group = ReentrantCallbackGroup()
+    options = {"callback_group": group, "result_timeout": RESULT_TIMEOUT, **QUEUES}
+    options["cancel_callback"] = lambda _: CancelResponse.ACCEPT
     for name, kind in (
         ("compute_path_to_pose", ComputePathToPose),
         ("compute_path_through_poses", ComputePathThroughPoses),
     ):
         action = PathAction(kind.Result, refusal, plan)
-        ActionServer(
-            node,
-            kind,
-            name,
-            action.execute,
-            callback_group=group,
-            goal_callback=action.accept,
-            handle_accepted_callback=action.begin,
-            cancel_callback=lambda _: CancelResponse.ACCEPT,
-            result_timeout=RESULT_TIMEOUT,
-            **QUEUES,
-        )
+        begin = {"goal_callback": action.accept, "handle_accepted_callback": action.begin}
+        ActionServer(node, kind, name, action.execute, **begin, **options)
     node.create_service(IsPathValid, "is_path_valid", on_is_path_valid, callback_group=group)
