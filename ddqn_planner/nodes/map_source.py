@@ -17,12 +17,8 @@ from ddqn_planner.experience import Experience
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.body import Inflation
 from ddqn_planner.grid.copies import boxes_of
-from ddqn_planner.nodes.conversions import (
-    MAP_PARAMETERS,
-    bytes_of,
-    grid_from_message,
-    grid_from_values,
-)
+from ddqn_planner.nodes import conversions
+from ddqn_planner.nodes.conversions import MAP_PARAMETERS, grid_from_message
 from ddqn_planner.nodes.report import NO_REQUEST, Outcome, Report, RequestError, seconds
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
 from ddqn_planner.planning.field import offset_between, overlap
@@ -182,7 +178,7 @@ class MapSource:
 
     def _patched(self, grid: GridMap, values: NDArray[np.int8], x: int, y: int) -> GridMap:
         rules = map(self._node.value, MAP_PARAMETERS)
-        patch = grid_from_values(values, 1.0, (0.0, 0.0, 0.0), *rules)
+        patch = conversions.grid_from_values(values, 1.0, (0.0, 0.0, 0.0), *rules)
         return grid.with_patch(patch.occupancy, x, y, patch.cost, patch.obstacles)
 
     def _take_update(self, update: Any) -> None:
@@ -343,7 +339,7 @@ class ExpectedTimes:
         """Use a message, or the file that is set, or none; return whether it is another one."""
         newer, layout = None, message.layout if message else None
         if message:
-            data = bytes_of("experience", message)
+            data = conversions.bytes_of("experience", message)
             if layout == self._layout:  # its digest is the same
                 return False
             newer = Experience.from_bytes(data)

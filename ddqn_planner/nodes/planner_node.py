@@ -29,6 +29,7 @@ from ddqn_planner.planning.plan import PosePlan
 from ddqn_planner.planning.segments import SAME_COST
 
 CONFIGURED = "inactive", "active"  # states with a map, a start and requests
+Planning = Coroutine[None, None, Outcome]
 LOOK_PERIOD = 0.1  # seconds until the next look at what has come: that takes 0.4 ms
 
 
@@ -247,10 +248,7 @@ class PlannerNode(ManagedNode):
         return response
 
     async def _answer(
-        self,
-        goals: list[PoseStamped],
-        planning: Coroutine[None, None, Outcome],
-        given_up: GivenUp = lambda: None,
+        self, goals: list[PoseStamped], planning: Planning, given_up: GivenUp = lambda: None
     ) -> Outcome:
         """Plan, unless the node stops or the request is given up."""
         self._answering += 1
