@@ -23,6 +23,7 @@ from ddqn_planner.grid.moves import positions
 Origin = tuple[float, float, float]
 Float64 = NDArray[np.float64]
 
+MAP_PARAMETERS = ("occupied_threshold", "allow_unknown", "use_map_costs", "map_type")
 TOLERANCE = 1e-4  # how far the norm of a quaternion may be from 1
 MIN_RESOLUTION = 1e-6  # metres per cell
 LABEL = "ddqn_planner {} 1 sha256:{}"  # of bytes: their kind, its version and their digest
@@ -30,7 +31,7 @@ SAME_DIRECTION = 1e-6  # radians: poses along a segment are rounded
 
 
 def grid_from_message(message: OccupancyGrid, *rules: Any) -> GridMap:
-    """Make a grid map of a map message by the rules of `grid_from_values`, or a ValueError."""
+    """Make a grid map of a map message by rules of `MAP_PARAMETERS`, or a ValueError."""
     info, turned = message.info, message.info.origin.orientation
     size = f"{info.width} x {info.height} cells"
     needs, has = info.width * info.height, len(message.data)
@@ -56,19 +57,12 @@ def grid_from_message(message: OccupancyGrid, *rules: Any) -> GridMap:
 
 
 def grid_from_values(
-    values: NDArray[np.int8],
-    resolution: float,
-    origin: Origin,
-    occupied_threshold: int = 65,
-    allow_unknown: bool = False,
-    use_map_costs: bool = False,
-    map_type: str = "map",
+    values: NDArray[np.int8], resolution: float, origin: Origin, *rules: Any
 ) -> GridMap:
-    """Make a grid map; a costmap has its own threshold and costs."""
-    if map_type == "costmap":
-        return grid_from_costmap(values, resolution, origin, allow_unknown)
-    rules = occupied_threshold, allow_unknown, use_map_costs
-    return GridMap.from_occupancy_values(values, resolution, origin, *rules)
+    """Make a grid map by `MAP_PARAMETERS`, or the first of them; a costmap has other costs."""
+    if rules[3:] == ("costmap",):
+        return grid_from_costmap(values, resolution, origin, rules[1])
+    return GridMap.from_occupancy_values(values, resolution, origin, *rules[:3])
 
 
 def occupancy_message(
@@ -212,6 +206,5 @@ def _check_pose(name: str, pose: Pose) -> None:
 
 
 def _numbers(message: Point | Quaternion) -> str:
-    return ", ".join(
-        f"{name} = {getattr(message, name):.6g}" for name in message.get_fields_and_field_types()
-    )
+    names = message.get_fields_and_field_types()
+    return ", ".join(f"{name} = {getattr(message, name):.6g}" for name in names)

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +17,8 @@ from ddqn_planner.experience import Experience
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.body import Inflation
 from ddqn_planner.grid.copies import boxes_of
-from ddqn_planner.nodes.conversions import bytes_of, grid_from_message, grid_from_values
+from ddqn_planner.nodes import conversions
+from ddqn_planner.nodes.conversions import MAP_PARAMETERS, grid_from_message
 from ddqn_planner.nodes.report import NO_REQUEST, Outcome, Report, RequestError, seconds
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
 from ddqn_planner.planning.field import offset_between, overlap
@@ -28,12 +29,10 @@ except ImportError:  # PyPI does not have it
     OccupancyGridUpdate = None
 
 DIRECTIONS = "map_directions"
-MAP_PARAMETERS = ("occupied_threshold", "allow_unknown", "use_map_costs", "map_type")
 BODY_PARAMETERS = ("robot_radius", "clearance_weight")
 
+# Reliable, as a lost update leaves old cells; volatile, as the last one alone makes no new map.
 UPDATES_QUALITY = QoSProfile(depth=100)
-"""Reliable, as a lost update leaves old cells; volatile, as the last one alone makes no new map."""
-
 REMEDY = "let the map's publisher send the full map"
 
 CHANGED_SHARE = 0.02  # of cells: with more, experience is spread anew over the map, slowly
@@ -48,14 +47,16 @@ class Directions(NamedTuple):
     grid: GridMap | None
 
 
-@dataclass
+@dataclass(eq=False)
 class Received:
     """A map, and the header and the time of its last message: its own, or that of an update."""
 
     message: OccupancyGrid
+    grid: GridMap
     header: Header
     came: float
     directions: Directions | None = None  # those with which it is in use
+    forbidden: NDArray[np.uint8] | None = None  # what they forbid on it
 
 
 class MapSource:
@@ -69,7 +70,7 @@ class MapSource:
         # The map in use and the last one. If that is another one, it waits for its directions.
         self._used: Received | None = None
         self._newest: Received | None = None
-        self._grid: GridMap  # of the one in use, with directions
+        self._size = ""  # of the one in use, in words
         self._directions: Directions | None = None  # the last ones
         self._began = time.monotonic()
         self._updates = self._applied_updates = 0
@@ -118,14 +119,6 @@ class MapSource:
             return str(error)
         return ""
 
-    @property
-    def _size(self) -> str:
-        """The size of the map in use, in words; empty without one."""
-        if self._used is None:
-            return ""
-        size = f"{self._grid.width} x {self._grid.height} cells"
-        return f"{size} of {self._grid.resolution:.6g} m in frame {self.frame!r}"
-
     def describe(self) -> dict[str, str]:
         """Return what the diagnostics say of the map."""
         description = {}
@@ -139,11 +132,12 @@ class MapSource:
 
     def ready(self) -> Future:
         """Return the `GridMap` to plan on, with body and times: computed for the first request."""
-        ready = self._ready
+        ready, used = self._ready, self._used
         if ready is None or (ready.done() and ready.exception()):  # as when no memory was left
+            assert used is not None
             radius, weight = map(self._node.value, BODY_PARAMETERS)
             # ROS accepts a value that is above the range by a millionth.
-            of_body = self._grid, radius, min(weight, 1.0)
+            of_body = used.grid.with_layers(forbidden=used.forbidden), radius, min(weight, 1.0)
             ready = self._worker.call(lambda: self.times.apply(self._inflate(*of_body)))
             self._ready = ready
         return ready
@@ -151,7 +145,9 @@ class MapSource:
     def apply_parameters(self, changed: set[str]) -> None:
         """Read and prepare the map anew if one of the parameters that changed says so."""
         if changed & {*MAP_PARAMETERS, *BODY_PARAMETERS, "require_directions", "exploration"}:
-            self._read_again()
+            for received in {*filter(None, (self._newest, self._used))}:
+                received.grid = self._read(received.message)
+            self._choose()
         if "experience" in changed:
             self.times.read()
 
@@ -163,32 +159,26 @@ class MapSource:
 
     def _take(self, message: OccupancyGrid) -> None:
         try:
-            grid = self._changed_map(message) or self._read(message)
+            grid = self._read(message, self._newest)
         except (ValueError, MemoryError) as error:
             self._report.refuse("map", str(error) or repr(error))
             return
-        self._newest = Received(message, message.header, time.monotonic())
+        self._newest = Received(message, grid, message.header, time.monotonic())
         self._report.accept("map_updates")
-        self._use(grid, self._newest)
+        self._use(self._newest)
 
-    def _read(self, message: OccupancyGrid) -> GridMap:
-        return grid_from_message(message, *map(self._node.value, MAP_PARAMETERS))
-
-    def _changed_map(self, message: OccupancyGrid) -> GridMap | None:
-        """Return the map in use with what a message of the same place has else; None for others."""
-        last = self._newest
-        if last is None or last is not self._used or self._grid.forbidden is not None:
-            return None
-        if _place(message) != _place(last.message):
-            return None
-        grid, new = self._grid, _values(message)
+    def _read(self, message: OccupancyGrid, last: Received | None = None) -> GridMap:
+        """Return the map of a message: the last one with other cells, if they have one place."""
+        if last is None or _place(message) != _place(last.message):
+            return grid_from_message(message, *map(self._node.value, MAP_PARAMETERS))
+        grid, new = last.grid, _values(message)
         for box in boxes_of(new != _values(last.message)):
             grid = self._patched(grid, new[box], box[1].start, box[0].start)
         return grid
 
     def _patched(self, grid: GridMap, values: NDArray[np.int8], x: int, y: int) -> GridMap:
         rules = map(self._node.value, MAP_PARAMETERS)
-        patch = grid_from_values(values, 1.0, (0.0, 0.0, 0.0), *rules)
+        patch = conversions.grid_from_values(values, 1.0, (0.0, 0.0, 0.0), *rules)
         return grid.with_patch(patch.occupancy, x, y, patch.cost, patch.obstacles)
 
     def _take_update(self, update: Any) -> None:
@@ -198,8 +188,7 @@ class MapSource:
             if newest is None:
                 raise ValueError(f"an update came before a map; {REMEDY}")
             values = updated_values(newest.message, update)
-            if newest is self._used:
-                self._grid = self._patched(self._grid, values, update.x, update.y)
+            newest.grid = self._patched(newest.grid, values, update.x, update.y)
             # In place, for the day when a parameter changes and the map is read anew.
             whole, (height, width) = _values(newest.message), values.shape
             whole[update.y : update.y + height, update.x : update.x + width] = values
@@ -215,26 +204,28 @@ class MapSource:
                 grid = grid_from_message(message)
                 grid = grid.with_layers(forbidden=_values(message).view(np.uint8))
             self._directions = Directions(message.header, grid)
-            self._read_again()
+            self._choose()
 
-    def _read_again(self) -> None:
+    def _choose(self) -> None:
         """Plan on the newest map if its directions have come, else on the one in use."""
         for received in filter(None, (self._newest, self._used)):
-            if self._use(self._read(received.message), received):
+            if self._use(received):
                 break
 
-    def _use(self, grid: GridMap, received: Received) -> bool:
+    def _use(self, received: Received) -> bool:
         """Plan on a map from now on; return whether its directions let it."""
+        grid = received.grid
         try:
-            grid, directions = self._directed(grid, received.message.header)
+            self._direct(received)
         except ValueError as error:
             if self._used is not None and self._used.directions is None:
                 self._used = None  # there are directions now
             if received is self._newest:  # without a log: they may be on their way
                 self._report.refuse("map", str(error), log=False)
             return False
-        before = self._size
-        self._used, self._grid, received.directions = received, grid, directions
+        self._used = received
+        size = f"{grid.width} x {grid.height} cells of {grid.resolution:.6g} m"
+        before, self._size = self._size, f"{size} in frame {self.frame!r}"
         if self._size != before:
             self._node.get_logger().info(f"map of {self._size}")
         if received is self._newest:
@@ -242,11 +233,9 @@ class MapSource:
         self.change()
         return True
 
-    def _directed(self, grid: GridMap, header: Header) -> tuple[GridMap, Directions | None]:
-        """Return a map with the last directions, in the region they share, or with its own.
-
-        A ValueError says that they have not come, or do not fit.
-        """
+    def _direct(self, received: Received) -> None:
+        """Give a map its own directions, or the last ones; a ValueError says that it waits."""
+        grid, header = received.grid, received.message.header
         # A map server creates this publisher first: whoever receives its map sees it already.
         published = self._node.count_publishers(self._directions_topic) > 0
         used = self._used
@@ -254,30 +243,31 @@ class MapSource:
         known = [each for each in (self._directions, before) if each is not None]
         own = [each for each in known if each.header.stamp == header.stamp]
         late = f"were not received on {self._directions_topic} yet"
-        if not known and (published or self._node.value("require_directions")):
-            remedy = "let a map server publish them, or set require_directions to false"
-            raise ValueError(f"the map's directions {late}; {remedy}")
         if not known:
-            return grid, None
+            if published or self._node.value("require_directions"):
+                remedy = "let a map server publish them, or set require_directions to false"
+                raise ValueError(f"the map's directions {late}; {remedy}")
+            return
         is_paired = used and before and used.message.header.stamp == before.header.stamp
         if is_paired and published and not own:
             what = f"the map's directions, with its stamp, {seconds(header.stamp)}"
             raise ValueError(f"{what}, {late}; if they do not come, load the map again")
         its, directions = found = (own or known)[0]
-        if directions is None or directions.forbidden is None:
-            return grid, found
-        offset = offset_between(directions, grid)
-        if its.frame_id != header.frame_id or offset is None:
-            raise ValueError(
-                f"the directions on {self._directions_topic} are not for this map: they have the "
-                f"frame {its.frame_id!r} and {directions.resolution:.6g} m per cell, the map "
-                f"{header.frame_id!r} and {grid.resolution:.6g} m; give both one frame, and "
-                "cells that lie on each other"
-            )
-        theirs, ours = overlap(directions, grid, offset)
-        forbidden = np.zeros(grid.occupancy.shape, dtype=np.uint8)
-        forbidden[ours] = directions.forbidden[theirs]
-        return replace(grid, forbidden=forbidden), found
+        forbidden: NDArray[np.uint8] | None = None
+        if directions is not None and directions.forbidden is not None:
+            offset = offset_between(directions, grid)
+            if its.frame_id != header.frame_id or offset is None:
+                raise ValueError(
+                    f"the directions on {self._directions_topic} are not for this map: they have "
+                    f"the frame {its.frame_id!r} and {directions.resolution:.6g} m per cell, the "
+                    f"map {header.frame_id!r} and {grid.resolution:.6g} m; give both one frame, "
+                    "and cells that lie on each other"
+                )
+            theirs, ours = overlap(directions, grid, offset)
+            forbidden = np.zeros(grid.occupancy.shape, dtype=np.uint8)
+            forbidden[ours] = directions.forbidden[theirs]
+            forbidden = forbidden if forbidden.any() else None
+        received.directions, received.forbidden = found, forbidden
 
 
 def _place(message: OccupancyGrid) -> tuple[Any, ...]:
@@ -349,7 +339,7 @@ class ExpectedTimes:
         """Use a message, or the file that is set, or none; return whether it is another one."""
         newer, layout = None, message.layout if message else None
         if message:
-            data = bytes_of("experience", message)
+            data = conversions.bytes_of("experience", message)
             if layout == self._layout:  # its digest is the same
                 return False
             newer = Experience.from_bytes(data)

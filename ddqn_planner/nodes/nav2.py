@@ -14,14 +14,15 @@ from ddqn_planner.nodes.report import Outcome
 from ddqn_planner.nodes.runtime import SERVICE_QUALITY, BaseNode
 from ddqn_planner.planning import PlanStatus
 
+GivenUp = Callable[[], Outcome | None]  # returns why a request is given up now, or None
+# Plans from a start, or None, through goals, by a planner's name.
+Plan = Callable[[Any, list[PoseStamped], str, GivenUp], Awaitable[tuple[Path, Outcome]]]
+
+# Those of an action's services: without them, goals are lost like requests.
 QUEUES: dict[str, Any] = {
     f"{service}_service_qos_profile": SERVICE_QUALITY for service in ("goal", "cancel", "result")
 }
-"""Those of an action's services: without them, goals are lost like requests."""
-
-RESULT_TIMEOUT = 2
-"""Seconds for which a result is kept: each request goes over all goals whose results are."""
-
+RESULT_TIMEOUT = 2  # seconds to keep a result: each request goes over all goals with theirs
 CANCELED = Outcome("CANCELED", "the goal was canceled")
 PREEMPTED = Outcome("PREEMPTED", "a newer goal of the same action came")
 
@@ -45,13 +46,6 @@ def error_code(status: str, result: Any) -> int:
     if status in (PlanStatus.SUCCEEDED.name, CANCELED.status):
         return 0
     return int(getattr(result, CODES.get(status, status), result.UNKNOWN))
-
-
-GivenUp = Callable[[], Outcome | None]
-"""Returns with what outcome a request is given up now, or None."""
-
-Plan = Callable[[Any, list[PoseStamped], str, GivenUp], Awaitable[tuple[Path, Outcome]]]
-"""Plans from a start, or None, through goals, by a planner's name."""
 
 
 # Without Nav2's types, so that it can be tested where these are not installed.
@@ -109,21 +103,13 @@ def serve_nav2(
         return
     # Reentrant: the newest goal must be able to preempt another one.
     group = ReentrantCallbackGroup()
+    options = {"callback_group": group, "result_timeout": RESULT_TIMEOUT, **QUEUES}
+    options["cancel_callback"] = lambda _: CancelResponse.ACCEPT
     for name, kind in (
         ("compute_path_to_pose", ComputePathToPose),
         ("compute_path_through_poses", ComputePathThroughPoses),
     ):
         action = PathAction(kind.Result, refusal, plan)
-        ActionServer(
-            node,
-            kind,
-            name,
-            action.execute,
-            callback_group=group,
-            goal_callback=action.accept,
-            handle_accepted_callback=action.begin,
-            cancel_callback=lambda _: CancelResponse.ACCEPT,
-            result_timeout=RESULT_TIMEOUT,
-            **QUEUES,
-        )
+        begin = {"goal_callback": action.accept, "handle_accepted_callback": action.begin}
+        ActionServer(node, kind, name, action.execute, **begin, **options)
     node.create_service(IsPathValid, "is_path_valid", on_is_path_valid, callback_group=group)

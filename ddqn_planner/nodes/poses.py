@@ -70,29 +70,25 @@ class Frames:
 
     def _lookup(self, target: str, source: str, stamp: Time = NEWEST) -> TransformStamped:
         """Return the transform from a frame to another at a time, by default the newest."""
-
-        def none(why: object) -> ValueError:
-            leads = f"no transform leads from {source!r} to {target!r}"
-            return ValueError(f"{leads} ({why}); publish one")
-
         self.listen()
         self._read()
         try:
             found = self._buffer.lookup_transform(target, source, stamp)
+            of = Time.from_msg(found.header.stamp)
+            age, limit = (self._node.get_clock().now() - of).nanoseconds / 1e9, self._tolerance()
+            # Static transforms have the stamp 0, and are never too old.
+            if not of.nanoseconds or stamp.nanoseconds or abs(age) <= limit:
+                return found
+            when = f"{age:.3g} s old" if age > 0 else f"{-age:.3g} s in the future"
+            why = f"the newest is {when}, more than transform_tolerance, {limit:g} s"
         except self._tf2_ros.TransformException as error:
             if stamp.nanoseconds:
                 newest = self._lookup(target, source)
                 later = (Time.from_msg(newest.header.stamp) - stamp).nanoseconds / 1e9
                 if 0 < later <= PATIENCE:  # the pose is from before the node listened
                     return newest
-            raise none(error) from None
-        of = Time.from_msg(found.header.stamp)
-        age, limit = (self._node.get_clock().now() - of).nanoseconds / 1e9, self._tolerance()
-        # Static transforms have the stamp 0, and are never too old.
-        if of.nanoseconds and not stamp.nanoseconds and abs(age) > limit:
-            when = f"{age:.3g} s old" if age > 0 else f"{-age:.3g} s in the future"
-            raise none(f"the newest is {when}, more than transform_tolerance, {limit:g} s")
-        return found
+            why = str(error)
+        raise ValueError(f"no transform leads from {source!r} to {target!r} ({why}); publish one")
 
     def listen(self) -> None:
         """Listen to TF from now on: most robots do not need it, and each message costs time."""
@@ -160,16 +156,12 @@ def listen(
 class Places(Frames):
     """Frames, and where the robot is by ``start_source``: the last `initialpose`, `odom`, or TF."""
 
-    # `frame` returns the map's; `on_start` is called when there is a start to plan from at once.
+    # `frame` returns the map's; `plan` is called when there is a start to plan from at once.
     def __init__(
-        self,
-        node: BaseNode,
-        report: Refusals,
-        frame: Callable[[], str],
-        on_start: Callable[[], None],
+        self, node: BaseNode, report: Refusals, frame: Callable[[], str], plan: Callable[[], None]
     ) -> None:
         super().__init__(node, lambda: float(node.value("transform_tolerance")))
-        self._report, self._map_frame, self._on_start = report, frame, on_start
+        self._report, self._map_frame, self._plan = report, frame, plan
         self._pose: PoseStamped | None = None
         self._subscription: Any = None
         self.topic = ""
@@ -200,7 +192,7 @@ class Places(Frames):
         is_due = self._pose is None or self.topic == "initialpose"
         self._pose, self._came = pose, self._node.get_clock().now()
         if is_due:
-            self._on_start()
+            self._plan()
 
     def transform_start(self) -> None:
         """Transform the last `initialpose` as soon as TF can: it forgets the times before."""
@@ -225,15 +217,13 @@ class Places(Frames):
             except ValueError as error:
                 reason = f"the start is unknown: {error}, or set robot_frame or start_source"
                 raise RequestError("NO_START", reason, self.began) from None
-        topic, since = self._subscription.topic_name, -math.inf
-        problem = f"set it on {topic} (in RViz: 2D Pose Estimate)"
-        if self._pose is not None and self.topic == "initialpose":
-            return self._pose
-        if self.topic == "odom":
-            problem, since = f"nothing came on {topic} in the map's frame", self._heard_from
+        topic, is_set = self._subscription.topic_name, self.topic == "initialpose"
+        problem, since = f"nothing came on {topic} in the map's frame", self._heard_from
+        if is_set:
+            problem, since = f"set it on {topic} (in RViz: 2D Pose Estimate)", -math.inf
         if self._pose is not None:  # its stamp may be that of another clock
             silent = (self._node.get_clock().now() - self._came).nanoseconds / 1e9
-            if silent <= max(self._node.value("transform_tolerance"), SILENCE):
+            if is_set or silent <= max(self._node.value("transform_tolerance"), SILENCE):
                 return self._pose
             often = "publish it more often, set transform_tolerance"
             problem = f"nothing came on {topic} for {silent:.3g} s; {often}"

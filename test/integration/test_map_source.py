@@ -4,6 +4,7 @@ Here a message of map_msgs is a stand-in with the same fields; PyPI does not hav
 """
 
 import array
+import math
 import threading
 import time
 from collections.abc import Callable, Coroutine, Iterator
@@ -59,7 +60,7 @@ class Source(MapSource):
     """A source of maps which has what the test gives it, and says what the planner would know."""
 
     def __init__(self, node: BaseNode) -> None:
-        self.heard, self.report = 0, Report(node, lambda: None)
+        self.heard, self.report = 0, Report(node)
         super().__init__(node, self.report, Worker(node), self._hear)
 
     def _hear(self) -> None:
@@ -529,24 +530,19 @@ def test_a_map_that_grows_keeps_its_times(times: ExpectedTimes) -> None:
     np.testing.assert_allclose(after[5:35, 10:130], before[:30], rtol=0.021)
 
 
-def test_the_executors_thread_alone_tells_what_the_worker_computes(
+def test_the_expected_time_is_told_as_soon_as_the_worker_has_it(
     source: Source, driven: UInt8MultiArray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    threads, told = set[int](), {"expected time (s)": "1.0"}
-
-    def describe(_: Outcome) -> dict[str, str]:
-        time.sleep(0.1)
-        return told
-
-    monkeypatch.setattr(source.report, "_on_change", lambda: threads.add(threading.get_ident()))
-    monkeypatch.setattr(source.times, "describe", describe)
+    gate, told = threading.Event(), {"expected time (s)": "1.0"}
+    monkeypatch.setattr(source.times, "describe", lambda _: gate.wait() and told)
     outcome = Outcome("SUCCEEDED", "a path")
     assert source.times.told(outcome) == {}  # without drives
     finished(source.times.on_sent(driven))
+    source.report._due = math.inf
     assert source.times.told(outcome) == {}
+    assert source.report._due == 0  # at the next look
+    gate.set()
     assert wait_for("expected time", lambda: source.times.told(outcome)) == told
-    time.sleep(0.1)
-    assert threads == {threading.get_ident()}
     finished(source.times.on_sent())  # the file that is set: none
     assert source.times.told(outcome) == {}
 
