@@ -191,7 +191,7 @@ class Trainer:
                 )
                 names = "seed", "move_rule", *now["parameters"]
                 before, now = saved | asdict(parameters), now | now["parameters"]
-                if changed := differences({name: before[name] for name in names}, now):
+                if changed := differences(before, {name: now[name] for name in names}):
                     raise CheckpointError(f"was made with {changed}; give those values")
                 self.steps, self.updates, self.episodes, self._replay.added = saved["counters"]
                 tensors = self._tensors()
