@@ -63,7 +63,7 @@ class Visits(NamedTuple):
 
 
 class Climbs(NamedTuple):
-    """Int64 where driving takes longer in one direction."""
+    """Squares where driving takes longer in one direction."""
 
     square: Int64  # (S,), in order
     toward: Int64  # (S,): the action of that direction, in a frame that is not turned
@@ -116,6 +116,7 @@ class Evidence:
         self.prior: Prior | None = None
         self.driven = 0.0
         self.table = np.zeros((0, len(COLUMNS)))
+        self.rows: dict[complex, int] = {}  # of the table, by square of the world
         # The first two columns of the visits in each direction of `MOVES`.
         self.directed = np.zeros((0, 2, len(MOVES)), np.float32)
         # Of the last drives' log times, and the greatest of each, both in standard deviations.
@@ -128,7 +129,7 @@ class Evidence:
         self._compare(visits)
         weight, slowness = visits.metres / self.side, visits.seconds / visits.metres
         log = np.log(np.clip(slowness * self.nominal_speed, 1 / MAX_SLOWNESS, MAX_SLOWNESS))
-        rows, waited = self._rows(visits.position), self._rows(visits.waits[:, :2])
+        rows, waited = self._rows_at(visits.position), self._rows_at(visits.waits[:, :2])
         if self._has_changed(rows, log, visits.toward):
             self._fade(CHANGED)
         np.add.at(self.table[:, 3], waited, visits.waits[:, 2])
@@ -137,8 +138,7 @@ class Evidence:
         is_near = np.hypot(away[..., 0], away[..., 1]).min(axis=1, initial=np.inf) <= 4 * self.side
         seen = weight[:, None] * np.column_stack([np.ones(len(log)), log, is_near])
         np.add.at(self.table[:, :3], rows, seen)
-        for column in (0, 1):
-            np.add.at(self.directed[:, column], (rows, visits.toward), seen[:, column])
+        np.add.at(self.directed, (rows, slice(None), visits.toward), seen[:, :2])
         self.table[waited, 2] = np.maximum(self.table[waited, 2], 1)
         self.table[:, 2:4] /= np.maximum(self.table[:, 2:3] / MOST_PASSAGES, 1)
         seconds = float(visits.seconds.sum() + visits.waits[:, 2].sum())
@@ -171,25 +171,21 @@ class Evidence:
             self.surprises.append(max(found))
         return max(found, default=0) > max(SURPRISE * max(float(high - low) / USUAL, 1), usual)
 
-    def _squares(self, position: Float64) -> NDArray[np.complex128]:
-        """Return the square of the world of each position (N, 2)."""
-        return np.floor(position / self.side) @ [1, 1j]
-
-    def _rows(self, position: Float64) -> NDArray[np.int64]:
+    def _rows_at(self, position: Float64) -> Int64:
         """Return the row of each position (N, 2); new places get one, in the order of visits."""
-        known = len(self.table)
-        squares = self._squares(np.concatenate([self.table[:, 5:], position]))
-        _, first, rows = np.unique(squares, return_index=True, return_inverse=True)
-        new = np.sort(first)[known:]
+        squares = (np.floor(position / self.side) @ [1, 1j]).tolist()
+        rows = np.array([self.rows.setdefault(it, len(self.rows)) for it in squares], np.int64)
+        found, first = np.unique(rows, return_index=True)
+        new = first[found >= len(self.table)]
         fresh = np.zeros((len(new), len(COLUMNS)))
-        fresh[:, 5:] = position[new - known]
+        fresh[:, 5:] = position[new]
         if self.posterior is not None:
             places = self.posterior.places_at(fresh[:, 5:])
             fresh[:, 4] = np.append(self.posterior.foretold, 0)[places]
         self.table = np.concatenate([self.table, fresh])
         none = np.zeros((len(new), 2, len(MOVES)), np.float32)
         self.directed = np.concatenate([self.directed, none])
-        return np.argsort(np.argsort(first))[rows[known:]]
+        return rows
 
     def _fit(self) -> None:
         """Learn what all places have in common, how they differ, and what the prior is worth."""
@@ -264,7 +260,7 @@ class Evidence:
 
     def merge(self, other: Evidence) -> None:
         """Add what other evidence has."""
-        rows = self._rows(other.table[:, 5:])
+        rows = self._rows_at(other.table[:, 5:])
         self.table[rows, :4] += other.table[:, :4]
         self.directed[rows] += other.directed
         self.errors += other.errors
@@ -282,20 +278,18 @@ class Evidence:
     def restore(self, *arrays: NDArray[Any]) -> None:
         """Take the table and all else of a file; a ValueError if that cannot be true."""
         given = [array.astype(np.float64) for array in arrays]
+        places, of_directions = len(given[0]), (len(given[0]), 2, len(MOVES))
+        if not given[1].size:  # older files have none
+            given[1] = np.zeros(of_directions)
         table, directed, driven, errors, surprises = given
-        of_directions = len(table), 2, len(MOVES)
-        if not directed.size:  # older files have none
-            given[1] = directed = np.zeros(of_directions)
-        of_drives = (), (errors.size,), (surprises.size,)
-        shapes = (len(table), len(COLUMNS)), of_directions, *of_drives
-        possible = shapes == tuple(array.shape for array in given)
-        possible = possible and all(np.isfinite(array).all() for array in given)
-        if possible:
-            weights = table[:, [0, 2, 3]], directed[:, 0], driven
-            possible = min(float(array.min(initial=0)) for array in weights) >= 0
-            possible &= len(np.unique(self._squares(table[:, 5:]))) == len(table)
-            possible &= bool(np.abs(table[:, 5:]).max(initial=0) <= FARTHEST)
-        if not possible:
+        shapes = (places, len(COLUMNS)), of_directions, (), (errors.size,), (surprises.size,)
+        if (
+            shapes != tuple(array.shape for array in given)
+            or not all(np.isfinite(array).all() for array in given)
+            or min(table[:, [0, 2, 3]].min(initial=0), directed[:, 0].min(initial=0), driven) < 0
+            or np.abs(table[:, 5:]).max(initial=0) > FARTHEST
+            or len(np.unique(self._rows_at(table[:, 5:]))) < places
+        ):
             raise ValueError("its evidence cannot be true")
         self.table, self.directed, self.driven = table, directed.astype("f4"), float(driven)
         self.errors, self.surprises = deque(errors, KEPT), deque(surprises, KEPT)

@@ -95,9 +95,10 @@ class Posterior:
         self.expected = evidence.trust[0] + evidence.trust[1] * self.foretold
         places = self.places_at(evidence.table[:, 5:])
         inside = places >= 0
-        weight, log, passed, waited = sums = np.zeros((4, len(self.middle)))
-        for of_places, of_rows in zip(sums, evidence.sums, strict=True):
-            np.add.at(of_places, places[inside], of_rows[inside])
+        weight, log, passed, waited = (
+            np.bincount(places[inside], of_rows[inside], len(self.middle))
+            for of_rows in evidence.sums
+        )
         # A lattice whose links have strength 1 has about the variance ln(32 / kappa) / 4 pi;
         # 1 is added for cells of many metres, where that would be negative.
         kappa = (self.spacing / CORRELATION) ** 2
