@@ -249,10 +249,8 @@ def _cut_incomplete_row(path: Path) -> int:
     return max((int(row[1]) for row in rows if row), default=0)
 
 
-def read_recording(
-    path: Path, grid: GridMap, topic: str = "", frame: str = "map", robot_frame: str = ""
-) -> tuple[str, list[Drive]]:
-    """Return from what the poses of a recording on a map come, and its drives.
+def read_recording(path: Path, grid: GridMap, *how: str) -> tuple[str, list[Drive]]:
+    """Return from what the poses of a recording on a map come, and its drives; see `read_mcap`.
 
     A ValueError says what is wrong with a recording that teaches nothing.
     """
@@ -262,7 +260,7 @@ def read_recording(
         if path.suffix.lower() == ".csv":
             name, samples = path.name, read_csv(path)
         else:
-            name, samples = read_mcap(_files_of(path), topic, frame, robot_frame)
+            name, samples = read_mcap(_files_of(path), *how)
         samples = [sample for sample in samples if all(map(math.isfinite, sample))]
         steps = np.diff([seconds for seconds, _, _ in samples])
         if len(steps) and ((steps < 0).mean() > BACKWARDS or not steps.any()):

@@ -138,7 +138,8 @@ class Evidence:
         is_near = np.hypot(away[..., 0], away[..., 1]).min(axis=1, initial=np.inf) <= 4 * self.side
         seen = weight[:, None] * np.column_stack([np.ones(len(log)), log, is_near])
         np.add.at(self.table[:, :3], rows, seen)
-        np.add.at(self.directed, (rows, slice(None), visits.toward), seen[:, :2])
+        of_visits: Any = rows, slice(None), visits.toward
+        np.add.at(self.directed, of_visits, seen[:, :2])
         self.table[waited, 2] = np.maximum(self.table[waited, 2], 1)
         self.table[:, 2:4] /= np.maximum(self.table[:, 2:3] / MOST_PASSAGES, 1)
         seconds = float(visits.seconds.sum() + visits.waits[:, 2].sum())

@@ -94,11 +94,9 @@ class Posterior:
             self.foretold[:] = self.prior.log_slowness(features) if self.prior else 0
         self.expected = evidence.trust[0] + evidence.trust[1] * self.foretold
         places = self.places_at(evidence.table[:, 5:])
-        inside = places >= 0
-        weight, log, passed, waited = (
-            np.bincount(places[inside], of_rows[inside], len(self.middle))
-            for of_rows in evidence.sums
-        )
+        on, count = places >= 0, len(self.middle)
+        sums: list[Any] = [np.bincount(places[on], rows[on], count) for rows in evidence.sums]
+        weight, log, passed, waited = sums
         # A lattice whose links have strength 1 has about the variance ln(32 / kappa) / 4 pi;
         # 1 is added for cells of many metres, where that would be negative.
         kappa = (self.spacing / CORRELATION) ** 2
@@ -106,8 +104,7 @@ class Posterior:
         visits = scale * weight
         # Half of the noise is added, as the mean of its exponential is more than 1.
         seen = scale * (log + weight * NOISE / 2)
-        right = np.empty(len(visits), np.complex128)
-        right.real, right.imag = seen - visits * self.expected, visits
+        right = seen - visits * self.expected + 1j * visits
         # The equations map the same error everywhere to its product with these, and greater errors
         # to greater residuals: residuals up to that product prove that no error is greater.
         most = (ACCURACY * (kappa + visits)) ** 2
