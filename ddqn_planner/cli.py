@@ -320,8 +320,7 @@ def certify(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
 
 def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     """Learn from a robot's recorded drives how long places take, and what of it the map tells."""
-    from ddqn_planner.experience.drives import EXPERIENCE, LOCK, RECORD, Drive
-    from ddqn_planner.experience.recordings import read_recording
+    from ddqn_planner.experience.drives import EXPERIENCE, LOCK, RECORD, Drive, read_recording
 
     words = "trainers' folders, bags, MCAP files, or CSV files with the columns seconds, x, y"
     parser.add_argument("drives", type=Path, nargs="+", help=words)
@@ -342,7 +341,7 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     given = {name: value for name, value in of_robot.items() if value is not None}
     if options.experience:
         experience = api.Experience.load(options.experience)
-        if changed := differences({name: getattr(experience, name) for name in given}, given):
+        if changed := differences(experience.options, given):
             raise ValueError(f"{options.experience} has {changed}; leave those options out")
     else:
         experience = api.Experience(**{"nominal_speed": 0.5, **given})

@@ -57,8 +57,8 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object
 
 
 def differences(saved: Mapping[str, object], now: Mapping[str, object]) -> str:
-    """Return which values of the same names differ, for an error; empty if none does."""
-    pairs = [(name, value, now[name]) for name, value in saved.items()]
+    """Return which of the present values were others, for an error; empty if none was."""
+    pairs = [(name, saved[name], value) for name, value in now.items()]
     return ", ".join(f"{name} {value} (now {new})" for name, value, new in pairs if value != new)
 
 

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.experience.directions import NOISE, climbs_of, squares_of
-from ddqn_planner.experience.posterior import FEW_PLACES, Posterior
+from ddqn_planner.experience.posterior import FEW_PLACES, NOISE, ROW, Posterior, squares_of
 from ddqn_planner.experience.prior import Prior
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
 from ddqn_planner.grid.grid_map import check_grid
-from ddqn_planner.grid.moves import MOVES, RISES, UPHILL
+from ddqn_planner.grid.moves import MOVES, RISES
 
 Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
 
 FARTHEST = 1e7  # metres from the origin of the map: a place beyond is not believed
 
@@ -33,6 +34,10 @@ USUAL = 4.0  # from bound to bound of drives' errors; where it is more, so is a 
 UNUSUAL, OF_DRIVES = 2.5, 0.95  # and by so many times this quantile of drives' greatest surprises
 PART_NOISE = 0.12  # of their mean log slowness, as each way through a place is another
 CHANGED = 0.01  # share of all evidence that is left then: where one place changed, others did
+
+# Of a climb: the weight of what the squares around show, and how many visits are assumed to show
+# that it does not matter. It does if twice the logarithm of how much likelier that is, is more.
+BESIDE, LEVEL_VISITS, SURE = 0.5, 2.0, 12.0
 
 MOST_PASSAGES = 20.0  # a wait is the mean of about the last so many
 
@@ -53,8 +58,50 @@ class Visits(NamedTuple):
     position: Float64  # (V, 2)
     seconds: Float64  # (V,): without waits
     metres: Float64  # (V,)
-    toward: NDArray[np.int64]  # (V,): the action of its direction, in a frame that is not turned
+    toward: Int64  # (V,): the action of its direction, in a frame that is not turned
     waits: Float64  # (W, 3): x, y, seconds
+
+
+class Climbs(NamedTuple):
+    """Squares where driving takes longer in one direction."""
+
+    square: Int64  # (S,), in order
+    toward: Int64  # (S,): the action of that direction, in a frame that is not turned
+    rise: Float64  # (S,): log of how much longer
+
+    def at(self, square: Int64) -> tuple[Int64, Float64]:
+        """Return direction and rise of each of some squares, a rise of 0 where it is flat."""
+        if not len(self.square):
+            return np.zeros(len(square), np.int64), np.zeros(len(square))
+        place = np.searchsorted(self.square, square).clip(max=len(self.square) - 1)
+        return self.toward[place], self.rise[place] * (self.square[place] == square)
+
+
+def climbs_of(square: Int64, visits: NDArray[np.float32]) -> Climbs:
+    """Return where directions matter, from sums of places in squares.
+
+    Visits (N, 2, 8) have the weight, and that times the log slowness, of those in each direction.
+    """
+    # Regression of the log slowness on the share of the rise, within each place, for each direction
+    # in which it may be steepest. A place that was driven in one direction tells nothing.
+    telling = np.flatnonzero(np.count_nonzero(visits[:, 0], axis=1) > 1)
+    telling = telling[np.argsort(square[telling])]
+    driven, begins = np.unique(square[telling], return_index=True)
+    told = visits[telling].astype(np.float64)
+    (weight, log), (share, product) = told.sum(axis=2).T[..., None], (told @ RISES).swapaxes(0, 1)
+    squared = told[:, 0] @ RISES**2 - share**2 / weight
+    product_with_log = product - share * log / weight
+    of_driven = np.add.reduceat(np.hstack([squared, product_with_log]), begins)
+    steps = np.append(0, MOVES @ ROW)  # to a square itself, and to those around it
+    known, places = np.unique(driven + steps[:, None], return_inverse=True)
+    sums = np.zeros((len(known), 16))
+    for place, part in zip(places.reshape(len(steps), -1), [1, *[BESIDE] * 8], strict=True):
+        sums[place] += part * of_driven
+    squared, product_with_log = sums[:, :8] + LEVEL_VISITS, np.maximum(sums[:, 8:], 0)
+    gain = product_with_log**2 / squared / NOISE
+    toward, rise = gain.argmax(axis=1), product_with_log / squared
+    sure = np.flatnonzero(gain.max(axis=1, initial=0) > SURE)
+    return Climbs(known[sure], toward[sure], rise[sure, toward[sure]])
 
 
 class Evidence:
@@ -69,10 +116,11 @@ class Evidence:
         self.prior: Prior | None = None
         self.driven = 0.0
         self.table = np.zeros((0, len(COLUMNS)))
+        self.rows: dict[complex, int] = {}  # of the table, by square of the world
         # The first two columns of the visits in each direction of `MOVES`.
         self.directed = np.zeros((0, 2, len(MOVES)), np.float32)
-        self.errors: list[float] = []  # of the last drives' log times, in standard deviations
-        self.surprises: list[float] = []  # the greatest of each of the last drives, likewise
+        # Of the last drives' log times, and the greatest of each, both in standard deviations.
+        self.errors, self.surprises = deque[float](maxlen=KEPT), deque[float](maxlen=KEPT)
         self.posterior: Posterior | None = None  # over the last map
         self._fit()
 
@@ -81,7 +129,7 @@ class Evidence:
         self._compare(visits)
         weight, slowness = visits.metres / self.side, visits.seconds / visits.metres
         log = np.log(np.clip(slowness * self.nominal_speed, 1 / MAX_SLOWNESS, MAX_SLOWNESS))
-        rows, waited = self._rows(visits.position), self._rows(visits.waits[:, :2])
+        rows, waited = self._rows_at(visits.position), self._rows_at(visits.waits[:, :2])
         if self._has_changed(rows, log, visits.toward):
             self._fade(CHANGED)
         np.add.at(self.table[:, 3], waited, visits.waits[:, 2])
@@ -90,8 +138,8 @@ class Evidence:
         is_near = np.hypot(away[..., 0], away[..., 1]).min(axis=1, initial=np.inf) <= 4 * self.side
         seen = weight[:, None] * np.column_stack([np.ones(len(log)), log, is_near])
         np.add.at(self.table[:, :3], rows, seen)
-        for column in (0, 1):
-            np.add.at(self.directed[:, column], (rows, visits.toward), seen[:, column])
+        of_visits: Any = rows, slice(None), visits.toward
+        np.add.at(self.directed, of_visits, seen[:, :2])
         self.table[waited, 2] = np.maximum(self.table[waited, 2], 1)
         self.table[:, 2:4] /= np.maximum(self.table[:, 2:3] / MOST_PASSAGES, 1)
         seconds = float(visits.seconds.sum() + visits.waits[:, 2].sum())
@@ -121,28 +169,24 @@ class Evidence:
         low, _, high = self.quantiles()
         usual = UNUSUAL * float(np.quantile([*self.surprises, *[1.0] * ASSUMED], OF_DRIVES))
         if found:
-            self.surprises = [*self.surprises, max(found)][-KEPT:]
+            self.surprises.append(max(found))
         return max(found, default=0) > max(SURPRISE * max(float(high - low) / USUAL, 1), usual)
 
-    def _squares(self, position: Float64) -> NDArray[np.complex128]:
-        """Return the square of the world of each position (N, 2)."""
-        return np.floor(position / self.side) @ [1, 1j]
-
-    def _rows(self, position: Float64) -> NDArray[np.int64]:
+    def _rows_at(self, position: Float64) -> Int64:
         """Return the row of each position (N, 2); new places get one, in the order of visits."""
-        known = len(self.table)
-        squares = self._squares(np.concatenate([self.table[:, 5:], position]))
-        _, first, rows = np.unique(squares, return_index=True, return_inverse=True)
-        new = np.sort(first)[known:]
+        squares = (np.floor(position / self.side) @ [1, 1j]).tolist()
+        rows = np.array([self.rows.setdefault(it, len(self.rows)) for it in squares], np.int64)
+        found, first = np.unique(rows, return_index=True)
+        new = first[found >= len(self.table)]
         fresh = np.zeros((len(new), len(COLUMNS)))
-        fresh[:, 5:] = position[new - known]
+        fresh[:, 5:] = position[new]
         if self.posterior is not None:
             places = self.posterior.places_at(fresh[:, 5:])
             fresh[:, 4] = np.append(self.posterior.foretold, 0)[places]
         self.table = np.concatenate([self.table, fresh])
         none = np.zeros((len(new), 2, len(MOVES)), np.float32)
         self.directed = np.concatenate([self.directed, none])
-        return np.argsort(np.argsort(first))[rows[known:]]
+        return rows
 
     def _fit(self) -> None:
         """Learn what all places have in common, how they differ, and what the prior is worth."""
@@ -188,13 +232,11 @@ class Evidence:
         free = places >= 0
         if free.sum() >= SHORTEST:
             nominal = visits.metres[free] / self.nominal_speed
-            expected = nominal * self.posterior.slowness[places[free]]
+            level = nominal * self.posterior.slowness[places[free]]
             toward = (visits.toward[free] - self.posterior.turned) % len(MOVES)
-            expected *= UPHILL[self.posterior.uphill[places[free]], toward]
+            expected, deviation = self.posterior.time(level, places[free], toward)
             seconds = visits.seconds[free].sum() + visits.waits[:, 2].sum()
-            deviation = self.posterior.deviation(expected, places[free])
-            self.errors.append(math.log(seconds / expected.sum()) / deviation)
-            self.errors = self.errors[-KEPT:]
+            self.errors.append(math.log(seconds / expected) / deviation)
 
     def quantiles(self) -> Float64:
         """Return the lower bound, the mean, and the upper bound of 90 % of the errors of drives."""
@@ -219,11 +261,11 @@ class Evidence:
 
     def merge(self, other: Evidence) -> None:
         """Add what other evidence has."""
-        rows = self._rows(other.table[:, 5:])
+        rows = self._rows_at(other.table[:, 5:])
         self.table[rows, :4] += other.table[:, :4]
         self.directed[rows] += other.directed
-        self.errors = [*self.errors, *other.errors][-KEPT:]
-        self.surprises = [*self.surprises, *other.surprises][-KEPT:]
+        self.errors += other.errors
+        self.surprises += other.surprises
         self.driven += other.driven
         self.use_prior(other.prior if self.prior is None else self.prior)
 
@@ -237,21 +279,19 @@ class Evidence:
     def restore(self, *arrays: NDArray[Any]) -> None:
         """Take the table and all else of a file; a ValueError if that cannot be true."""
         given = [array.astype(np.float64) for array in arrays]
+        places, of_directions = len(given[0]), (len(given[0]), 2, len(MOVES))
+        if not given[1].size:  # older files have none
+            given[1] = np.zeros(of_directions)
         table, directed, driven, errors, surprises = given
-        of_directions = len(table), 2, len(MOVES)
-        if not directed.size:  # older files have none
-            given[1] = directed = np.zeros(of_directions)
-        of_drives = (), (errors.size,), (surprises.size,)
-        shapes = (len(table), len(COLUMNS)), of_directions, *of_drives
-        possible = shapes == tuple(array.shape for array in given)
-        possible = possible and all(np.isfinite(array).all() for array in given)
-        if possible:
-            weights = table[:, [0, 2, 3]], directed[:, 0], driven
-            possible = min(float(array.min(initial=0)) for array in weights) >= 0
-            possible &= len(np.unique(self._squares(table[:, 5:]))) == len(table)
-            possible &= bool(np.abs(table[:, 5:]).max(initial=0) <= FARTHEST)
-        if not possible:
+        shapes = (places, len(COLUMNS)), of_directions, (), (errors.size,), (surprises.size,)
+        if (
+            shapes != tuple(array.shape for array in given)
+            or not all(np.isfinite(array).all() for array in given)
+            or min(table[:, [0, 2, 3]].min(initial=0), directed[:, 0].min(initial=0), driven) < 0
+            or np.abs(table[:, 5:]).max(initial=0) > FARTHEST
+            or len(np.unique(self._rows_at(table[:, 5:]))) < places
+        ):
             raise ValueError("its evidence cannot be true")
         self.table, self.directed, self.driven = table, directed.astype("f4"), float(driven)
-        self.errors, self.surprises = errors.tolist(), surprises.tolist()
+        self.errors, self.surprises = deque(errors, KEPT), deque(surprises, KEPT)
         self._fit()

@@ -10,7 +10,6 @@ from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
-from zipfile import is_zipfile
 from zlib import crc32
 
 import numpy as np
@@ -163,9 +162,8 @@ class Experience:
 
     def record_failure(self, position: Sequence[float]) -> None:
         """Learn that the robot failed at a place: it costs as much as a wait of `max_pause`."""
-        point = numbers("the position", position, (2,))
-        if not (np.abs(point) < FARTHEST).all():
-            raise ValueError(f"the position is {position!r}; give metres, at most {FARTHEST:g}")
+        near, remedy = (-FARTHEST, FARTHEST), f"metres, at most {FARTHEST:g}"
+        point = numbers("the position", position, (2,), between=near, whole=False, remedy=remedy)
         none, waits = np.zeros((0, 2)), np.array([[*point, self.max_pause]])
         visits = Visits(none, none[:, 0], none[:, 0], actions_along(none), waits)
         self._learn(partial(Evidence.add, visits=visits))
@@ -241,12 +239,13 @@ class Experience:
         """Return (H, W) float32: seconds, with waits, over nominal ones; the mean of directions."""
         posterior = self.evidence.over(grid)
         of_directions = UPHILL[posterior.uphill, : len(MOVES)].mean(axis=1)
-        return posterior.over(posterior.slowness * of_directions, 1.0)
+        return posterior.over((posterior.slowness * of_directions).astype(np.float32), 1)
 
     def uncertainty(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: the standard deviation of the log slowness, most if unknown."""
         posterior = self.evidence.over(grid)
-        return math.sqrt(self.evidence.variance) * posterior.over(posterior.unknown, 1.0)
+        unknown: Float32 = posterior.over(posterior.unknown.astype(np.float32), 1)
+        return math.sqrt(self.evidence.variance) * unknown
 
     def expected_time(self, grid: GridMap, cells: Cells) -> ExpectedTime:
         """Return the time that a path takes, with an interval of 90 %.
@@ -268,11 +267,10 @@ class Experience:
         metres = np.diff(position) * of_segments[position[:-1].astype(np.int64)]
         places = posterior.place[path[:, 1], path[:, 0]]
         slowness = posterior.slowness[places]
-        seconds = metres / self.nominal_speed * (slowness[1:] + slowness[:-1]) / 2
-        seconds *= UPHILL[posterior.uphill[places[1:]], actions_along(np.diff(path, axis=0))]
-        deviation = posterior.deviation(seconds, places[1:])
-        shares = np.exp(self.evidence.quantiles() * deviation)
-        low, middle, high = (float(seconds.sum()) * shares).tolist()
+        level = metres / self.nominal_speed * (slowness[1:] + slowness[:-1]) / 2
+        toward = actions_along(np.diff(path, axis=0))
+        seconds, deviation = posterior.time(level, places[1:], toward)
+        low, middle, high = (seconds * np.exp(self.evidence.quantiles() * deviation)).tolist()
         return ExpectedTime(middle, low, high)
 
     def save(self, path: str | Path) -> None:
@@ -324,9 +322,7 @@ class Experience:
             If the bytes are broken, or no experience.
         """
         try:
-            if not is_zipfile(io.BytesIO(data)):
-                raise ValueError("it is no .npz file")
-            with np.load(io.BytesIO(data), allow_pickle=False) as file:
+            with np.lib.npyio.NpzFile(io.BytesIO(data)) as file:  # which unpickles nothing
                 arrays = dict.fromkeys(ARRAYS, np.zeros(0)) | dict(file)  # older ones lack some
             version = int(arrays["version"])
             if version not in (1, VERSION):

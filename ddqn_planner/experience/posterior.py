@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place
-from ddqn_planner.experience.directions import NOISE, squares_of
 from ddqn_planner.experience.prior import Prior, map_features
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
-from ddqn_planner.grid.moves import MOVES, STEEPER
+from ddqn_planner.grid.moves import MOVES, STEEPER, UPHILL
 
 if TYPE_CHECKING:
     from ddqn_planner.experience.evidence import Evidence
@@ -21,6 +20,7 @@ if TYPE_CHECKING:
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
+NOISE = 0.1  # variance of the log slowness of one visit
 CORRELATION = 1.0  # metres: how far the slowness of a place tells of that of others
 STEP = 0.02  # slowness is told in steps of this share: fields need no repair for less
 STEPS = (1 + STEP) ** np.arange(1 + round(math.log(MAX_SLOWNESS) / math.log(1 + STEP)))
@@ -32,6 +32,15 @@ WAIT_PLACES = 0.1  # so many places around each one are assumed to be driven wit
 FEW_PLACES = 16.0  # it is assumed that so many were driven where nothing was slow
 # Standard deviations of the log time of a drive: on ways that are known, and that are not.
 DRIVE_NOISE, UNSURE = 0.05, 0.42
+
+SQUARE = 1.0  # metres: the side of squares of the world in which a climb is alike
+ROW = np.array([1, 1 << 32])  # from the number of a square to that of the next column, and row
+
+
+def squares_of(position: Float64) -> Int64:
+    """Return the number of the square of each position, (N, 2) in metres."""
+    squares: Int64 = np.floor(position / SQUARE).astype(np.int64) @ ROW
+    return squares
 
 
 class Posterior:
@@ -63,10 +72,12 @@ class Posterior:
         self.turned = round(grid.origin[2] / (math.pi / 4))  # by so many actions
         self.painted: dict[str, tuple[NDArray[Any], NDArray[Any]]] = {}  # steps, and the map
 
-    def deviation(self, seconds: Float64, places: Int64) -> float:
-        """Return the standard deviation of the log time of a way, by its seconds in places."""
-        unknown = float(seconds @ self.unknown[places] / seconds.sum())
-        return math.hypot(DRIVE_NOISE, UNSURE * unknown)
+    def time(self, seconds: Float64, places: Int64, toward: Int64) -> tuple[float, float]:
+        """Return the seconds of a way, and the deviation of their log, by those in level places."""
+        seconds = seconds * UPHILL[self.uphill[places], toward]
+        total = float(seconds.sum())
+        unknown = float(seconds @ self.unknown[places] / total)
+        return total, math.hypot(DRIVE_NOISE, UNSURE * unknown)
 
     def places_at(self, position: Float64) -> Int64:
         """Return the place of each position (N, 2), the nearest within a place's side, or -1."""
@@ -83,10 +94,9 @@ class Posterior:
             self.foretold[:] = self.prior.log_slowness(features) if self.prior else 0
         self.expected = evidence.trust[0] + evidence.trust[1] * self.foretold
         places = self.places_at(evidence.table[:, 5:])
-        inside = places >= 0
-        weight, log, passed, waited = sums = np.zeros((4, len(self.middle)))
-        for of_places, of_rows in zip(sums, evidence.sums, strict=True):
-            np.add.at(of_places, places[inside], of_rows[inside])
+        on, count = places >= 0, len(self.middle)
+        sums: list[Any] = [np.bincount(places[on], rows[on], count) for rows in evidence.sums]
+        weight, log, passed, waited = sums
         # A lattice whose links have strength 1 has about the variance ln(32 / kappa) / 4 pi;
         # 1 is added for cells of many metres, where that would be negative.
         kappa = (self.spacing / CORRELATION) ** 2
@@ -94,8 +104,7 @@ class Posterior:
         visits = scale * weight
         # Half of the noise is added, as the mean of its exponential is more than 1.
         seen = scale * (log + weight * NOISE / 2)
-        right = np.empty(len(visits), np.complex128)
-        right.real, right.imag = seen - visits * self.expected, visits
+        right = seen - visits * self.expected + 1j * visits
         # The equations map the same error everywhere to its product with these, and greater errors
         # to greater residuals: residuals up to that product prove that no error is greater.
         most = (ACCURACY * (kappa + visits)) ** 2
@@ -147,15 +156,14 @@ class Posterior:
         return self.layer(name, STEPS.take(steps.astype(np.int64)), 1)
 
     def layer(self, name: str, values: NDArray[Any], occupied: int) -> NDArray[Any]:
-        """Return (H, W): of each cell the value of its place; the same array while none changes."""
+        """Return the same as `over`, and the same array while no value changes."""
         if name not in self.painted or not np.array_equal(values, self.painted[name][0]):
-            whole = np.append(values, values.dtype.type(occupied))
-            self.painted[name] = values, whole.take(self.place, mode="wrap")
+            self.painted[name] = values, self.over(values, occupied)
         return self.painted[name][1]
 
-    def over(self, values: Float64, occupied: float) -> NDArray[np.float32]:
-        """Return (H, W) float32: of each cell the value of its place."""
-        return np.append(values, occupied).astype(np.float32).take(self.place, mode="wrap")
+    def over(self, values: NDArray[Any], occupied: int) -> NDArray[Any]:
+        """Return (H, W): of each cell the value of its place."""
+        return np.append(values, values.dtype.type(occupied)).take(self.place, mode="wrap")
 
 
 def _places_of(grid: GridMap, size: int) -> tuple[Int64, Int64]:
@@ -178,11 +186,11 @@ def _links_of(place: Int64, size: int, count: int) -> Any:
     """Return how strongly places are linked, by the share of a block's side that they have."""
     from scipy.sparse import csr_array
 
-    links = csr_array((count, count))
-    for one, other in ((place[:, :-1], place[:, 1:]), (place[:-1], place[1:])):
-        linked = (one != other) & (one >= 0) & (other >= 0)
-        weights = np.full(np.count_nonzero(linked), 1 / size)
-        links += csr_array((weights, (one[linked], other[linked])), shape=(count, count))
+    sides = (place[:, :-1], place[:, 1:]), (place[:-1], place[1:])
+    one, other = np.hstack([[one.ravel(), other.ravel()] for one, other in sides])
+    linked = (one != other) & (one >= 0) & (other >= 0)
+    ends = one[linked], other[linked]
+    links = csr_array((np.full(len(ends[0]), 1 / size), ends), shape=(count, count))
     return (links + links.T).tocsr()
 
 

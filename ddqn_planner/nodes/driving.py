@@ -17,7 +17,13 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
 
-from ddqn_planner.experience.drives import DriveEnd, DriveFolder, DriveRecorder, read_drives
+from ddqn_planner.experience.drives import (
+    Drive,
+    DriveEnd,
+    DriveFolder,
+    DriveRecorder,
+    read_drives,
+)
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import occupancy_message
 from ddqn_planner.nodes.poses import Frames, listen
@@ -135,22 +141,20 @@ class Driving:
         self._learning = node.create_timer(1.0, self._learn_prior, group, clock=STEADY)
         self.start()
 
-    def _on_drive(
-        self, by_robot: str, outcome: DriveEnd, seconds: Float64, positions: Float64
-    ) -> None:
+    def _on_drive(self, by_robot: str, drive: Drive) -> None:
         place, folder = self._node.map, self._folder
         if place is None or folder is None:
             return
         try:
-            drive = folder.add(outcome, seconds, positions, place.grid)
+            folder.add(drive, place.grid)
         except Exception as error:  # the node must survive
             self._node.fail("a drive taught nothing", error)
             return
-        last = f"{drive.number}{by_robot}: {drive.metres:.1f} m, {outcome.value}"
+        last = f"{folder.drives}{by_robot}: {drive.metres:.1f} m, {drive.outcome.value}"
         self._values["last drive"] = last
         self._node.get_logger().info(f"drive {last}")
         if self._node.replaying is None:
-            self._node.draw(place.frame, positions)
+            self._node.draw(place.frame, drive.positions)
 
     def _tell_saved(self, folder: DriveFolder) -> None:
         self._shown = None

@@ -31,29 +31,20 @@ def prior_of(grid: GridMap, table: Any, older: Prior | None, seed: int = 0) -> P
     if seen.sum() < FEWEST_PLACES:
         return older
     weight, log = table[seen, :2].T
-    features, mean = map_features(grid)[y[seen], x[seen]], log / weight
-    return train_prior(features, mean, np.minimum(weight, MOST), older, seed, table[seen, 5:])
+    features = map_features(grid)[y[seen], x[seen]]
+    new = np.column_stack([table[seen, 5:], features, log / weight, np.minimum(weight, MOST)])
+    return train_prior(new.astype(np.float32), older, seed)
 
 
-def train_prior(
-    features: Any,
-    log_slowness: Any,
-    weights: Any,
-    older: Prior | None = None,
-    seed: int = 0,
-    positions: Any = None,
-) -> Prior:
-    """Train a prior on N places: features (N, F), mean log slowness (N,) and its weight (N,).
+def train_prior(new: Float32, older: Prior | None = None, seed: int = 0) -> Prior:
+    """Train a prior on places, in rows as those of `Prior.replay`.
 
-    The places come in the order in which they were first driven. How long to train, and how much to
+    They come in the order in which they were first driven. How long to train, and how much to
     believe the result, is what foretells places best that were left out: none of it, if none does.
     On a new map an older prior stays as long as it foretells these places better. Later its places
-    are replayed, so that what it knew of other maps is not forgotten; positions (N, 2) tell which
-    of them are these ones.
+    are replayed, so that what it knew of other maps is not forgotten.
     """
     random = np.random.default_rng(seed)
-    at = np.zeros((len(features), 2)) if positions is None else positions
-    new = np.column_stack([at, features, log_slowness, weights]).astype(np.float32)
     old = new[:0] if older is None else older.replay
     known = {row.tobytes() for row in new[:, :-2]}  # a later drive tells of them anew
     old = old[[row.tobytes() not in known for row in old[:, :-2]]]

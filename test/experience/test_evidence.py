@@ -48,15 +48,6 @@ def test_what_is_kept_gives_what_is_computed_anew(
         )
 
 
-def test_experience_that_was_forgotten_is_not_taken_over() -> None:
-    older = driven(straight((2, 3), (12, 3), 4))
-    older.apply(HALL)
-    newer, again = (driven(straight((2, 8), (12, 8), 4)) for _ in range(2))
-    newer.take_over(older)
-    np.testing.assert_allclose(newer.slowness(HALL), again.slowness(HALL), rtol=CLOSE)
-    assert at(HALL, older.slowness(HALL), 7, 3) > 2
-
-
 @given(st.integers(0, 2**32 - 1))
 @example(seed=275)  # drives that cross show a climb
 @example(seed=8894)  # a place has no neighbours
@@ -87,25 +78,16 @@ def test_the_posterior_is_that_of_a_gaussian_markov_random_field(seed: int) -> N
             precision[[i, j], [j, i]] -= 1
     precision += np.eye(len(precision)) * 0.25**2
     precision *= np.log1p(32 / 0.25**2) / (4 * np.pi) / variance
-    table, seen = experience.evidence.table, np.zeros(len(precision))
+    table, (seen, visits) = experience.evidence.table, np.zeros((2, len(precision)))
     cells = np.floor(table[:, 5:] / 0.25).astype(int)
     # What drives in several directions show of climbs is taken off.
     for (x, y), weight, log in zip(cells, table[:, 0], experience.evidence.flat, strict=True):
         precision[number[y, x], number[y, x]] += weight / NOISE
+        visits[number[y, x]] += weight / NOISE
         seen[number[y, x]] += (log + weight * (NOISE / 2 - common)) / NOISE
     mean = common + np.linalg.solve(precision, seen) + surplus * (1 - posterior.known)
     np.testing.assert_allclose(posterior.mean, mean, atol=0.02)
-
-
-def test_a_map_is_the_same_while_nothing_was_learned() -> None:
-    experience = driven(straight((2, 5), (12, 5), 3))
-    before = experience.apply(HALL)
-    assert before.same_cells(experience.apply(HALL))
-    assert before.slowness is not None
-    kept = before.slowness.copy()
-    experience.record(*straight((2, 5), (12, 5), 9))
-    assert not experience.apply(HALL).same_cells(before)
-    np.testing.assert_array_equal(before.slowness, kept)
+    np.testing.assert_allclose(posterior.known, np.linalg.solve(precision, visits), atol=0.01)
 
 
 def test_without_memory_for_a_map_nothing_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,22 +100,6 @@ def test_without_memory_for_a_map_nothing_is_lost(monkeypatch: pytest.MonkeyPatc
         with pytest.raises(MemoryError):
             experience.apply(HALL)
     np.testing.assert_array_equal(experience.slowness(HALL), driven(*drives).slowness(HALL))
-
-
-def test_what_was_seen_does_not_reach_through_walls_and_past_corners() -> None:
-    occupancy = HALL.occupancy.copy()
-    occupancy[22, :50] = True
-    grid = GridMap(occupancy, 0.25)
-    experience = driven(straight((2, 5.4), (12, 5.4), 4))
-    assert at(grid, experience.slowness(grid), 7, 5.4) > 2
-    unsure = experience.uncertainty(grid) / experience.uncertainty(HALL).max()
-    assert at(grid, unsure, 7, 4.9) < 0.8
-    assert (unsure[23:, :40] > 0.99).all()
-    diagonal = np.eye(40, 60, dtype=bool)  # open only to who cuts its corners
-    unsure = driven(straight((2, 1.4), (8, 7.4), 4)).uncertainty(GridMap(diagonal, 0.25))
-    y, x = np.mgrid[:40, :60]
-    assert (unsure[x > y] < 0.95 * unsure.max()).sum() > 100
-    assert (unsure[x < y] == unsure.max()).all()
 
 
 def test_a_wall_thinner_than_a_place_divides_it() -> None:
@@ -227,15 +193,6 @@ def test_where_parts_of_drives_often_surprise_a_surprise_is_no_change() -> None:
         experience.record(*drive(4 if number % 4 == 0 else 1))
         experience = Experience.from_bytes(experience.to_bytes())
     assert experience.evidence.table[row, 0] > 0.8 * weight
-
-
-def test_one_outlier_is_bounded() -> None:
-    usual = straight((2, 5), (12, 5))
-    seconds = usual[0].copy()
-    seconds[100:105] += np.arange(5) * 0.5  # 0.25 m in 2.5 s, where 0.5 s were usual
-    seconds[105:] += 2.5
-    once = driven(*[usual] * 5, (seconds, usual[1]))
-    assert at(HALL, once.slowness(HALL), 7.1, 5) < 1.5
 
 
 def waited(seconds: float, x: float = 7.0) -> Poses:
@@ -338,11 +295,3 @@ def test_nine_of_ten_drives_take_a_time_within_their_interval(noise: float) -> N
     assert 0.8 < np.mean(inside[50:]) <= 1
     assert expected.low < expected.seconds < expected.high
     assert expected.seconds == pytest.approx(actual, rel=0.3)
-
-
-def test_memory_grows_with_the_driven_area() -> None:
-    experience = driven(*[straight((2, 5), (12, 5), 2)] * 3)
-    places = len(experience.evidence.table)
-    assert 35 <= places <= 45
-    experience.record(*straight((2, 5), (12, 5), 2))
-    assert len(experience.evidence.table) == places

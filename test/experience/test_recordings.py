@@ -10,8 +10,14 @@ import pytest
 from map_files import save_map
 
 from ddqn_planner import Experience, GridMap
-from ddqn_planner.experience.drives import DriveEnd, DriveFolder
-from ddqn_planner.experience.recordings import drives_of, read_csv, read_mcap
+from ddqn_planner.experience.drives import (
+    Drive,
+    DriveEnd,
+    DriveFolder,
+    read_csv,
+    read_mcap,
+    read_recording,
+)
 
 GRID = GridMap(np.zeros((40, 120), dtype=np.bool_), resolution=0.25)
 
@@ -100,7 +106,7 @@ def test_a_folder_is_learned_anew(tmp_path: Path, map_file: Path, console: Any) 
     folder = DriveFolder(tmp_path / "drives", 0.5, 0.5)
     seconds, *positions = np.transpose(slow_drive())
     for _ in range(3):
-        folder.add(DriveEnd.ARRIVED, seconds, np.column_stack(positions), GRID)
+        folder.add(Drive(DriveEnd.ARRIVED, seconds, np.column_stack(positions)), GRID)
     learn = "learn", folder.folder, "--map", map_file
     # The trainer records there.
     assert "another process records" in console(*learn, status=2).err
@@ -268,9 +274,11 @@ def test_a_broken_mcap_file_is_refused(tmp_path: Path, cut: int) -> None:
         read_mcap([file])
 
 
-def test_a_recording_of_hours_has_a_drive_for_each_way() -> None:
+def test_a_recording_of_hours_has_a_drive_for_each_way(tmp_path: Path) -> None:
     way = [(t, min(t / 2, 10.0), 0.0) for t in np.arange(0, 200, 0.1).tolist()]
     back = [(200 + t, 10 - x, y) for t, x, y in way]
-    drives = drives_of([*way, *back])
+    rows = [f"{t},{x},{y}" for t, x, y in [*way, *back]]
+    (tmp_path / "drive.csv").write_text("\n".join(["seconds,x,y", *rows]))
+    _, drives = read_recording(tmp_path / "drive.csv", GRID)
     assert [drive.outcome.value for drive in drives] == ["paused", "paused"]
     assert [round(drive.metres) for drive in drives] == [10, 10]

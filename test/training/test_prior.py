@@ -9,9 +9,6 @@ from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience.prior import Prior, map_features
 from ddqn_planner.training.prior import REPLAYED, prior_of, train_prior
 
-Places = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Features (N, F), log slowness (N,) and weights (N,)."""
-
 rng = np.random.default_rng
 
 
@@ -27,11 +24,12 @@ def by_clearance(features: np.ndarray) -> np.ndarray:
     return np.log(1 + 3 * np.exp(-features[:, 2] / 0.5))
 
 
-def measured(seed: int, count: int = 600) -> Places:
-    """Places of rooms that are slow near walls, with noise."""
+def measured(seed: int, count: int = 600, at: float = 0) -> np.ndarray:
+    """Places of rooms that are slow near walls, with noise, in rows of `Prior.replay`."""
     features = rooms(seed, count)
     slowness = by_clearance(features) + rng(seed).normal(0, 0.3, count)
-    return features, slowness, rng(seed).uniform(1, 4, count)
+    rows = np.full((count, 2), at), features, slowness, rng(seed).uniform(1, 4, count)
+    return np.column_stack(rows).astype(np.float32)
 
 
 def share_foretold(prior: Prior, features: np.ndarray) -> float:
@@ -42,50 +40,51 @@ def share_foretold(prior: Prior, features: np.ndarray) -> float:
 
 def test_what_walls_govern_is_foretold_on_another_map() -> None:
     for seed in (0, 2):
-        assert share_foretold(train_prior(*measured(seed)), rooms(seed + 1)) > 0.98
+        assert share_foretold(train_prior(measured(seed)), rooms(seed + 1)) > 0.98
 
 
-def zones(count: int, seed: int) -> Places:
+def zones(count: int, seed: int) -> np.ndarray:
     """Places of rooms of which every second ten are slow, which no wall explains."""
-    features, _, weights = (array[:count] for array in measured(seed))
-    slowness = np.where(np.arange(count) // 10 % 2, 1.0, 0.0) + rng(seed).normal(0, 0.3, count)
-    return features, slowness, weights
+    rows = measured(seed)[:count]
+    rows[:, -2] = np.arange(count) // 10 % 2 + rng(seed).normal(0, 0.3, count)
+    return rows
 
 
 def test_few_places_tell_little_and_what_no_wall_explains_tells_nothing() -> None:
     for count in (1, 600):
-        prior, (_, slowness, weights) = train_prior(*zones(count, 1)), zones(count, 1)
-        mean = np.average(slowness, weights=weights)
-        assert prior.log_slowness(rooms(5)) == pytest.approx(mean, abs=0.1)
-    foretold = [train_prior(*zones(20, seed)).log_slowness(rooms(5)) for seed in range(7)]
+        rows = zones(count, 1)
+        mean = np.average(rows[:, -2], weights=rows[:, -1])
+        assert train_prior(rows).log_slowness(rooms(5)) == pytest.approx(mean, abs=0.1)
+    foretold = [train_prior(zones(20, seed)).log_slowness(rooms(5)) for seed in range(7)]
     assert np.median(np.std(foretold, axis=1)) < 0.1
 
 
 def test_weights_count() -> None:
-    features, slowness, weights = measured(0)
-    twice = [np.concatenate([array, array]) for array in (features, slowness)]
-    twice[1][600:] = 5.0
-    ignored = train_prior(*twice, np.concatenate([weights, np.full(600, 1e-6)]))
-    assert ignored.level == pytest.approx(np.average(slowness, weights=weights), abs=1e-3)
+    rows = measured(0)
+    twice = np.concatenate([rows, rows])
+    twice[600:, -2:] = 5.0, 1e-6
+    ignored = train_prior(twice)
+    mean = np.average(rows[:, -2], weights=rows[:, -1])
+    assert ignored.level == pytest.approx(mean, abs=1e-3)
     assert share_foretold(ignored, rooms(1)) > 0.7
 
 
 def test_the_same_seed_gives_the_same_prior() -> None:
-    one, same, other = (train_prior(*measured(0), seed=seed) for seed in (3, 3, 4))
+    one, same, other = (train_prior(measured(0), seed=seed) for seed in (3, 3, 4))
     assert all(np.array_equal(*pair) for pair in zip(one, same, strict=True))
     assert not np.array_equal(one.weights_1, other.weights_1)
 
 
 def test_an_older_map_is_not_forgotten_and_known_places_are_not_kept_twice() -> None:
-    older = train_prior(*measured(0))
-    assert len(older.replay) == REPLAYED < len(measured(0)[0])
-    features, _, weights = measured(1)
-    is_hall = features[:, 2] > np.quantile(features[:, 2], 0.7)
-    hall = features[is_hall], rng(2).normal(1, 0.3, is_hall.sum()), weights[is_hall]
-    assert share_foretold(train_prior(*hall), rooms(2)) < 0.1
-    once = train_prior(*hall, older)
+    older = train_prior(measured(0))
+    assert len(older.replay) == REPLAYED < len(measured(0))
+    hall = measured(1)
+    hall = hall[hall[:, 4] > np.quantile(hall[:, 4], 0.7)]
+    hall[:, -2] = rng(2).normal(1, 0.3, len(hall))
+    assert share_foretold(train_prior(hall), rooms(2)) < 0.1
+    once = train_prior(hall, older)
     assert share_foretold(once, rooms(2)) > 0.7
-    again = train_prior(*hall, once)
+    again = train_prior(hall, once)
     assert all(np.array_equal(*pair) for pair in zip(once, again, strict=True))
 
 
@@ -128,8 +127,7 @@ def test_what_all_places_have_in_common_is_not_learned_twice() -> None:
 
 
 def test_an_older_prior_stays_on_a_new_map_as_long_as_it_foretells_it_better() -> None:
-    older = train_prior(*measured(0))
-    features, slowness, weights = (array[:40] for array in measured(1))
-    elsewhere = np.ones((40, 2))
-    assert train_prior(features, slowness, weights, older, 0, elsewhere) is older
-    assert train_prior(features, -slowness, weights, older, 0, elsewhere) is not older
+    older, elsewhere = train_prior(measured(0)), measured(1, at=1)[:40]
+    assert train_prior(elsewhere, older) is older
+    elsewhere[:, -2] *= -1
+    assert train_prior(elsewhere, older) is not older
