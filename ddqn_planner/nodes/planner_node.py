@@ -30,7 +30,7 @@ from ddqn_planner.planning.segments import SAME_COST
 
 CONFIGURED = "inactive", "active"  # states with a map, a start and requests
 Planning = Coroutine[None, None, Outcome]
-LOOK_PERIOD = 0.1  # seconds until the next look at what has come: that takes 0.4 ms
+LOOK_PERIOD, IDLE_PERIOD = 0.1, 1.0  # seconds until the next look: after a change, and else
 
 
 # The executor's one thread holds all state. What takes long runs in workers: to load the model,
@@ -41,8 +41,8 @@ class PlannerNode(ManagedNode):
     def __init__(self) -> None:
         super().__init__("planner", PLANNER_PARAMETERS)
         self._settings = self.settings()
-        self.create_timer(LOOK_PERIOD, self._on_look, clock=STEADY)
-        self._report = Report(self)
+        self._looks = self.create_timer(LOOK_PERIOD, self._on_look, clock=STEADY)
+        self._report = Report(self, self._look_soon)
         self._worker, self._map_worker, self._display_worker = (Worker(self) for _ in range(3))
         self._model = ModelSource(self, self._report, self._worker)
         self._answering = 0
@@ -71,7 +71,7 @@ class PlannerNode(ManagedNode):
         self._map = MapSource(self, self._report, self._map_worker, self._replan.trigger)
         self._places = Places(self, self._report, lambda: self._map.frame, self._on_start)
         inputs = self._map, self._places, self._model
-        self._requests = Requests(self._settings, *inputs, self._worker)
+        self._requests = Requests(self._settings, *inputs, self._worker, self._look_soon)
         self.create_subscription(PoseStamped, "goal_pose", self._on_goals, 10)
         self.create_subscription(PoseArray, "goal_poses", self._on_goals, 10)
         if self._settings.follow_trainer:
@@ -270,8 +270,17 @@ class PlannerNode(ManagedNode):
 
     # Diagnostics
 
+    def _look_soon(self, is_near: bool = True) -> None:
+        """Look at what changed, or may have come, in `LOOK_PERIOD`, or else in `IDLE_PERIOD`."""
+        nanoseconds = int(1e9 * (LOOK_PERIOD if is_near else IDLE_PERIOD))
+        if self._looks.timer_period_ns != nanoseconds:  # a timer that is reset wakes the node
+            self._looks.timer_period_ns = nanoseconds
+            self._looks.reset()
+
     def _on_look(self) -> None:
         active, missing = self._active, [self._refusal.reason if self._refusal else ""]
+        is_frequent = bool(active.poses) and self._settings.replan_period < IDLE_PERIOD
+        self._look_soon(is_frequent or active.lacks_pose)
         if is_configured := self.state in CONFIGURED:
             self._requests.look_again()
             self._places.transform_start()

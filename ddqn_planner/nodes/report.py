@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -21,7 +21,7 @@ from ddqn_planner.planning.pose_planner import PoseRequest
 Request = PlanRequest | PoseRequest
 
 PATIENCE = 1.0  # seconds within which a new listener hears a first map, odometry or TF
-PERIOD = 0.95  # seconds until diagnostics are due when nothing changes: at the next look
+PERIOD = 0.9  # seconds until diagnostics are due when nothing changes: at the next look
 
 TOLERANCE = ", or a greater tolerance"  # does not help with several goals: none of them moves
 REMEDIES = {
@@ -127,8 +127,8 @@ def _place(stamped: PoseStamped, cell: Cell) -> str:
 class Refusals:
     """What a node refused and has not accepted since, and why; it is logged when that changes."""
 
-    def __init__(self, node: BaseNode) -> None:
-        self.node, self._due = node, 0.0
+    def __init__(self, node: BaseNode, on_change: Callable[[], None] = lambda: None) -> None:
+        self.node, self._on_change, self._due = node, on_change, 0.0
         self.refused: dict[str, str] = {}
         self.publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
@@ -158,6 +158,7 @@ class Refusals:
     def change(self) -> None:
         """Publish soon: something about the node changed."""
         self._due = 0.0
+        self._on_change()
 
     def problems(self) -> list[str]:
         """Return what a user reads of all that is refused."""

@@ -49,12 +49,16 @@ class ActiveGoal:
     last: Outcome = UNCHANGED
     next_look: float = 0.0
 
+    @property
+    def lacks_pose(self) -> bool:
+        """Whether it waits for TF or odometry."""
+        return bool(self.poses) and self.last.status in ("NO_START", "TF_ERROR")
+
     def is_look_due(self, lacks_map: bool, places: Places) -> bool:
         """Return whether it is time to look if something changed; the next plan does then."""
         stopped = lacks_map and self.last.request is not None  # a costmap: its path is taken back
-        lacked_pose = self.last.status in ("NO_START", "TF_ERROR")
-        is_due = stopped or time.monotonic() >= self.next_look
-        return bool(self.poses) and (is_due or (lacked_pose and places.know(self.poses)))
+        is_due = bool(self.poses) and (stopped or time.monotonic() >= self.next_look)
+        return is_due or (self.lacks_pose and places.know(self.poses))
 
     def is_due(self, planner: Planner, request: Request, header: Header) -> bool:
         """Return whether there is a reason to plan."""
@@ -202,6 +206,7 @@ class Requests:
     places: Places
     model: ModelSource
     worker: Worker
+    look_soon: Callable[[], None]
     next_look: Future = field(default_factory=Future)
 
     def look_again(self) -> None:
@@ -342,6 +347,7 @@ class Requests:
             except RequestError as error:
                 if not error.may_come and time.monotonic() >= deadline:
                     raise
+            self.look_soon()
             await self.next_look
 
 

@@ -533,8 +533,9 @@ def test_a_map_that_grows_keeps_its_times(times: ExpectedTimes) -> None:
 def test_the_expected_time_is_told_as_soon_as_the_worker_has_it(
     source: Source, driven: UInt8MultiArray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    gate, told = threading.Event(), {"expected time (s)": "1.0"}
+    gate, told, threads = threading.Event(), {"expected time (s)": "1.0"}, set[int]()
     monkeypatch.setattr(source.times, "describe", lambda _: gate.wait() and told)
+    monkeypatch.setattr(source.report, "_on_change", lambda: threads.add(threading.get_ident()))
     outcome = Outcome("SUCCEEDED", "a path")
     assert source.times.told(outcome) == {}  # without drives
     finished(source.times.on_sent(driven))
@@ -543,6 +544,7 @@ def test_the_expected_time_is_told_as_soon_as_the_worker_has_it(
     assert source.report._due == 0  # at the next look
     gate.set()
     assert wait_for("expected time", lambda: source.times.told(outcome)) == told
+    assert threads == {threading.get_ident()}  # the executor's alone
     finished(source.times.on_sent())  # the file that is set: none
     assert source.times.told(outcome) == {}
 
