@@ -186,10 +186,10 @@ class Trainer:
                 saved = json.loads(metadata[CHECKPOINT_KEY])
                 if saved["scenarios"] != now["scenarios"]:
                     raise CheckpointError("was made with another map, start or goal; give that one")
-                before = {name: saved[name] for name in ("seed", "move_rule")}
                 others = saved["parameters"] | {"steps": self.parameters.steps}
-                before |= asdict(HyperParameters(**others))
-                if changed := differences(before, now | now["parameters"]):
+                before = saved | asdict(HyperParameters(**others))
+                given = {name: now[name] for name in ("seed", "move_rule")} | now["parameters"]
+                if changed := differences(before, given):
                     raise CheckpointError(f"was made with {changed}; give those values")
                 self.steps, self.updates, self.episodes, self._replay.added = saved["counters"]
                 tensors = self._tensors()
