@@ -149,8 +149,7 @@ class Driving:
         last = f"{drive.number}{by_robot}: {drive.metres:.1f} m, {outcome.value}"
         self._values["last drive"] = last
         self._node.get_logger().info(f"drive {last}")
-        if self._node.replaying is None:
-            self._node.draw(place.frame, positions)
+        self._node.draw(place.frame, positions)
 
     def _tell_saved(self, folder: DriveFolder) -> None:
         self._shown = None
