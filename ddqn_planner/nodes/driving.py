@@ -153,8 +153,7 @@ class Driving:
         last = f"{folder.drives}{by_robot}: {drive.metres:.1f} m, {drive.outcome.value}"
         self._values["last drive"] = last
         self._node.get_logger().info(f"drive {last}")
-        if self._node.replaying is None:
-            self._node.draw(place.frame, drive.positions)
+        self._node.draw(place.frame, drive.positions)
 
     def _tell_saved(self, folder: DriveFolder) -> None:
         self._shown = None

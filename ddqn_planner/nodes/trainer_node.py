@@ -74,8 +74,8 @@ class TrainerNode(BaseNode):
         self.refusals = Refusals(self)
         self.worker = Worker(self)
         self.state, self.error, self.save_error = "idle", "", ""
-        self.replaying: Timer | None = None
-        self.episodes = self.create_publisher(Path, "~/episode", 10)
+        self._replaying: Timer | None = None
+        self._episodes = self.create_publisher(Path, "~/episode", 10)
         self._poses: dict[str, PoseStamped] = {}
         self._run: TrainingRun | None = None
         self._read_map_file()
@@ -202,30 +202,31 @@ class TrainerNode(BaseNode):
 
         def step() -> None:
             try:
-                self.draw(frame, next(begun))
+                self.draw(frame, next(begun), True)
             except (StopIteration, OSError):
                 self._stop_replay()
 
         try:
-            self.draw(frame, next(begun))
+            self.draw(frame, next(begun), True)
         except StopIteration:
             return False, f"{file} holds no episode to replay yet; let it learn on"
         except OSError as error:
             return False, f"no recorded episodes ({error}); call ~/start first"
         self._stop_replay()
-        self.replaying = self.create_timer(self.value("replay_period"), step, clock=STEADY)
+        self._replaying = self.create_timer(self.value("replay_period"), step, clock=STEADY)
         return True, "replaying the recorded episodes on ~/episode"
 
     def _stop_replay(self) -> bool:
         """Stop a replay, and return whether there was one."""
-        timer, self.replaying = self.replaying, None
+        timer, self._replaying = self._replaying, None
         return timer is not None and self.destroy_timer(timer)
 
-    def draw(self, frame: str, positions: Float64) -> None:
-        """Publish an episode or a drive, each pose of which faces the next."""
-        yaw = np.arctan2(*np.diff(positions, axis=0).T[::-1])
-        yaw = np.append(yaw, yaw[-1] if len(yaw) else 0.0)
-        self.episodes.publish(conversions.path_bytes(positions, yaw, self.header(frame)))
+    def draw(self, frame: str, positions: Float64, is_replayed: bool = False) -> None:
+        """Publish an episode or a drive, unless others are replayed; each pose faces the next."""
+        if is_replayed or self._replaying is None:
+            yaw = np.arctan2(*np.diff(positions, axis=0).T[::-1])
+            yaw = np.append(yaw, yaw[-1] if len(yaw) else 0.0)
+            self._episodes.publish(conversions.path_bytes(positions, yaw, self.header(frame)))
 
     def destroy_node(self) -> None:
         """Save what was learned, and destroy the node."""
@@ -283,13 +284,14 @@ class TrainerNode(BaseNode):
 
     def _train(self, run: TrainingRun, place: MapInFrame) -> None:
         """Train, in the worker, until the training has finished or is stopped."""
+        executor: Any = self.executor  # where replays begin: no episode comes between their steps
         try:
             for episodes in run.steps():
                 for episode in episodes:
                     self._rewards.publish(Float32(data=episode.average_reward))
-                    is_due = episode.number % self.value("episode_interval") == 0
-                    if is_due and self.replaying is None:
-                        self.draw(place.frame, conversions.along(episode.cells, place.grid)[0])
+                    if episode.number % self.value("episode_interval") == 0:
+                        positions = conversions.along(episode.cells, place.grid)[0]
+                        executor.create_task(self.draw, place.frame, positions)
             ends = "stopped" if "stop" in run.asked else "finished"
         except Exception as error:  # the node must survive any error
             ends = "failed"
