@@ -274,12 +274,11 @@ def take_back(
         for number in range(tile << TILE_BITS, (tile + 1) << TILE_BITS):
             if mark[number] == UNREACHED or distance[number] < limit:
                 continue
-            found = np.float32(np.inf)
+            mark[number], found = UNREACHED, np.float32(np.inf)
             if distance[number] <= last:
                 found, _ = next_best(number, limit, found, search)
-            mark[number] = OPEN if found < np.inf else UNREACHED
             if found < np.inf:
-                distance[number] = found
+                mark[number], distance[number] = OPEN, found
                 x, y, _ = place_of(number, world)
                 push(np.float32(found + aim.weight * way_left(x, y, aim)), number, heap)
     return limit

@@ -27,7 +27,7 @@ AHEAD: Final = 0.9  # the cosine above which a robot drives ahead, not behind or
 
 
 class Way(NamedTuple):
-    """A path of N poses that follows a field."""
+    """A path of N poses."""
 
     poses: Float64  # (N, 3), in metres and radians
     cells: NDArray[np.int32]  # (N, 2)
@@ -36,27 +36,21 @@ class Way(NamedTuple):
 
     def plan(self, first: int, grid: GridMap) -> PosePlan:
         """Return the plan along the poses from one on."""
+        poses, cells = self.poses[first:], self.cells[first:]
+        poses.flags.writeable = False
+        (x, y, _), (column, line) = poses.T, cells.T
+        is_next = (column[1:] != column[:-1]) | (line[1:] != line[:-1])
         cost, least = float(self.spent[-1] - self.spent[first]), self.least - self.spent[first]
-        return plan_along(self.poses[first:], self.cells[first:], grid, cost, least)
-
-
-def plan_along(
-    poses: Float64, cells: NDArray[np.int32], grid: GridMap, cost: float, least: float
-) -> PosePlan:
-    """Return the plan of a path of poses that lie in cells, of a cost and the least one proved."""
-    poses.flags.writeable = False
-    (x, y, _), (column, line) = poses.T, cells.T
-    is_next = (column[1:] != column[:-1]) | (line[1:] != line[:-1])
-    bound = max(cost / least, 1.0) if least > 0 else math.inf
-    return PosePlan(
-        PlanStatus.SUCCEEDED,
-        cells[np.append(True, is_next)],
-        cost=cost * (grid.seconds_per_cell or 1.0),
-        goal=(int(cells[-1, 0]), int(cells[-1, 1])),
-        poses=poses,
-        driven=float(np.hypot(np.diff(x), np.diff(y)).sum()) / grid.resolution,
-        bound=bound if cost > least * SAME else 1.0,
-    )
+        bound = max(cost / least, 1.0) if least > 0 else math.inf
+        return PosePlan(
+            PlanStatus.SUCCEEDED,
+            cells[np.append(True, is_next)],
+            cost=cost * (grid.seconds_per_cell or 1.0),
+            goal=(int(cells[-1, 0]), int(cells[-1, 1])),
+            poses=poses,
+            driven=float(np.hypot(np.diff(x), np.diff(y)).sum()) / grid.resolution,
+            bound=float(bound) if cost > least * SAME else 1.0,
+        )
 
 
 def points_of(corners: Float64, resolution: float) -> Body:

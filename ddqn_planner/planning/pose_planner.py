@@ -136,7 +136,8 @@ class PosePlanner:
         if has_plan:
             cost = share * (plan.cost or 0.0) / (grid.seconds_per_cell or 1.0)
             least = cost / (share * plan.bound)
-        kept = paths.plan_along(rest, paths.cells_of(paths.in_cells(rest, grid)), grid, cost, least)
+        cells, spent = paths.cells_of(paths.in_cells(rest, grid)), np.linspace(0, cost, len(rest))
+        kept = paths.Way(rest, cells, spent, least).plan(0, grid)
         ms = plan.field_ms, plan.rollout_ms
         return replace(kept, extra_cost=share - 1, field_ms=ms[0], rollout_ms=ms[1])
 

@@ -69,16 +69,13 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
     start, end, headings = motions.start, motions.end, np.arange(HEADINGS + 1)
     passed = [_passed(poses) for poses in motions.poses]
     standing, core = np.ones((2, HEADINGS, *swept.shape[1:]), dtype=np.bool_)
-    either = swept.any(axis=0)
-    for mask, before, after, (x, y), (cells, _) in zip(
-        swept, start, end, motions.offset, passed, strict=True
-    ):
-        standing[before] &= mask
-        around_end = np.roll(mask, (-y, -x), axis=(0, 1))
-        standing[after] &= around_end
-        either |= around_end
-        for over, up, *_ in cells:
-            core[before] &= np.roll(mask, (-up, -over), axis=(0, 1))
+    either = np.zeros(swept.shape[1:], dtype=np.bool_)
+    for mask, before, after, (cells, _) in zip(swept, start, end, passed, strict=True):
+        around = np.array([np.roll(mask, (-up, -over), axis=(0, 1)) for over, up, *_ in cells])
+        standing[before] &= around[0]
+        standing[after] &= around[-1]
+        core[before] &= around.all(axis=0)
+        either |= around.any(axis=0)
     reach = int(np.abs(np.argwhere(either) - swept.shape[1] // 2).max())
     around = np.ones((1, 2 * reach + TILE + 1, 2 * reach + TILE + 1), dtype=np.bool_)
     parts = [rows_of(masks) for masks in (swept, standing, core, core.all(axis=0)[None], around)]
