@@ -1,5 +1,7 @@
 """Random maps for the property tests."""
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
@@ -67,6 +69,21 @@ def json_values(scalars: st.SearchStrategy[object]) -> st.SearchStrategy[object]
 
 def cells_of(grid: GridMap) -> st.SearchStrategy[Cell]:
     return st.tuples(st.integers(0, grid.width - 1), st.integers(0, grid.height - 1))
+
+
+@st.composite
+def patched(draw: st.DrawFn, grid: GridMap) -> GridMap:
+    """The same place with other cells, or other directions, in a box."""
+    width, height = draw(st.integers(1, grid.width)), draw(st.integers(1, grid.height))
+    x, y = draw(st.integers(0, grid.width - width)), draw(st.integers(0, grid.height - height))
+    if grid.forbidden is not None and draw(st.booleans()):
+        forbidden = grid.forbidden.copy()
+        forbidden[y : y + height, x : x + width] = draw(st.integers(0, 255))
+        return replace(grid, forbidden=forbidden)
+    random = np.random.default_rng(draw(st.integers(0, 2**32)))
+    patch = random.random((height, width)) < draw(st.sampled_from([0, 0.3, 1]))
+    cost = None if grid.cost is None else random.integers(-1, 100, patch.shape)
+    return grid.with_patch(patch, x, y, cost)
 
 
 GRIDS = grids_with_free_cell() | grids_with_costs() | grids_in_parts()

@@ -24,8 +24,7 @@ PATCHED = {"occupancy", "cost", "obstacles"}  # layers of which patches change s
 MAX_PATCHES = 512  # so many are known of a map, one after the other
 
 # Directions, costs, slowness and climbs of maps without. Not to be written to, as those of maps.
-DTYPES = np.uint8, np.int8, np.float32, np.uint8
-NO_LAYERS = [np.frombuffer(b"", dtype).reshape(0, 0) for dtype in DTYPES]
+NO_LAYERS = [np.frombuffer(b"", dtype).reshape(0, 0) for dtype in ("u1", "i1", "f4", "u1")]
 
 # (101,): the multiplier of each cost, 0 to 100
 MULTIPLIERS = np.linspace(1, MAX_COST_MULTIPLIER, OCCUPIED + 1, dtype=np.float32)

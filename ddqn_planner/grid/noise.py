@@ -21,12 +21,9 @@ def scatter_obstacles(
     path: Sequence[Cell],
     move_rule: MoveRule,
     random: np.random.Generator,
-    reach: int = 1,
+    reach: int = 1,  # cells beside the path: section 5.3 can be read as 0 or 1
 ) -> tuple[GridMap, int]:
-    """Return the map with 1 to 5 obstacles more, which leave a path, and the rejected draws.
-
-    They lie on the path or up to so many cells beside it: section 5.3 can be read as 0 or 1.
-    """
+    """Return the map with 1 to 5 obstacles more, which leave a path, and the rejected draws."""
     start, goal, offsets = path[0], path[-1], range(-reach, reach + 1)
     near = {(x + dx, y + dy) for x, y in path for dx in offsets for dy in offsets}
     candidates = sorted(cell for cell in near - {start, goal} if grid.is_free(cell))

@@ -154,7 +154,7 @@ def is_path_valid(
     path: Cells, robot: Cell, grid: GridMap, move_rule: MoveRule | str, radius: float = 0.0
 ) -> bool:
     """Return whether any path is free and legal from its cell nearest to the robot on."""
-    cells = _array(path)
+    cells = np.asarray(path, dtype=np.int32).reshape(-1, 2)
     if not len(cells):
         return False
     passed, position = cells_along(cells)
@@ -175,7 +175,7 @@ def is_path_valid(
 
 def rest_of_path(path: Cells, robot: Cell, grid: GridMap, move_rule: MoveRule | str) -> Path:
     """Return what is left of a path from a robot's cell on, (N, 2): empty if it is too far."""
-    cells = _array(path)
+    cells = np.asarray(path, dtype=np.int32).reshape(-1, 2)
     if not len(cells) or not grid.is_free(robot):
         return cells[:0]
     passed, position = cells_along(cells)
@@ -220,7 +220,3 @@ def _legal_from(cells: Path, grid: GridMap, move_rule: MoveRule | str, begin: fl
     # As a segment of no length the last cell has to be free too.
     legal = legal_segments(np.concatenate([cells, cells[-1:]]), grid, move_rule, begin)
     return int(np.flatnonzero(~legal).max(initial=-1)) + 1
-
-
-def _array(path: Cells) -> Path:
-    return np.asarray(path, dtype=np.int32).reshape(-1, 2)

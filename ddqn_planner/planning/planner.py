@@ -290,7 +290,7 @@ class Planner:
         grid = request.grid
         if not grid.contains(request.start):
             return PlanStatus.START_OUTSIDE_MAP
-        if not any(grid.contains(goal) for goal in request.goals):
+        if not free and not any(map(grid.contains, request.goals)):
             return PlanStatus.GOAL_OUTSIDE_MAP
         if grid.is_obstacle(request.start) and request.start_clearing_radius == 0:
             return PlanStatus.START_OCCUPIED

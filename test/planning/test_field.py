@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 from networks import ANY_MAP, new_planner
 from random_maps import generate_map
-from strategies import GRIDS, RULES, Data, Place, cells_of, shapes
+from strategies import GRIDS, RULES, Data, Place, cells_of, patched, shapes
 
 from ddqn_planner import GridMap, MoveRule, PlanStatus
 from ddqn_planner.grid import Cell, copies, grid_map
@@ -167,24 +167,12 @@ def any_share(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @st.composite
 def changed_maps(draw: st.DrawFn, grid: GridMap) -> GridMap:
-    """Draw a map of the same place: other cells or directions in a box, or another cut of it."""
-    if grid.forbidden is not None and draw(st.booleans()):
-        forbidden = grid.forbidden.copy()
-        x, y = draw(cells_of(grid))
-        forbidden[y, x] = draw(st.integers(0, 255))
-        return replace(grid, forbidden=forbidden)
+    """Draw a map of the same place: with others in a box, or another cut of it."""
     if draw(st.booleans()):
-        width, height = draw(st.integers(1, grid.width)), draw(st.integers(1, grid.height))
-        x = draw(st.integers(0, grid.width - width))
-        y = draw(st.integers(0, grid.height - height))
-        random = np.random.default_rng(draw(st.integers(0, 2**32)))
-        patch = random.random((height, width)) < draw(st.sampled_from([0, 0.3, 1]))
-        cost = None if grid.cost is None else random.integers(-1, 100, patch.shape)
-        return grid.with_patch(patch, x, y, cost)
+        return draw(patched(grid))
     left, right, below, above = (draw(st.integers(-2, 3)) for _ in range(4))
     if grid.width + left + right < 1 or grid.height + below + above < 1:
         left = right = below = above = 1
-
     rows = slice(3 - below, 3 + grid.height + above)
     columns = slice(3 - left, 3 + grid.width + right)
     layers = (grid.occupancy, grid.cost, grid.forbidden)

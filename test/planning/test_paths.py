@@ -23,6 +23,7 @@ from strategies import (
     grids_with_costs,
     grids_with_directions,
     grids_with_free_cell,
+    patched,
 )
 
 from ddqn_planner import GridMap, MoveRule, PlanStatus, inflate, simplify
@@ -32,21 +33,6 @@ from ddqn_planner.planning import PlanRequest
 from ddqn_planner.planning.paths import REACH, is_path_valid, keep_or_switch, rest_of_path, search
 from ddqn_planner.planning.planner import last_step
 from ddqn_planner.planning.segments import cost_along, legal_segments
-
-
-@st.composite
-def changed(draw: st.DrawFn, grid: GridMap) -> GridMap:
-    """The map with some other cells and costs."""
-    occupancy = grid.occupancy.copy()
-    cost = None if grid.cost is None else grid.cost.copy()
-    for x, y in draw(st.lists(cells_of(grid), max_size=6)):
-        occupancy[y, x] ^= draw(st.booleans())
-        if cost is not None:
-            cost[y, x] = draw(st.integers(0, 99))
-    forbidden = grid.forbidden
-    if forbidden is not None and draw(st.booleans()):
-        forbidden = np.roll(forbidden, 1, axis=0)
-    return GridMap(occupancy, cost=cost, forbidden=forbidden)
 
 
 def cells_with_positions(path: list[Cell]) -> list[tuple[Cell, Fraction]]:
@@ -74,7 +60,7 @@ def test_a_path_is_valid_by_its_rest(place: Place, rule: MoveRule, data: Data) -
     path = drawn_path(data, grid, goal, rule)
     path = data.draw(st.sampled_from([path, [*simplify(path, grid, rule)]]))
     robot = data.draw(st.tuples(st.integers(-99, 99), st.integers(-99, 99)))
-    after = data.draw(changed(grid))
+    after = data.draw(patched(grid))
     passed = cells_with_positions(path)
     assert cells_along(np.array(path))[0].tolist() == [[*cell] for cell, _ in passed]
     _, position = min(passed, key=lambda entry: math.dist(entry[0], robot))
@@ -108,7 +94,7 @@ def test_a_path_of_which_only_an_occupied_end_or_nothing_is_left_is_not_valid() 
 def test_the_rest_of_a_path_leads_to_it(place: Place, rule: MoveRule, data: Data) -> None:
     grid, goal = place
     path = drawn_path(data, grid, goal, rule)
-    after = data.draw(changed(grid))
+    after = data.draw(patched(grid))
     robot = data.draw(st.tuples(st.integers(-1, 9), st.integers(-1, 9)) | st.sampled_from(path))
     for followed in (path, [*simplify(path, grid, rule)]):
         rest = list(map(tuple, rest_of_path(followed, robot, after, rule).tolist()))
@@ -158,7 +144,7 @@ def test_what_is_kept_is_cheap(place: Place, rule: MoveRule, threshold: float, d
     grid, goal = place
     start = data.draw(st.sampled_from(grid.free_cells()))
     under_way = shortest_path(grid, start, goal, rule)
-    after = data.draw(changed(grid))
+    after = data.draw(patched(grid))
     assume(after.is_free(goal) and after.free_cells())
     robot = data.draw(st.sampled_from([*filter(after.is_free, under_way), *after.free_cells()]))
     new = shortest_path(after, robot, goal, rule)
