@@ -201,7 +201,7 @@ def train(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     _add_training_options(parser, "runs/train", HyperParameters())
     options = parser.parse_args(arguments)
     map_file, start, goal = _read_map(options)
-    scenario = Scenario(map_file.grid(), start, goal)
+    scenario = Scenario(map_file.grid(), start, goal, api.MoveRule(options.move_rule))
     trainer = _run_training(options, lambda: [scenario]).trainer
     field = trainer.planner().q_field(scenario.grid, goal)
     evaluation, plan = evaluate(field, scenario.grid, field.move_rule), field.rollout(start)
@@ -219,7 +219,6 @@ def train_any_map(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> 
 
     _add_options(parser, ("maps", int, MAPS, "number of maps"))
     _add_training_options(parser, "runs/any_map", ANY_MAP)
-    parser.set_defaults(move_rule="robot_safe")
     options = parser.parse_args(arguments)
     if options.maps < 1:
         raise ValueError(f"--maps is {options.maps}; give at least 1")
@@ -280,8 +279,8 @@ def _run_training(options: Any, scenarios: Callable[[], Sequence[Scenario]]) -> 
 
     torch.set_num_threads(1)  # as fast as two for such small networks, and always the same result
     values = {entry.name: getattr(options, entry.name) for entry in fields(HyperParameters)}
-    parameters, rule = HyperParameters(**values), api.MoveRule(options.move_rule)
-    with TrainingRun(options.out, scenarios(), rule, parameters, options.seed) as run:
+    parameters = HyperParameters(**values)
+    with TrainingRun(options.out, scenarios(), parameters, options.seed) as run:
         trainer = run.trainer
         print(run.description)
         # An exception could interrupt a step; what is asked for is read between two steps.

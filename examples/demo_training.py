@@ -9,7 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
 
-from ddqn_planner import MoveRule, Planner
+from ddqn_planner import Planner
 from ddqn_planner.grid import Cell
 from ddqn_planner.training.environment import Scenario, paper_scenario
 from ddqn_planner.training.evaluation import length_ratios
@@ -20,7 +20,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "experiments"))
 from figures import COLOURS, draw_map, draw_path, frame_of, save_film
 
 FRAMES = 60
-RULE = MoveRule.CORNER_CUTTING
 
 
 def draw(
@@ -32,7 +31,7 @@ def draw(
 ) -> tuple[Image.Image, float]:
     """Draw what the robot did last and what it knows now; return the share of solved starts."""
     grid, field = scenario.grid, planner.q_field(scenario.grid, scenario.goal)
-    ratios = length_ratios(field, grid, RULE)
+    ratios = length_ratios(field, grid, scenario.move_rule)
     solved = np.where(np.isnan(ratios), np.nan, np.isfinite(ratios))
     share, step = float(np.nanmean(solved)), planner.metadata.steps
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.6, 4.8), layout="constrained")
@@ -52,7 +51,7 @@ def main(arguments: Sequence[str]) -> int:
     """Train, print how well, and save the film."""
     steps = int(arguments[0]) if arguments else HyperParameters().steps
     scenario, parameters = paper_scenario(), HyperParameters(learning_rate=0.001, steps=steps)
-    trainer = Trainer([scenario], RULE, parameters, seed=0)
+    trainer = Trainer([scenario], parameters, seed=0)
     interval, curve = max(1, steps // FRAMES), list[tuple[int, float]]()
     frames, episodes = list[Image.Image](), list[Any]()
     for ended in trainer.run(steps, interval):

@@ -23,7 +23,7 @@ from rcl_interfaces.srv import GetParameters
 from std_srvs.srv import Trigger
 from tables import table
 
-from ddqn_planner.grid import OCCUPIED, MapFile, MoveRule
+from ddqn_planner.grid import OCCUPIED, MapFile
 from ddqn_planner.grid.noise import MAX_NEW_OBSTACLES, random_requests
 from ddqn_planner.model import load_model
 from ddqn_planner.nodes.runtime import LATCHED
@@ -175,9 +175,7 @@ class Faults(Client):
         if model.exists():
             load_model(model)
         if (checkpoint := model.with_name("checkpoint.safetensors")).exists():
-            trainer = Trainer(
-                [paper_scenario()], MoveRule.CORNER_CUTTING, HyperParameters(), seed=0
-            )
+            trainer = Trainer([paper_scenario()], HyperParameters(), seed=0)
             trainer.restore(checkpoint)
             steps = trainer.steps
         self.start("trainer")

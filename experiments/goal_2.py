@@ -50,7 +50,7 @@ def count_solved(ratios: Sequence[NDArray[np.float64]], starts: Any) -> str:
 def trained_field(planner: Planner) -> QField:
     """Return the Q field of a propagation network as the loss trained it: with reward and γ."""
     occupancy = SCENARIO.grid.occupancy
-    environment = GridVectorEnvironment([SCENARIO], MOVE_RULE, PROFILES["propagation"])
+    environment = GridVectorEnvironment([SCENARIO], PROFILES["propagation"])
     network, cells = planner.network, np.arange(occupancy.size)
     assert isinstance(network, PropagationQNetwork)
     parts = [{name: tensor.copy() for name, tensor in network.tensors.items()} for _ in range(4)]

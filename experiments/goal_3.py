@@ -99,7 +99,7 @@ def train_supervised(training: Training) -> None:
     if path.exists():
         return
     path.parent.mkdir(parents=True, exist_ok=True)
-    trainer = Trainer(training.scenarios, MOVE_RULE, training.parameters, training.seed)
+    trainer = Trainer(training.scenarios, training.parameters, training.seed)
     best_SCA = np.stack([best_moves(scenario) for scenario in training.scenarios])
     scenario, cell = np.nonzero(best_SCA.any(axis=2))
     random = np.random.default_rng(training.seed)
@@ -146,7 +146,7 @@ def report(settings: Settings) -> str:
     rows = []
     for noise in settings.noise:
         training, test = drawn_maps(settings, noise)
-        maps, lengths = GridVectorEnvironment([*training, *test], MOVE_RULE, PAPER), {}
+        maps, lengths = GridVectorEnvironment([*training, *test], PAPER), {}
         for label, (folder, parameters) in networks(settings).items():
             name = f"{noise}/{folder}"
             lengths[label] = np.array([rollouts(p, maps)[0] for p in settings.planners(name, KEPT)])

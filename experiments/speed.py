@@ -301,12 +301,12 @@ def measure_training() -> Iterator[bool]:
     """Compare our steps with torch and with Stable-Baselines3: same network, an update a step."""
     # ε is at its last value from the start: a random action costs no forward pass.
     p = HyperParameters(epsilon_start=HyperParameters().epsilon_end)
-    scenario, rule = paper_scenario(), MoveRule.CORNER_CUTTING
-    ours, in_torch = (Trainer([scenario], rule, p, seed=0) for _ in range(2))
+    scenario = paper_scenario()
+    ours, in_torch = (Trainer([scenario], p, seed=0) for _ in range(2))
     TorchLearner(in_torch)
     theirs = DQN(
         "MlpPolicy",
-        GridEnvironment(scenario, rule, p),
+        GridEnvironment(scenario, p),
         learning_rate=p.learning_rate,
         buffer_size=p.replay_capacity,
         learning_starts=p.learning_starts,

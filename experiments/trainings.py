@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from ddqn_planner.files import write_atomically, write_csv
-from ddqn_planner.grid import LENGTHS, MoveRule, neighbours
+from ddqn_planner.grid import LENGTHS, neighbours
 from ddqn_planner.model import PaperQNetwork
 from ddqn_planner.planning import Planner
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario, paper_scenario
@@ -25,7 +25,7 @@ from ddqn_planner.training.shared_background import evaluate, look, networks_of
 from ddqn_planner.training.trainer import Trainer
 
 SCENARIO: Final = paper_scenario()
-MOVE_RULE: Final = MoveRule.CORNER_CUTTING  # by it the paper's 22.97 is the shortest path
+MOVE_RULE: Final = SCENARIO.move_rule  # by it the paper's 22.97 is the shortest path
 BACKENDS: Final = ("loky", "ray", "dask", "sequential")  # of joblib: this machine, or a cluster
 HIDDEN_UNITS: Final = (0, 128)  # of the paper's network for goal iii; 0 for no hidden layer
 # How far from the path new obstacles lie, in cells, by two readings of section 5.3: the "free
@@ -151,7 +151,7 @@ def _in_one_thread(job: Callable[[Any], Any], item: Any) -> Any:
 def train(training: Training) -> None:
     """Train and evaluate, or resume; keep the last network that solved the most scenarios, too."""
     folder = training.folder
-    run = TrainingRun(folder, training.scenarios, MOVE_RULE, training.parameters, training.seed)
+    run = TrainingRun(folder, training.scenarios, training.parameters, training.seed)
     with closing(run):
         trainer = run.trainer
         before = read_csv(folder / "evaluations.csv")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from ddqn_planner.grid import GridMap
+from ddqn_planner.grid import GridMap, MoveRule
 from ddqn_planner.training.environment import Scenario, paper_scenario
 
 # A shell starts what it runs in the background with SIGINT ignored; the processes that the tests
@@ -30,4 +30,4 @@ def small() -> Scenario:
     """A 5x4 map with a wall that is open at its top."""
     occupancy = np.zeros((4, 5), dtype=bool)
     occupancy[:3, 2] = True
-    return Scenario(GridMap(occupancy), start=(0, 0), goal=(4, 0))
+    return Scenario(GridMap(occupancy), (0, 0), (4, 0), MoveRule.ROBOT_SAFE)

@@ -4,7 +4,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -115,7 +115,8 @@ def test_each_hyper_parameter_can_be_given(
     given["steps"] = 4
     arguments = [f"--{name.replace('_', '-')}={value}" for name, value in given.items()]
     console("train --seed 5", small_map, "--out", tmp_path / "run", *arguments)
-    trainer = Trainer([small], MoveRule.CORNER_CUTTING, HyperParameters(**given), seed=5)
+    scenario = replace(small, move_rule=MoveRule.CORNER_CUTTING)
+    trainer = Trainer([scenario], HyperParameters(**given), seed=5)
     trainer.restore(tmp_path / "run" / "checkpoint.safetensors")  # of these parameters alone
     assert trainer.steps == 4
     assert not given.items() & {entry.name: entry.default for entry in PARAMETERS}.items()
@@ -127,7 +128,7 @@ def test_the_model_for_any_map_is_trained_with_parameters_of_its_own(
 ) -> None:
     console("train-any-map --maps 3 --seed 4 --steps 128 --out", tmp_path)
     scenarios = random_scenarios(seed=4, maps=3)
-    trainer = Trainer(scenarios, MoveRule.ROBOT_SAFE, ANY_MAP, seed=4)
+    trainer = Trainer(scenarios, ANY_MAP, seed=4)
     trainer.restore(tmp_path / "checkpoint.safetensors")  # of these parameters alone
     assert trainer.steps == 128
 

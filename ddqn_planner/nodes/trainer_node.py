@@ -264,9 +264,9 @@ class TrainerNode(BaseNode):
         from ddqn_planner.training.environment import Scenario  # these import gymnasium, torch
         from ddqn_planner.training.run import TrainingRun
 
-        scenarios, rule = [Scenario(place.grid, start, goal)], MoveRule(self.value("move_rule"))
+        scenario = Scenario(place.grid, start, goal, MoveRule(self.value("move_rule")))
         how = self._hyper_parameters({}), self.value("seed")
-        return place, TrainingRun(self.folder, scenarios, rule, *how)
+        return place, TrainingRun(self.folder, [scenario], *how)
 
     def stop(self) -> tuple[bool, str]:
         """Stop the training, which saves."""

@@ -25,7 +25,7 @@ class Scenario:
     grid: GridMap
     start: Cell
     goal: Cell
-    move_rule: MoveRule | None = None  # by default that of its environment
+    move_rule: MoveRule = MoveRule.CORNER_CUTTING  # the paper's, likely
 
     def __post_init__(self) -> None:
         for name, cell in (("start", self.start), ("goal", self.goal)):
@@ -52,7 +52,6 @@ class GridVectorEnvironment:
     def __init__(
         self,
         scenarios: Sequence[Scenario],
-        move_rule: MoveRule,
         parameters: HyperParameters,
         random: np.random.Generator | None = None,
     ) -> None:
@@ -62,15 +61,14 @@ class GridVectorEnvironment:
         (self.shape,) = shapes
         self.scenarios = tuple(scenarios)
         self.parameters = parameters
-        self.move_rules = tuple(s.move_rule or move_rule for s in scenarios)
         self.random = random or np.random.default_rng()
 
         maps = [observation_background(s.grid.occupancy, s.goal) for s in scenarios]
         self.background, self.next_cell = np.stack(maps), neighbours(self.shape)
         tables, to_number = (len(maps), len(MOVES), -1), np.array([1, self.shape[1]])
-        with_rules = list(zip(self.scenarios, self.move_rules, strict=True))
-        legal = [s.grid.legal_moves(rule) for s, rule in with_rules]
-        reward = [move_reward(s.grid, s.start, s.goal, rule, parameters) for s, rule in with_rules]
+        legal = [s.grid.legal_moves(s.move_rule) for s in scenarios]
+        given = [(s.grid, s.start, s.goal, s.move_rule) for s in scenarios]
+        reward = [move_reward(*of_scenario, parameters) for of_scenario in given]
         self.legal = np.stack(legal).reshape(tables)
         self.free_reward = np.stack(reward).reshape(tables)
         collision = np.float32(parameters.obstacle_reward)
@@ -126,13 +124,10 @@ class GridEnvironment(gymnasium.Env[Observations, np.int64]):
     metadata = {"render_modes": []}  # noqa: RUF012
 
     def __init__(
-        self,
-        scenario: Scenario | None = None,
-        move_rule: MoveRule = MoveRule.CORNER_CUTTING,
-        parameters: HyperParameters | None = None,
+        self, scenario: Scenario | None = None, parameters: HyperParameters | None = None
     ) -> None:
         parameters = replace(parameters or HyperParameters(), environments=1)
-        self.vector = GridVectorEnvironment([scenario or paper_scenario()], move_rule, parameters)
+        self.vector = GridVectorEnvironment([scenario or paper_scenario()], parameters)
         self.action_space = gymnasium.spaces.Discrete(len(MOVES))
         self.observation_space = gymnasium.spaces.Box(
             OBSTACLE, max(GOAL, ROBOT), self.vector.shape, np.float32

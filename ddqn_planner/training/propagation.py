@@ -39,8 +39,7 @@ class PropagationLearner:
         self.uses_costs = network.uses_costs
         self._parts = [{name: torch.from_numpy(t) for name, t in part.items()} for part in parts]
         self._online, self._target, *_ = self._parts
-        with_rules = zip(e.scenarios, e.move_rules, strict=True)
-        seen = [(patches(s.grid.occupancy, s.grid.cost), rule) for s, rule in with_rules]
+        seen = [(patches(s.grid.occupancy, s.grid.cost), s.move_rule) for s in e.scenarios]
         features = np.concatenate([network.features(*of_map) for of_map in seen])
         self._feature_UI, places = np.unique(features, axis=0, return_inverse=True)
         self._place_SC = places.reshape(len(seen), -1)

@@ -5,7 +5,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ddqn_planner.files import WorkFolder, write_atomically
-from ddqn_planner.grid import MoveRule
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.episodes import Episode, open_record, record
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -23,7 +22,6 @@ class TrainingRun(WorkFolder):
         self,
         folder: str | Path,
         scenarios: Sequence[Scenario],
-        move_rule: MoveRule,
         parameters: HyperParameters,
         seed: int,
     ) -> None:
@@ -32,7 +30,7 @@ class TrainingRun(WorkFolder):
         self.model_path = self.folder / "model.safetensors"
         self.checkpoint_path = self.folder / CHECKPOINT
         with self.opening(), _memory_with_remedy():
-            self.trainer = Trainer(scenarios, move_rule, parameters, seed)
+            self.trainer = Trainer(scenarios, parameters, seed)
             if self.checkpoint_path.exists():
                 self.trainer.restore(self.checkpoint_path)
             self._record = open_record(self.folder / "episodes.csv", self.trainer.episodes)
@@ -43,11 +41,11 @@ class TrainingRun(WorkFolder):
 
     def steps(self, every: int = SAVE_INTERVAL) -> Iterator[list[Episode]]:
         """Train until the end or "stop" is asked for, and save; yield as `Trainer.run` does."""
-        rules, until = self.trainer.environment.move_rules, self.trainer.parameters.steps
+        scenarios, until = self.trainer.scenarios, self.trainer.parameters.steps
         with _memory_with_remedy():
             for finished in self.trainer.run(until, every):
                 for episode in finished:
-                    self._record.append(record(episode, rules[episode.scenario]))
+                    self._record.append(record(episode, scenarios[episode.scenario].move_rule))
                 due = self.trainer.steps // SAVE_INTERVAL != self.saved_at // SAVE_INTERVAL
                 if (due or "save" in self.asked) and self.trainer.steps < until:
                     self.asked.discard("save")

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from safetensors import safe_open
 
 from ddqn_planner.files import differences, write_atomically
-from ddqn_planner.grid import MOVES, MoveRule
+from ddqn_planner.grid import MOVES
 from ddqn_planner.model import (
     NETWORKS,
     ModelMetadata,
@@ -44,14 +44,9 @@ class Trainer:
     """Trains a Q-network by Double DQN; the same arguments give the same network, bit for bit."""
 
     def __init__(
-        self,
-        scenarios: Sequence[Scenario],
-        move_rule: MoveRule,
-        parameters: HyperParameters,
-        seed: int,
+        self, scenarios: Sequence[Scenario], parameters: HyperParameters, seed: int
     ) -> None:
         self.scenarios = tuple(scenarios)
-        self.move_rule = move_rule
         self.parameters = parameters
         self.seed = seed
         self.steps = self.updates = self.episodes = 0
@@ -59,7 +54,7 @@ class Trainer:
         weights, *others = np.random.SeedSequence(seed).spawn(4)
         self._generators = [np.random.default_rng(sequence) for sequence in others]
         initial, self._exploration, self._sampling = self._generators
-        self.environment = GridVectorEnvironment(self.scenarios, move_rule, parameters, initial)
+        self.environment = GridVectorEnvironment(self.scenarios, parameters, initial)
         network_class, (height, width) = NETWORKS[parameters.network], self.environment.shape
         known = {**asdict(parameters), "height": height, "width": width}
         sizes = {name: known[name] for name in network_class.size_names}
@@ -142,9 +137,9 @@ class Trainer:
 
     def planner(self) -> Planner:
         """Return a planner with a copy of the network as it is now."""
-        p, network, grid = self.parameters, self.network, self.scenarios[0].grid
-        of_training = grid.fingerprint, self.steps, self.seed, package_version()
-        metadata = ModelMetadata(p.network, network.sizes, self.move_rule, p.gamma, *of_training)
+        p, network, first = self.parameters, self.network, self.scenarios[0]
+        of_training = first.grid.fingerprint, self.steps, self.seed, package_version()
+        metadata = ModelMetadata(p.network, network.sizes, first.move_rule, p.gamma, *of_training)
         tensors = {name: tensor.copy() for name, tensor in network.tensors.items()}
         return Planner(type(network)(network.sizes, tensors), metadata)
 
@@ -161,7 +156,7 @@ class Trainer:
         e = self.environment
         return {
             "seed": self.seed,
-            "move_rule": self.move_rule.value,
+            "move_rule": self.scenarios[0].move_rule.value,
             "parameters": asdict(self.parameters),
             "scenarios": [[s.grid.fingerprint, [*s.start], [*s.goal]] for s in self.scenarios],
             "counters": [self.steps, self.updates, self.episodes, self._replay.added],

@@ -117,7 +117,7 @@ def test_the_last_of_the_networks_that_solve_the_most_is_kept(
 
 
 def test_the_over_estimation_is_that_of_the_free_cells_but_the_goal(small: Scenario) -> None:
-    trainer = Trainer([small], trainings.MOVE_RULE, QUICK, seed=0)
+    trainer = Trainer([small], QUICK, seed=0)
     found = trainings.evaluate_training(trainer, np.full(20, -2.0, dtype=np.float32))
     value = trainer.planner().q_field(small.grid, small.goal).q.max(axis=0)
     cells = [cell for cell in small.grid.free_cells() if cell != small.goal]
@@ -128,7 +128,7 @@ def test_the_over_estimation_is_that_of_the_free_cells_but_the_goal(small: Scena
 @pytest.mark.parametrize("alpha", [0.0, 0.6])
 def test_the_optimal_value_is_what_the_best_policy_earns(small: Scenario, alpha: float) -> None:
     parameters = replace(QUICK, alpha=alpha)
-    environment = GridVectorEnvironment([small], trainings.MOVE_RULE, parameters)
+    environment = GridVectorEnvironment([small], parameters)
     value = trainings.optimal_value(environment)
     # Bellman's equation, with what the environment itself does.
     for x, y in small.grid.free_cells():

@@ -15,7 +15,7 @@ BRIEF = 96_000
 
 @pytest.fixture(scope="module")
 def planner() -> Planner:
-    trainer = Trainer(random_scenarios(seed=0), MoveRule.ROBOT_SAFE, ANY_MAP, seed=0)
+    trainer = Trainer(random_scenarios(seed=0), ANY_MAP, seed=0)
     for _ in trainer.run(BRIEF):
         pass
     return trainer.planner()
@@ -58,7 +58,7 @@ def test_the_maps_to_train_on_are_those_of_the_seed_and_have_costs_of_every_sort
     assert said == same
     assert said[0] != other[0]
     for scenario in scenarios:
-        joined = scenario.grid.reachable([scenario.goal], scenario.move_rule or MOVE_RULES[0])
+        joined = scenario.grid.reachable([scenario.goal], scenario.move_rule)
         assert joined[scenario.start[1], scenario.start[0]]
     assert {scenario.move_rule for scenario in scenarios} == set(MOVE_RULES)
     grids = [scenario.grid for scenario in scenarios]

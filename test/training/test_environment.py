@@ -47,7 +47,7 @@ def test_a_batch_moves_as_by_hand(paper: Scenario, rule: MoveRule, count: int, r
     parameters = replace(PARAMETERS, **changes)
     cost = np.random.default_rng(0).integers(0, 99, (20, 20))
     paper = replace(paper, grid=replace(paper.grid, cost=cost.astype(np.int8)), move_rule=rule)
-    batch = GridVectorEnvironment([paper], MoveRule.ROBOT_SAFE, parameters)
+    batch = GridVectorEnvironment([paper], parameters)
     random = np.random.default_rng(count)
     batch.reset()
     background = observation_background(paper.grid.occupancy, paper.goal)
@@ -73,9 +73,9 @@ def test_a_batch_moves_as_by_hand(paper: Scenario, rule: MoveRule, count: int, r
 
 
 def test_the_scalar_environment_is_a_batch_of_one(paper: Scenario) -> None:
-    batch = GridVectorEnvironment([paper], MoveRule.ROBOT_SAFE, PARAMETERS)
+    batch = GridVectorEnvironment([paper], PARAMETERS)
     # How many environments a batch has does not matter here.
-    scalar = GridEnvironment(paper, MoveRule.ROBOT_SAFE, replace(PARAMETERS, environments=7))
+    scalar = GridEnvironment(paper, replace(PARAMETERS, environments=7))
     actions = np.random.default_rng(0)
     for seed in range(30):
         observation, info = scalar.reset(seed=seed)
@@ -97,7 +97,7 @@ def test_an_episode_starts_with_probability_p_r_in_any_cell(paper: Scenario, p_r
     scenarios = [paper, Scenario(GridMap(np.zeros((20, 20))), (0, 0), (4, 3))]
     parameters = HyperParameters(environments=4000, p_r=p_r)
     random = np.random.default_rng(2)
-    batch = GridVectorEnvironment(scenarios, MoveRule.ROBOT_SAFE, parameters, random)
+    batch = GridVectorEnvironment(scenarios, parameters, random)
     drawn: tuple[list[int], list[int]] = [], []
     for _ in range(4):
         batch.reset()
@@ -129,12 +129,12 @@ def test_a_scenario_needs_two_free_cells(small: Scenario) -> None:
             Scenario(small.grid, *ends)
     other = Scenario(GridMap(np.zeros((2, 2))), (0, 0), (1, 1))
     with pytest.raises(ValueError, match="one size"):
-        GridVectorEnvironment([small, other], MoveRule.ROBOT_SAFE, PARAMETERS)
+        GridVectorEnvironment([small, other], PARAMETERS)
 
 
 def test_a_move_that_succeeds_is_rewarded_for_the_goal_only_beside_it(small: Scenario) -> None:
     parameters = HyperParameters(alpha=0.0, beta=0.0)
-    environment = GridVectorEnvironment([small], MoveRule.ROBOT_SAFE, parameters)
+    environment = GridVectorEnvironment([small], parameters)
     rewarded = {(int(c) % 5, int(c) // 5) for _, c in np.argwhere(environment.free_reward[0])}
     # The goal (4, 0) is at the end of its row: the first cells of the next one are far from it.
     assert rewarded == {(3, 0), (3, 1), (4, 1)}

@@ -27,7 +27,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def open_run(folder: Path, scenario: Scenario, **changes: object) -> TrainingRun:
     parameters = replace(PARAMETERS, **changes)  # type: ignore[arg-type]
-    return TrainingRun(folder, [scenario], MoveRule.ROBOT_SAFE, parameters, seed=0)
+    return TrainingRun(folder, [scenario], parameters, seed=0)
 
 
 def finish(run: TrainingRun) -> list[Episode]:
@@ -158,7 +158,7 @@ def test_a_training_that_cannot_fit_is_refused_with_the_remedy(tmp_path: Path) -
     greedy = replace(PARAMETERS, filters=1024, hidden_units=4096)  # 400 GB of weights
     for _ in range(2):  # the folder is not left locked
         with pytest.raises(MemoryError, match="a smaller map, or smaller filters"):
-            TrainingRun(tmp_path, [Scenario(grid, (0, 0), (1, 1))], MoveRule.UNIT, greedy, seed=0)
+            TrainingRun(tmp_path, [Scenario(grid, (0, 0), (1, 1))], greedy, seed=0)
 
 
 GOOD = b"1,9,0,reached_goal,2,2.0,1.5,0.75,0:0 1:0 2:0\r\n"

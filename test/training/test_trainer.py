@@ -26,7 +26,7 @@ QUICK = HyperParameters(
 
 
 def make(scenario: Scenario, parameters: HyperParameters = QUICK, seed: int = 0) -> Trainer:
-    return Trainer([scenario], MoveRule.ROBOT_SAFE, parameters, seed)
+    return Trainer([scenario], parameters, seed)
 
 
 def train(trainer: Trainer, until: int) -> list[Episode]:
@@ -91,7 +91,8 @@ def test_weights_begin_as_those_of_torch(small: Scenario, network: str) -> None:
 def test_a_propagation_network_learns(small: Scenario, paper: Scenario, rule: MoveRule) -> None:
     quick = {"learning_rate": 0.003, "batch_size": 256, "filters": 32, "environments": 8}
     quick |= {"target_interval": 50, "update_interval": 8}
-    trainer = Trainer([paper], rule, HyperParameters(network="propagation", **quick), seed=0)
+    parameters = HyperParameters(network="propagation", **quick)
+    trainer = Trainer([replace(paper, move_rule=rule)], parameters, seed=0)
     train(trainer, 8000)
     for scenario in (paper, small):
         field = trainer.planner().q_field(scenario.grid, scenario.goal)
@@ -160,8 +161,9 @@ def test_an_episode_adds_up_its_own_rewards_alone(small: Scenario) -> None:
 
 
 def test_a_saved_model_plans_as_its_trainer(small: Scenario, tmp_path: Path) -> None:
+    small = replace(small, move_rule=MoveRule.UNIT)
     other = replace(small, grid=GridMap(np.zeros((4, 5))))
-    trainer = Trainer([small, other], MoveRule.UNIT, replace(QUICK, gamma=0.8), seed=3)
+    trainer = Trainer([small, other], replace(QUICK, gamma=0.8), seed=3)
     train(trainer, 2)
     (tmp_path / "model.safetensors").write_bytes(trainer.model_bytes())
     network, found = load_model(tmp_path / "model.safetensors")

@@ -53,7 +53,7 @@ def about_to_update(scenarios: list[Scenario], parameters: HyperParameters) -> T
     """A trainer that makes its first update after the next step; its two networks differ."""
     settings = {"learning_starts": 60, "environments": 5, "update_interval": 5}
     parameters = replace(parameters, **settings, max_episode_steps=7)
-    trainer = Trainer(scenarios, MoveRule.CORNER_CUTTING, parameters, seed=1)
+    trainer = Trainer(scenarios, parameters, seed=1)
     for _ in trainer.run(60):
         pass
     part(trainer)
@@ -112,7 +112,7 @@ def test_compiled_training_is_that_of_torch(
     brief = {"learning_rate": 0.001, "learning_starts": 20, "target_interval": 10}
     brief |= {"epsilon_steps": 60, "environments": 3, "max_episode_steps": 7, "filters": 4}
     parameters = HyperParameters(target=target, hidden_units=units, **brief)
-    trainers = [Trainer(scenarios, MoveRule.ROBOT_SAFE, parameters, seed=2) for _ in range(2)]
+    trainers = [Trainer(scenarios, parameters, seed=2) for _ in range(2)]
     compiled, of_torch = trainers
     for trainer in trainers:
         part(trainer)
@@ -122,7 +122,7 @@ def test_compiled_training_is_that_of_torch(
     assert compiled.updates == of_torch.updates > 60
     check_same(compiled, of_torch)
     of_torch.save_checkpoint(tmp_path / "checkpoint")
-    compiled = Trainer(scenarios, MoveRule.ROBOT_SAFE, parameters, seed=2)
+    compiled = Trainer(scenarios, parameters, seed=2)
     compiled.restore(tmp_path / "checkpoint")
     one, other = ([e for ended in t.run(180) for e in ended] for t in (compiled, of_torch))
     assert one == other
@@ -139,7 +139,7 @@ def check_same(compiled: Trainer, of_torch: Trainer) -> None:
 
 def test_weights_whose_gradients_fade_move_as_those_of_torch(small: Scenario) -> None:
     parameters = HyperParameters(hidden_units=6, filters=4)
-    trainer = Trainer([small], MoveRule.ROBOT_SAFE, parameters, seed=2)
+    trainer = Trainer([small], parameters, seed=2)
     zeros = ({name: 0 * t for name, t in trainer.network.tensors.items()} for _ in range(3))
     e, parts = trainer.environment, (trainer.network.tensors, *zeros)
     windows, networks = networks_of(e.background, e.shape, parts, batch=1)
@@ -168,7 +168,7 @@ def test_an_update_is_the_equations_and_counts_each_reward_once(
     cost = np.arange(20, dtype=np.int8).reshape(4, 5)
     walls = small.grid.occupancy
     scenarios = [
-        replace(small, grid=GridMap(walls, cost=cost)),
+        replace(small, grid=GridMap(walls, cost=cost), move_rule=MoveRule.CORNER_CUTTING),
         Scenario(GridMap(walls[::-1]), (4, 3), (0, 1), MoveRule.ROBOT_SAFE),
     ]
     settings = {"reward": "path_cost", "gamma": 0.5, "obstacle_reward": -20.0, "filters": 4}
@@ -182,8 +182,7 @@ def test_an_update_is_the_equations_and_counts_each_reward_once(
 
     def q_of(weights: dict[str, Tensor], scenario: Scenario, value: Any) -> dict[Cell, Tensor]:
         seen = patches(scenario.grid.occupancy, scenario.grid.cost)
-        rule = scenario.move_rule or MoveRule.CORNER_CUTTING
-        features = torch.from_numpy(AnyMapQNetwork.features(seen, rule))
+        features = torch.from_numpy(AnyMapQNetwork.features(seen, scenario.move_rule))
         p, multiplier = propagation_layers(weights, features)
         answers = {}
         for number in range(20):
