@@ -28,6 +28,8 @@ from ddqn_planner.planning import Planner
 from ddqn_planner.planning.plan import PosePlan
 from ddqn_planner.planning.segments import SAME_COST
 
+CONFIGURED = "inactive", "active"  # states with a map, a start and requests
+Planning = Coroutine[None, None, Outcome]
 LOOK_PERIOD, IDLE_PERIOD = 0.1, 1.0  # seconds until the next look: after a change, and else
 
 
@@ -43,30 +45,20 @@ class PlannerNode(ManagedNode):
         self._report = Report(self, self._look_soon)
         self._worker, self._map_worker, self._display_worker = (Worker(self) for _ in range(3))
         self._model = ModelSource(self, self._report, self._worker)
-        if self._settings.autostart:
-            # While it loads, DDS discovers, and the node says what else is missing.
-            self._model.load()
         self._answering = 0
-        self._forget()
+        self.deactivate()
         self.add_post_set_parameters_callback(self._apply_parameters)
         if self._settings.autostart:
             self.start()
 
     # Lifecycle
 
-    def _forget(self) -> None:
-        """Have no map and no goal, and refuse requests."""
-        self._is_configured = False
-        # What requests are answered, also those under way; None while the node is active.
-        self._refusal: Outcome | None = NOT_ACTIVE
-        self._logged: tuple[object, ...] = ()
-        self.deactivate()
-
     def start(self) -> None:
         """Configure the node; what is asked before the model is loaded waits for it."""
+        # While it loads, DDS discovers, and the node says what else is missing.
+        self._model.load()
         super().start()
-        self._refusal = None
-        self._replan.trigger()
+        self.activate()  # the state follows when there is a model
 
     def configure(self) -> None:
         """Listen to the map and to where the robot is, and create what answers requests."""
@@ -80,8 +72,8 @@ class PlannerNode(ManagedNode):
         self._places = Places(self, self._report, lambda: self._map.frame, self._on_start)
         inputs = self._map, self._places, self._model
         self._requests = Requests(self._settings, *inputs, self._worker, self._look_soon)
-        self.create_subscription(PoseStamped, "goal_pose", lambda goal: self._on_goals([goal]), 10)
-        self.create_subscription(PoseArray, "goal_poses", self._on_goal_poses, 10)
+        self.create_subscription(PoseStamped, "goal_pose", self._on_goals, 10)
+        self.create_subscription(PoseArray, "goal_poses", self._on_goals, 10)
         if self._settings.follow_trainer:
             self.create_subscription(UInt8MultiArray, "trainer/model", self._on_model, LATCHED)
         # Reentrant: a request that waits for its field does not keep out the others.
@@ -89,27 +81,29 @@ class PlannerNode(ManagedNode):
         self.create_service(GetPlan, "~/get_plan", self._on_get_plan, callback_group=reentrant)
         self.create_trigger("~/reload_model", self._model.on_reload)
         serve_nav2(self, lambda: self._refusal, self._plan_for_action, self._on_is_path_valid)
-        self._is_configured = True
 
     def activate(self) -> None:
         """Answer requests from now on."""
-        self._refusal = None
+        # What requests are answered, also those under way; None while the node is active.
+        self._refusal: Outcome | None = None
         self._report.change()
         self._replan.trigger()
 
     def deactivate(self) -> None:
-        """Forget the active goal."""
+        """Refuse requests, and forget the active goal."""
         super().deactivate()
+        self._refusal = NOT_ACTIVE
         self._active = ActiveGoal([], 0.0)
         # Of actions whose path can be kept, and of those whose path can get better, the last ones.
         self._followed: Outcome | None = None
         self._newest: Outcome | None = None
+        self._logged: tuple[object, ...] = ()
         self._report.change()
 
     def cleanup(self) -> None:
         """Free the map, the model and its fields."""
         super().cleanup()
-        self._forget()
+        self.deactivate()
         self._report.refused.clear()
         self._report.note(NO_REQUEST)
         self.after_jump_back.clear()
@@ -143,7 +137,7 @@ class PlannerNode(ManagedNode):
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
         self._settings = self.settings()
         changed = {parameter.name for parameter in parameters} & self._declared.keys()
-        if not (changed and self._is_configured):  # subscriptions declare parameters, too
+        if not changed or self.state not in CONFIGURED:  # subscriptions declare parameters, too
             return
         if "model" in changed:
             self._model.use(*self._candidate)
@@ -169,19 +163,16 @@ class PlannerNode(ManagedNode):
         self._active = ActiveGoal(goals, self._settings.replan_period, followed)
         self._replan.trigger()
 
-    def _on_goal_poses(self, message: PoseArray) -> None:
-        if not message.poses:
+    def _on_goals(self, message: PoseStamped | PoseArray) -> None:
+        poses = message.poses if isinstance(message, PoseArray) else [message.pose]
+        if not poses:
             self._report.refuse("goal_poses", "the array has no pose; give one or more")
-            return
-        self._on_goals([PoseStamped(header=message.header, pose=pose) for pose in message.poses])
-
-    def _on_goals(self, goals: list[PoseStamped]) -> None:
-        if self._refusal is not None:
+        elif self._refusal is not None:
             self._report.note(self._refusal)
             self._report.log(self._refusal)
-            return
-        self._report.accept("goal_poses")
-        self._plan_for(goals)
+        else:
+            self._report.accept("goal_poses")
+            self._plan_for([PoseStamped(header=message.header, pose=pose) for pose in poses])
 
     # Planning
 
@@ -257,10 +248,7 @@ class PlannerNode(ManagedNode):
         return response
 
     async def _answer(
-        self,
-        goals: list[PoseStamped],
-        planning: Coroutine[None, None, Outcome],
-        given_up: GivenUp = lambda: None,
+        self, goals: list[PoseStamped], planning: Planning, given_up: GivenUp = lambda: None
     ) -> Outcome:
         """Plan, unless the node stops or the request is given up."""
         self._answering += 1
@@ -290,23 +278,21 @@ class PlannerNode(ManagedNode):
             self._looks.reset()
 
     def _on_look(self) -> None:
-        is_frequent = bool(self._active.poses) and self._settings.replan_period < IDLE_PERIOD
-        self._look_soon(is_frequent or self._active.lacks_pose)
-        if self._is_configured:
+        active, missing = self._active, [self._refusal.reason if self._refusal else ""]
+        is_frequent = bool(active.poses) and self._settings.replan_period < IDLE_PERIOD
+        self._look_soon(is_frequent or active.lacks_pose)
+        if is_configured := self.state in CONFIGURED:
             self._requests.look_again()
             self._places.transform_start()
-            active, is_lost = self._active, bool(self._map.missing)
+            missing.append(self._map.missing)
             has_come = active.lacks_pose and self._places.know(active.poses)
-            if has_come or active.is_look_due(is_lost):
+            if has_come or active.is_look_due(bool(missing[-1])):
                 self._replan.trigger()
         if self._report.is_due():
-            missing = [self._refusal.reason] if self._refusal is not None else []
-            missing += [self._map.missing] if self._is_configured else []
             missing += ["the model is being loaded"] if self._model.loading else []
             fatal = self._model.planner is None and "model" in self._report.refused
             values = {"state": self.state, **self._model.describe(self._settings.move_rule)}
-            if self._is_configured:
-                values |= self._map.describe()
+            values |= self._map.describe() if is_configured else {}
             self._report.publish(fatal, "; ".join(filter(None, missing)), values)
 
 

@@ -23,9 +23,7 @@ Request = PlanRequest | PoseRequest
 PATIENCE = 1.0  # seconds within which a new listener hears a first map, odometry or TF
 PERIOD = 0.9  # seconds until diagnostics are due when nothing changes: at the next look
 
-TOLERANCE = ", or a greater tolerance"
-"""The part of a remedy that does not help with several goals: none of them moves."""
-
+TOLERANCE = ", or a greater tolerance"  # does not help with several goals: none of them moves
 REMEDIES = {
     PlanStatus.START_OUTSIDE_MAP: "set the start on the map",
     PlanStatus.GOAL_OUTSIDE_MAP: "set the goal on the map",

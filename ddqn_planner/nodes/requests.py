@@ -133,11 +133,14 @@ class ModelSource:
     def load(self) -> None:
         """Begin to load the first model, and to compile what many requests need."""
 
-        def read() -> tuple[Planner, str]:
-            planner, file = read_model(self._node.value("model"))
-            compiling = warm_up(planner, self._node.value("follow_trainer"))
-            gc.set_threshold(20_000)  # to compile and to plan makes hardly any garbage
-            next(compiling)
+        def read() -> tuple[Planner | None, str]:
+            try:
+                planner, file = read_model(self._node.value("model"))
+                compiling = warm_up(planner, self._node.value("follow_trainer"))
+                gc.set_threshold(20_000)  # to compile and to plan makes hardly any garbage
+                next(compiling)
+            except Exception as error:
+                return None, f"{str(error) or repr(error)}; or set the parameter 'model'"
             gc.freeze()  # a collection of all that would stop the node for 45 ms
             threading.Thread(target=next, args=[compiling], daemon=True).start()  # the rest
             return planner, file
@@ -146,17 +149,14 @@ class ModelSource:
 
     async def first(self) -> None:
         """Wait for the first model, and use it unless another one was set since."""
-        loading = self.loading
-        try:
-            loaded = await loading if loading is not None else None
-        except Exception as error:
-            if self.loading is loading:
-                self.loading = None
-                reason = f"{str(error) or repr(error)}; or set the parameter 'model'"
-                self.report.refuse("model", reason)
+        if (loading := self.loading) is None:
             return
-        if loaded is not None and self.loading is loading:
-            self.use(*loaded)
+        planner, said = await loading
+        if self.loading is loading and planner is not None:
+            self.use(planner, said)
+        elif self.loading is loading:
+            self.loading = None
+            self.report.refuse("model", said)
 
     def use(self, planner: Planner, file: str, layout: Any = None) -> None:
         """Plan with it from now on."""
@@ -182,7 +182,7 @@ class ModelSource:
             description["model footprint (m)"] = str(body.footprint.tolist())
         return description | {
             "model file": self.file,
-            "move rule": MoveRule(rule or metadata.move_rule).value,
+            "move rule": rule or metadata.move_rule.value,
             "model move rule": metadata.move_rule.value,
             "model sizes": ", ".join(f"{key} {size}" for key, size in metadata.sizes.items()),
             "model training steps": str(metadata.steps),
@@ -237,22 +237,18 @@ class Requests:
         if not 0 <= metres < math.inf:
             wrong = f"the tolerance is {metres}; give metres, finite and 0 or more"
             raise RequestError("INVALID_TOLERANCE", wrong)
-        request: Any = PlanRequest(
-            grid,
-            start=first,
-            goals=(second,),
-            move_rule=MoveRule(settings.move_rule or planner.metadata.move_rule),
-            method=PlanMethod(settings.mode),
-            tolerance=metres / grid.resolution,
-            simplified=settings.path_simplification != "none",
-            switch_threshold=settings.switch_threshold,
-            start_clearing_radius=_clearing_radius(settings, grid),
-        )
+        request: Any
+        options = {"switch_threshold": settings.switch_threshold}
         if planner.pose_planner is not None:
             first, second, *more = map(pose_of, poses)
             limits = metres, settings.yaw_tolerance
-            how = {"bound": settings.path_bound, "switch_threshold": settings.switch_threshold}
-            request = PoseRequest(grid, first, (second,), limits, **how)
+            request = PoseRequest(grid, first, (second,), limits, settings.path_bound, **options)
+        else:
+            rule = MoveRule(settings.move_rule or planner.metadata.move_rule)
+            is_simplified = settings.path_simplification != "none"
+            how = rule, PlanMethod(settings.mode), metres / grid.resolution, is_simplified
+            options["start_clearing_radius"] = _clearing_radius(settings, grid)
+            request = PlanRequest(grid, first, (second,), *how, **options)
         if active is not None:
             active.poses[:] = poses[1:]  # there they stay, though their own frame moves
             followed = active.followed
@@ -302,9 +298,8 @@ class Requests:
         header, grid, planner = await self._inputs()
         frame, settings = header.frame_id, self.settings
         poses = [PoseStamped(header=path.header, pose=stamped.pose) for stamped in path.poses]
-        if planner.pose_planner is None:
-            # What a straight path passes between its turns is known, between its poses not.
-            poses = turns(poses)
+        # What a straight path passes between its turns is known, between its poses not.
+        poses = turns(poses) if planner.pose_planner is None else poses
         cells = [cell_from_pose("the path", pose, grid, frame) for pose in poses]
         if not cells:
             return False
@@ -339,11 +334,9 @@ class Requests:
             to_map = partial(self.places.to_map, name, stamped, frame)
             pose = await self._wait_for(to_map, deadline)
             return pose, cell_from_pose(name, pose, grid, frame)
-        except RequestError:
-            raise
-        except ValueError as error:
+        except ValueError as error:  # of a RequestError it is the last word
             status = "INVALID_START" if name == "the start" else "INVALID_GOAL"
-            raise RequestError(status, str(error)) from None
+            raise RequestError(getattr(error, "status", status), str(error)) from None
 
     async def _wait_for(self, get: Callable[[], T], deadline: float = 0.0) -> T:
         """Return what a function returns, as soon as it raises no RequestError that may pass."""
