@@ -206,6 +206,5 @@ def _check_pose(name: str, pose: Pose) -> None:
 
 
 def _numbers(message: Point | Quaternion) -> str:
-    return ", ".join(
-        f"{name} = {getattr(message, name):.6g}" for name in message.get_fields_and_field_types()
-    )
+    names = message.get_fields_and_field_types()
+    return ", ".join(f"{name} = {getattr(message, name):.6g}" for name in names)

@@ -17,12 +17,8 @@ from ddqn_planner.experience import Experience
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.body import Inflation
 from ddqn_planner.grid.copies import boxes_of
-from ddqn_planner.nodes.conversions import (
-    MAP_PARAMETERS,
-    bytes_of,
-    grid_from_message,
-    grid_from_values,
-)
+from ddqn_planner.nodes import conversions
+from ddqn_planner.nodes.conversions import MAP_PARAMETERS, grid_from_message
 from ddqn_planner.nodes.report import NO_REQUEST, Outcome, Report, RequestError, seconds
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
 from ddqn_planner.planning.field import offset_between, overlap
@@ -35,9 +31,8 @@ except ImportError:  # PyPI does not have it
 DIRECTIONS = "map_directions"
 BODY_PARAMETERS = ("robot_radius", "clearance_weight")
 
-UPDATES_QUALITY = QoSProfile(depth=100)
-"""Reliable, as a lost update leaves old cells; volatile, as the last one alone makes no new map."""
-
+# Reliable, as a lost update leaves old cells; volatile, as the last one alone makes no new map.
+UPDATES = QoSProfile(depth=100)
 REMEDY = "let the map's publisher send the full map"
 
 CHANGED_SHARE = 0.02  # of cells: with more, experience is spread anew over the map, slowly
@@ -87,8 +82,7 @@ class MapSource:
         self._topic = node.create_subscription(OccupancyGrid, "map", self._take, LATCHED).topic_name
         updates = f"{self._topic}_updates"
         if OccupancyGridUpdate is not None:
-            kind = OccupancyGridUpdate
-            node.create_subscription(kind, updates, self._take_update, UPDATES_QUALITY)
+            node.create_subscription(OccupancyGridUpdate, updates, self._take_update, UPDATES)
         else:
             missing = "is not read: map_msgs is not installed; apt install ros-jazzy-map-msgs, or"
             node.get_logger().info(f"{updates} {missing} {REMEDY}")
@@ -183,7 +177,7 @@ class MapSource:
 
     def _patched(self, grid: GridMap, values: NDArray[np.int8], x: int, y: int) -> GridMap:
         rules = map(self._node.value, MAP_PARAMETERS)
-        patch = grid_from_values(values, 1.0, (0.0, 0.0, 0.0), *rules)
+        patch = conversions.grid_from_values(values, 1.0, (0.0, 0.0, 0.0), *rules)
         return grid.with_patch(patch.occupancy, x, y, patch.cost, patch.obstacles)
 
     def _take_update(self, update: Any) -> None:
@@ -221,7 +215,7 @@ class MapSource:
         """Plan on a map from now on; return whether its directions let it."""
         grid = received.grid
         try:
-            received.directions, received.forbidden = self._directions_of(received)
+            self._direct(received)
         except ValueError as error:
             if self._used is not None and self._used.directions is None:
                 self._used = None  # there are directions now
@@ -238,13 +232,8 @@ class MapSource:
         self.change()
         return True
 
-    def _directions_of(
-        self, received: Received
-    ) -> tuple[Directions | None, NDArray[np.uint8] | None]:
-        """Return a map's own directions, or else the last ones, and what they forbid on it.
-
-        A ValueError says that they have not come, or do not fit.
-        """
+    def _direct(self, received: Received) -> None:
+        """Give a map its own directions, or the last ones; a ValueError says that it waits."""
         grid, header = received.grid, received.message.header
         # A map server creates this publisher first: whoever receives its map sees it already.
         published = self._node.count_publishers(self._directions_topic) > 0
@@ -257,26 +246,27 @@ class MapSource:
             if published or self._node.value("require_directions"):
                 remedy = "let a map server publish them, or set require_directions to false"
                 raise ValueError(f"the map's directions {late}; {remedy}")
-            return None, None
+            return
         is_paired = used and before and used.message.header.stamp == before.header.stamp
         if is_paired and published and not own:
             what = f"the map's directions, with its stamp, {seconds(header.stamp)}"
             raise ValueError(f"{what}, {late}; if they do not come, load the map again")
         its, directions = found = (own or known)[0]
-        if directions is None or directions.forbidden is None:
-            return found, None
-        offset = offset_between(directions, grid)
-        if its.frame_id != header.frame_id or offset is None:
-            raise ValueError(
-                f"the directions on {self._directions_topic} are not for this map: they have the "
-                f"frame {its.frame_id!r} and {directions.resolution:.6g} m per cell, the map "
-                f"{header.frame_id!r} and {grid.resolution:.6g} m; give both one frame, and "
-                "cells that lie on each other"
-            )
-        theirs, ours = overlap(directions, grid, offset)
-        forbidden = np.zeros(grid.occupancy.shape, dtype=np.uint8)
-        forbidden[ours] = directions.forbidden[theirs]
-        return found, forbidden if forbidden.any() else None
+        forbidden: NDArray[np.uint8] | None = None
+        if directions is not None and directions.forbidden is not None:
+            offset = offset_between(directions, grid)
+            if its.frame_id != header.frame_id or offset is None:
+                raise ValueError(
+                    f"the directions on {self._directions_topic} are not for this map: they have "
+                    f"the frame {its.frame_id!r} and {directions.resolution:.6g} m per cell, the "
+                    f"map {header.frame_id!r} and {grid.resolution:.6g} m; give both one frame, "
+                    "and cells that lie on each other"
+                )
+            theirs, ours = overlap(directions, grid, offset)
+            forbidden = np.zeros(grid.occupancy.shape, dtype=np.uint8)
+            forbidden[ours] = directions.forbidden[theirs]
+            forbidden = forbidden if forbidden.any() else None
+        received.directions, received.forbidden = found, forbidden
 
 
 def _place(message: OccupancyGrid) -> tuple[Any, ...]:
@@ -348,7 +338,7 @@ class ExpectedTimes:
         """Use a message, or the file that is set, or none; return whether it is another one."""
         newer, layout = None, message.layout if message else None
         if message:
-            data = bytes_of("experience", message)
+            data = conversions.bytes_of("experience", message)
             if layout == self._layout:  # its digest is the same
                 return False
             newer = Experience.from_bytes(data)
@@ -383,7 +373,5 @@ class ExpectedTimes:
 def is_like(grid: GridMap, other: GridMap) -> bool:
     """Return whether two maps have the same place, and nearly the same obstacles."""
     mine, its = ((each.occupancy.shape, each.resolution, each.origin) for each in (grid, other))
-    if mine != its:
-        return False
-    changed = np.count_nonzero(grid.occupancy != other.occupancy)
-    return bool(changed <= CHANGED_SHARE * grid.occupancy.size)
+    most = CHANGED_SHARE * grid.occupancy.size
+    return mine == its and bool(np.count_nonzero(grid.occupancy != other.occupancy) <= most)

@@ -14,14 +14,15 @@ from ddqn_planner.nodes.report import Outcome
 from ddqn_planner.nodes.runtime import SERVICE_QUALITY, BaseNode
 from ddqn_planner.planning import PlanStatus
 
+GivenUp = Callable[[], Outcome | None]  # returns why a request is given up now, or None
+# Plans from a start, or None, through goals, by a planner's name.
+Plan = Callable[[Any, list[PoseStamped], str, GivenUp], Awaitable[tuple[Path, Outcome]]]
+
+# Those of an action's services: without them, goals are lost like requests.
 QUEUES: dict[str, Any] = {
     f"{service}_service_qos_profile": SERVICE_QUALITY for service in ("goal", "cancel", "result")
 }
-"""Those of an action's services: without them, goals are lost like requests."""
-
-RESULT_TIMEOUT = 2
-"""Seconds for which a result is kept: each request goes over all goals whose results are."""
-
+RESULT_TIMEOUT = 2  # seconds to keep a result: each request goes over all goals with theirs
 CANCELED = Outcome("CANCELED", "the goal was canceled")
 PREEMPTED = Outcome("PREEMPTED", "a newer goal of the same action came")
 
@@ -45,13 +46,6 @@ def error_code(status: str, result: Any) -> int:
     if status in (PlanStatus.SUCCEEDED.name, CANCELED.status):
         return 0
     return int(getattr(result, CODES.get(status, status), result.UNKNOWN))
-
-
-GivenUp = Callable[[], Outcome | None]
-"""Returns with what outcome a request is given up now, or None."""
-
-Plan = Callable[[Any, list[PoseStamped], str, GivenUp], Awaitable[tuple[Path, Outcome]]]
-"""Plans from a start, or None, through goals, by a planner's name."""
 
 
 # Without Nav2's types, so that it can be tested where these are not installed.

@@ -156,16 +156,12 @@ def listen(
 class Places(Frames):
     """Frames, and where the robot is by ``start_source``: the last `initialpose`, `odom`, or TF."""
 
-    # `frame` returns the map's; `on_start` is called when there is a start to plan from at once.
+    # `frame` returns the map's; `plan` is called when there is a start to plan from at once.
     def __init__(
-        self,
-        node: BaseNode,
-        report: Refusals,
-        frame: Callable[[], str],
-        on_start: Callable[[], None],
+        self, node: BaseNode, report: Refusals, frame: Callable[[], str], plan: Callable[[], None]
     ) -> None:
         super().__init__(node, lambda: float(node.value("transform_tolerance")))
-        self._report, self._map_frame, self._on_start = report, frame, on_start
+        self._report, self._map_frame, self._plan = report, frame, plan
         self._pose: PoseStamped | None = None
         self._subscription: Any = None
         self.topic = ""
@@ -196,7 +192,7 @@ class Places(Frames):
         is_due = self._pose is None or self.topic == "initialpose"
         self._pose, self._came = pose, self._node.get_clock().now()
         if is_due:
-            self._on_start()
+            self._plan()
 
     def transform_start(self) -> None:
         """Transform the last `initialpose` as soon as TF can: it forgets the times before."""
