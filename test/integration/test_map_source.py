@@ -59,7 +59,7 @@ class Source(MapSource):
     """A source of maps which has what the test gives it, and says what the planner would know."""
 
     def __init__(self, node: BaseNode) -> None:
-        self.heard, self.report = 0, Report(node, lambda: None)
+        self.heard, self.report = 0, Report(node)
         super().__init__(node, self.report, Worker(node), self._hear)
 
     def _hear(self) -> None:
@@ -283,26 +283,13 @@ def test_a_costmap_is_planned_on_for_map_timeout_after_its_last_message(
 # Directions: no path may go the wrong way, whatever is late
 
 
-def test_without_a_publisher_of_directions_a_map_needs_none(source: Source) -> None:
-    assert source.on_map(1) == (1, None)
-    # The next map does not wait for directions either, once there were some.
-    assert source.on_directions(1) == (1, EAST)
-    assert source.on_map(2) == (2, EAST)
-
-
 @pytest.mark.usefixtures("published")
-def test_the_first_map_waits_for_directions_of_a_publisher(source: Source) -> None:
+def test_a_servers_map_waits_for_directions(source: Source, set_parameters: SetParameters) -> None:
     assert source.on_map(1) == NOTHING
     assert "directions were not received on /map_directions yet; let a map server" in source.missing
     assert not source.heard
     assert source.on_directions(1) == (1, EAST)
     assert source.heard == 1
-
-
-@pytest.mark.usefixtures("published")
-def test_a_servers_map_waits_for_directions(source: Source, set_parameters: SetParameters) -> None:
-    source.on_directions(1)
-    assert source.on_map(1) == (1, EAST)
     # A map comes before its directions, or without them: its map server was killed.
     assert source.on_map(2) == (1, EAST)
     assert "directions, with its stamp, 2.000000000, were not" in source.report.refused["map"]
@@ -337,14 +324,16 @@ def test_directions_hold_for_their_region(
     assert source.heard == 4
 
 
-def test_required_directions_are_awaited(source: Source, set_parameters: SetParameters) -> None:
+def test_only_required_directions_are_awaited_without_a_publisher(
+    source: Source, set_parameters: SetParameters
+) -> None:
     set_parameters(require_directions=True)
     assert source.on_map(1) == NOTHING
     assert "or set require_directions to false" in source.missing
     for required, used in ((False, (1, None)), (True, NOTHING)):
         set_parameters(require_directions=required)
         assert source.used() == used
-    assert source.on_directions(9) == (1, EAST)
+    assert source.on_directions(1) == (1, EAST)
     assert source.on_map(2) == (2, EAST)  # once
 
 
@@ -532,18 +521,16 @@ def test_a_map_that_grows_keeps_its_times(times: ExpectedTimes) -> None:
 def test_the_executors_thread_alone_tells_what_the_worker_computes(
     source: Source, driven: UInt8MultiArray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    threads, told = set[int](), {"expected time (s)": "1.0"}
-
-    def describe(_: Outcome) -> dict[str, str]:
-        time.sleep(0.1)
-        return told
-
+    threads, gate, told = set[int](), threading.Event(), {"expected time (s)": "1.0"}
     monkeypatch.setattr(source.report, "_on_change", lambda: threads.add(threading.get_ident()))
-    monkeypatch.setattr(source.times, "describe", describe)
+    monkeypatch.setattr(source.times, "describe", lambda _: gate.wait() and told)
     outcome = Outcome("SUCCEEDED", "a path")
     assert source.times.told(outcome) == {}  # without drives
     finished(source.times.on_sent(driven))
+    threads.clear()
     assert source.times.told(outcome) == {}
+    assert threads == {threading.get_ident()}  # it looks again soon
+    gate.set()
     assert wait_for("expected time", lambda: source.times.told(outcome)) == told
     time.sleep(0.1)
     assert threads == {threading.get_ident()}

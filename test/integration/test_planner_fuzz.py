@@ -1,7 +1,7 @@
 """Whatever comes in, the planner node answers, says why, and goes on with what it had."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -12,7 +12,7 @@ from integration.messages import NUMBERS_32, STAMPED_POSES, maps, some_parameter
 from integration.robot import GOAL, NUMBERS, Robot, check_path
 from load import BurstClients, GoalBursts, burst_requests
 from nav_msgs.msg import OccupancyGrid, Odometry
-from nav_msgs.srv import GetMap, GetPlan
+from nav_msgs.srv import GetPlan
 from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 from std_msgs.msg import UInt8MultiArray
@@ -129,16 +129,6 @@ def test_each_request_of_a_burst_has_its_plan(robot: Any, clients: int) -> None:
         answers = asking.burst(requests)
     assert len(answers) == 200
     assert all(answer is not None and answer.plan.poses for answer in answers)
-
-
-@pytest.mark.slow
-def test_each_request_of_a_burst_has_its_map(run_node: Callable[..., Any]) -> None:
-    with (
-        run_node("map_server_node", {}, namespace="/burst"),
-        BurstClients(1, GetMap, "/burst/map_server/map") as asking,
-    ):
-        answers = asking.burst([GetMap.Request()] * 200)
-    assert all(answer is not None and answer.map.info.width == 20 for answer in answers)
 
 
 @pytest.mark.slow

@@ -2,7 +2,6 @@
 
 import math
 import shutil
-import signal
 import time
 from collections.abc import Iterator
 from itertools import pairwise
@@ -362,12 +361,6 @@ def test_what_comes_while_a_plan_takes_long_has_the_last_plan(slow_robot: Any) -
     robot.gate.touch()
     robot.node.wait_for_log("no plan: the goal's frame is ''")
     assert robot.last_plan().poses == []
-
-
-def test_a_signal_ends_the_node_while_a_plan_takes_long(slow_robot: Any) -> None:
-    slow_robot.send_goal(slow_robot.pose((5, 2)))  # whose field no test before needed
-    slow_robot.node.wait_for_log("a plan waits")
-    assert slow_robot.node.stop(signal.SIGTERM) == 0
 
 
 def test_says_what_it_waits_for(run_robot: Any, model: FilePath, tmp_path: FilePath) -> None:
