@@ -293,13 +293,14 @@ def test_a_servers_map_waits_for_directions(source: Source, set_parameters: SetP
     # A map comes before its directions, or without them: its map server was killed.
     assert source.on_map(2) == (1, EAST)
     assert "directions, with its stamp, 2.000000000, were not" in source.report.refused["map"]
-    set_parameters(occupied_threshold=1)
+    set_parameters(use_map_costs=True)
     assert source.used() == (1, EAST)
+    assert source.grid().cost is not None  # it is read anew
     assert source.on_directions(2, WEST) == (2, WEST)
     assert not source.report.refused
     # The directions come first, or alone.
     assert source.on_directions(3, None) == (2, WEST)
-    set_parameters(occupied_threshold=65)
+    set_parameters(use_map_costs=False)
     assert source.used() == (2, WEST)
     # Of those of two maps, each time one was lost.
     assert source.on_map(4) == (2, WEST)
