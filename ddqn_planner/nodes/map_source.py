@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from nav_msgs.msg import OccupancyGrid
@@ -37,14 +37,9 @@ REMEDY = "let the map's publisher send the full map"
 
 CHANGED_SHARE = 0.02  # of cells: with more, experience is spread anew over the map, slowly
 
-
 # A map server publishes them for each of its maps, with the map's stamp: then the next map waits
 # for its own, which may come seconds after it, or never if the map server is killed.
-class Directions(NamedTuple):
-    """A message of forbidden directions: its header, and their map, unless it forbids nothing."""
-
-    header: Header
-    grid: GridMap | None
+Directions = tuple[Header, GridMap | None]  # of a message: without a map if it forbids nothing
 
 
 @dataclass(eq=False)
@@ -202,7 +197,7 @@ class MapSource:
             if message.info.width or message.info.height or message.data:
                 grid = grid_from_message(message)
                 grid = grid.with_layers(forbidden=_values(message).view(np.uint8))
-            self._directions = Directions(message.header, grid)
+            self._directions = message.header, grid
             self._choose()
 
     def _choose(self) -> None:
@@ -240,14 +235,14 @@ class MapSource:
         used = self._used
         before = used.directions if used is not None else None
         known = [each for each in (self._directions, before) if each is not None]
-        own = [each for each in known if each.header.stamp == header.stamp]
+        own = [each for each in known if each[0].stamp == header.stamp]
         late = f"were not received on {self._directions_topic} yet"
         if not known:
             if published or self._node.value("require_directions"):
                 remedy = "let a map server publish them, or set require_directions to false"
                 raise ValueError(f"the map's directions {late}; {remedy}")
             return
-        is_paired = used and before and used.message.header.stamp == before.header.stamp
+        is_paired = used and before and used.message.header.stamp == before[0].stamp
         if is_paired and published and not own:
             what = f"the map's directions, with its stamp, {seconds(header.stamp)}"
             raise ValueError(f"{what}, {late}; if they do not come, load the map again")
