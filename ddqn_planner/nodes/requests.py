@@ -334,7 +334,7 @@ class Requests:
             to_map = partial(self.places.to_map, name, stamped, frame)
             pose = await self._wait_for(to_map, deadline)
             return pose, cell_from_pose(name, pose, grid, frame)
-        except ValueError as error:  # of a RequestError it is the last word
+        except ValueError as error:  # a RequestError has its own status
             status = "INVALID_START" if name == "the start" else "INVALID_GOAL"
             raise RequestError(getattr(error, "status", status), str(error)) from None
 
