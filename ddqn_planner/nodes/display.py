@@ -114,13 +114,11 @@ def policy_message(field: QField | None, grid: GridMap, header: Header) -> Marke
     while np.count_nonzero(policy[::step, ::step] >= 0) > MAX_ARROWS:
         step += 1
     rows, columns = step * np.array(np.nonzero(policy[::step, ::step] >= 0))
-    centres = columns + 0.5 + 1j * (rows + 0.5)
-    arrows = centres[:, None] + step * ARROW * DIRECTIONS[policy[rows, columns], None]
-    origin_x, origin_y, yaw = grid.origin
-    arrows = complex(origin_x, origin_y) + grid.resolution * np.exp(1j * yaw) * arrows
-    width = LINE_WIDTH * step * grid.resolution
+    x, y = grid.centres(columns, rows)
+    size, turn = step * grid.resolution, np.exp(1j * grid.origin[2])
+    arrows = (x + 1j * y)[:, None] + size * turn * ARROW * DIRECTIONS[policy[rows, columns], None]
     # From tail to tip, and from there along both barbs.
-    return _lines("policy", arrows, (0, 1, 1, 2, 1, 3), width, header)
+    return _lines("policy", arrows, (0, 1, 1, 2, 1, 3), LINE_WIDTH * size, header)
 
 
 def footprint_message(outcome: Any) -> MarkerArray:

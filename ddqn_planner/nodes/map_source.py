@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from nav_msgs.msg import OccupancyGrid
@@ -32,19 +32,14 @@ DIRECTIONS = "map_directions"
 BODY_PARAMETERS = ("robot_radius", "clearance_weight")
 
 # Reliable, as a lost update leaves old cells; volatile, as the last one alone makes no new map.
-UPDATES_QUALITY = QoSProfile(depth=100)
+UPDATES = QoSProfile(depth=100)
 REMEDY = "let the map's publisher send the full map"
 
 CHANGED_SHARE = 0.02  # of cells: with more, experience is spread anew over the map, slowly
 
-
 # A map server publishes them for each of its maps, with the map's stamp: then the next map waits
 # for its own, which may come seconds after it, or never if the map server is killed.
-class Directions(NamedTuple):
-    """A message of forbidden directions: its header, and their map, unless it forbids nothing."""
-
-    header: Header
-    grid: GridMap | None
+Directions = tuple[Header, GridMap | None]  # of a message: without a map if it forbids nothing
 
 
 @dataclass(eq=False)
@@ -82,8 +77,7 @@ class MapSource:
         self._topic = node.create_subscription(OccupancyGrid, "map", self._take, LATCHED).topic_name
         updates = f"{self._topic}_updates"
         if OccupancyGridUpdate is not None:
-            kind = OccupancyGridUpdate
-            node.create_subscription(kind, updates, self._take_update, UPDATES_QUALITY)
+            node.create_subscription(OccupancyGridUpdate, updates, self._take_update, UPDATES)
         else:
             missing = "is not read: map_msgs is not installed; apt install ros-jazzy-map-msgs, or"
             node.get_logger().info(f"{updates} {missing} {REMEDY}")
@@ -203,7 +197,7 @@ class MapSource:
             if message.info.width or message.info.height or message.data:
                 grid = grid_from_message(message)
                 grid = grid.with_layers(forbidden=_values(message).view(np.uint8))
-            self._directions = Directions(message.header, grid)
+            self._directions = message.header, grid
             self._choose()
 
     def _choose(self) -> None:
@@ -241,14 +235,14 @@ class MapSource:
         used = self._used
         before = used.directions if used is not None else None
         known = [each for each in (self._directions, before) if each is not None]
-        own = [each for each in known if each.header.stamp == header.stamp]
+        own = [each for each in known if each[0].stamp == header.stamp]
         late = f"were not received on {self._directions_topic} yet"
         if not known:
             if published or self._node.value("require_directions"):
                 remedy = "let a map server publish them, or set require_directions to false"
                 raise ValueError(f"the map's directions {late}; {remedy}")
             return
-        is_paired = used and before and used.message.header.stamp == before.header.stamp
+        is_paired = used and before and used.message.header.stamp == before[0].stamp
         if is_paired and published and not own:
             what = f"the map's directions, with its stamp, {seconds(header.stamp)}"
             raise ValueError(f"{what}, {late}; if they do not come, load the map again")
@@ -374,7 +368,5 @@ class ExpectedTimes:
 def is_like(grid: GridMap, other: GridMap) -> bool:
     """Return whether two maps have the same place, and nearly the same obstacles."""
     mine, its = ((each.occupancy.shape, each.resolution, each.origin) for each in (grid, other))
-    if mine != its:
-        return False
-    changed = np.count_nonzero(grid.occupancy != other.occupancy)
-    return bool(changed <= CHANGED_SHARE * grid.occupancy.size)
+    most = CHANGED_SHARE * grid.occupancy.size
+    return mine == its and bool(np.count_nonzero(grid.occupancy != other.occupancy) <= most)

@@ -27,16 +27,12 @@ CANCELED = Outcome("CANCELED", "the goal was canceled")
 PREEMPTED = Outcome("PREEMPTED", "a newer goal of the same action came")
 
 CODES = {
-    PlanStatus.NO_PATH.name: "NO_VALID_PATH",
-    PlanStatus.ROLLOUT_TRAPPED.name: "NO_VALID_PATH",
-    "NO_START": "TF_ERROR",
-    # Malformed, or in another frame without TF: clearing costmaps, as after UNKNOWN, does not help.
-    "INVALID_START": "TF_ERROR",
-    "INVALID_GOAL": "TF_ERROR",
+    **dict.fromkeys((PlanStatus.NO_PATH.name, PlanStatus.ROLLOUT_TRAPPED.name), "NO_VALID_PATH"),
+    # Unknown, malformed, or in a frame without TF: clearing costmaps, as after UNKNOWN, is no help.
+    **dict.fromkeys(("NO_START", "INVALID_START", "INVALID_GOAL"), "TF_ERROR"),
     "NO_GOALS": "NO_VIAPOINTS_GIVEN",
     # As Nav2's planners time out while their costmap is not current.
-    "NO_MAP": "TIMEOUT",
-    "MAP_TIMEOUT": "TIMEOUT",
+    **dict.fromkeys(("NO_MAP", "MAP_TIMEOUT"), "TIMEOUT"),
 }
 """What Nav2 calls a status, if by another name; UNKNOWN is all that it does not know."""
 

@@ -285,7 +285,8 @@ class PlannerNode(ManagedNode):
             self._requests.look_again()
             self._places.transform_start()
             missing.append(self._map.missing)
-            if active.is_look_due(bool(missing[-1]), self._places):
+            has_come = active.lacks_pose and self._places.know(active.poses)
+            if has_come or active.is_look_due(bool(missing[-1])):
                 self._replan.trigger()
         if self._report.is_due():
             missing += ["the model is being loaded"] if self._model.loading else []

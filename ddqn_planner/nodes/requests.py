@@ -54,11 +54,10 @@ class ActiveGoal:
         """Whether it waits for TF or odometry."""
         return bool(self.poses) and self.last.status in ("NO_START", "TF_ERROR")
 
-    def is_look_due(self, lacks_map: bool, places: Places) -> bool:
+    def is_look_due(self, lacks_map: bool) -> bool:
         """Return whether it is time to look if something changed; the next plan does then."""
         stopped = lacks_map and self.last.request is not None  # a costmap: its path is taken back
-        is_due = bool(self.poses) and (stopped or time.monotonic() >= self.next_look)
-        return is_due or (self.lacks_pose and places.know(self.poses))
+        return bool(self.poses) and (stopped or time.monotonic() >= self.next_look)
 
     def is_due(self, planner: Planner, request: Request, header: Header) -> bool:
         """Return whether there is a reason to plan."""
@@ -183,7 +182,7 @@ class ModelSource:
             description["model footprint (m)"] = str(body.footprint.tolist())
         return description | {
             "model file": self.file,
-            "move rule": MoveRule(rule or metadata.move_rule).value,
+            "move rule": rule or metadata.move_rule.value,
             "model move rule": metadata.move_rule.value,
             "model sizes": ", ".join(f"{key} {size}" for key, size in metadata.sizes.items()),
             "model training steps": str(metadata.steps),
@@ -335,7 +334,7 @@ class Requests:
             to_map = partial(self.places.to_map, name, stamped, frame)
             pose = await self._wait_for(to_map, deadline)
             return pose, cell_from_pose(name, pose, grid, frame)
-        except ValueError as error:  # of a RequestError it is the last word
+        except ValueError as error:  # a RequestError has its own status
             status = "INVALID_START" if name == "the start" else "INVALID_GOAL"
             raise RequestError(getattr(error, "status", status), str(error)) from None
 

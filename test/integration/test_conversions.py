@@ -284,12 +284,13 @@ def test_transforms_from_before_the_clock_jumped_back_are_forgotten(listening: A
     assert error.value.may_come
 
 
-def test_a_set_start_outlives_a_jump_of_the_clock() -> None:
+def test_a_set_start_outlives_time_and_a_jump_of_the_clock() -> None:
     node, pose = new_node("initialpose"), pose_at(NOW, "map")
     places = Places(node, Refusals(node), lambda: "map", lambda: None)
     places._take(pose)
     for forget in node.after_jump_back:
         forget()
+    node.get_clock().now.return_value = Time(seconds=2 * NOW, clock_type=ClockType.ROS_TIME)
     assert places.start() is pose
 
 

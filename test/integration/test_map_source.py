@@ -4,7 +4,6 @@ Here a message of map_msgs is a stand-in with the same fields; PyPI does not hav
 """
 
 import array
-import math
 import threading
 import time
 from collections.abc import Callable, Coroutine, Iterator
@@ -284,36 +283,24 @@ def test_a_costmap_is_planned_on_for_map_timeout_after_its_last_message(
 # Directions: no path may go the wrong way, whatever is late
 
 
-def test_without_a_publisher_of_directions_a_map_needs_none(source: Source) -> None:
-    assert source.on_map(1) == (1, None)
-    # The next map does not wait for directions either, once there were some.
-    assert source.on_directions(1) == (1, EAST)
-    assert source.on_map(2) == (2, EAST)
-
-
 @pytest.mark.usefixtures("published")
-def test_the_first_map_waits_for_directions_of_a_publisher(source: Source) -> None:
+def test_a_servers_map_waits_for_directions(source: Source, set_parameters: SetParameters) -> None:
     assert source.on_map(1) == NOTHING
     assert "directions were not received on /map_directions yet; let a map server" in source.missing
     assert not source.heard
     assert source.on_directions(1) == (1, EAST)
     assert source.heard == 1
-
-
-@pytest.mark.usefixtures("published")
-def test_a_servers_map_waits_for_directions(source: Source, set_parameters: SetParameters) -> None:
-    source.on_directions(1)
-    assert source.on_map(1) == (1, EAST)
     # A map comes before its directions, or without them: its map server was killed.
     assert source.on_map(2) == (1, EAST)
     assert "directions, with its stamp, 2.000000000, were not" in source.report.refused["map"]
-    set_parameters(occupied_threshold=1)
+    set_parameters(use_map_costs=True)
     assert source.used() == (1, EAST)
+    assert source.grid().cost is not None  # it is read anew
     assert source.on_directions(2, WEST) == (2, WEST)
     assert not source.report.refused
     # The directions come first, or alone.
     assert source.on_directions(3, None) == (2, WEST)
-    set_parameters(occupied_threshold=65)
+    set_parameters(use_map_costs=False)
     assert source.used() == (2, WEST)
     # Of those of two maps, each time one was lost.
     assert source.on_map(4) == (2, WEST)
@@ -338,14 +325,16 @@ def test_directions_hold_for_their_region(
     assert source.heard == 4
 
 
-def test_required_directions_are_awaited(source: Source, set_parameters: SetParameters) -> None:
+def test_only_required_directions_are_awaited_without_a_publisher(
+    source: Source, set_parameters: SetParameters
+) -> None:
     set_parameters(require_directions=True)
     assert source.on_map(1) == NOTHING
     assert "or set require_directions to false" in source.missing
     for required, used in ((False, (1, None)), (True, NOTHING)):
         set_parameters(require_directions=required)
         assert source.used() == used
-    assert source.on_directions(9) == (1, EAST)
+    assert source.on_directions(1) == (1, EAST)
     assert source.on_map(2) == (2, EAST)  # once
 
 
@@ -533,15 +522,15 @@ def test_a_map_that_grows_keeps_its_times(times: ExpectedTimes) -> None:
 def test_the_expected_time_is_told_as_soon_as_the_worker_has_it(
     source: Source, driven: UInt8MultiArray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    gate, told, threads = threading.Event(), {"expected time (s)": "1.0"}, set[int]()
-    monkeypatch.setattr(source.times, "describe", lambda _: gate.wait() and told)
+    threads, gate, told = set[int](), threading.Event(), {"expected time (s)": "1.0"}
     monkeypatch.setattr(source.report, "_on_change", lambda: threads.add(threading.get_ident()))
+    monkeypatch.setattr(source.times, "describe", lambda _: gate.wait() and told)
     outcome = Outcome("SUCCEEDED", "a path")
     assert source.times.told(outcome) == {}  # without drives
     finished(source.times.on_sent(driven))
-    source.report._due = math.inf
+    threads.clear()
     assert source.times.told(outcome) == {}
-    assert source.report._due == 0  # at the next look
+    assert threads == {threading.get_ident()}  # it looks again soon
     gate.set()
     assert wait_for("expected time", lambda: source.times.told(outcome)) == told
     assert threads == {threading.get_ident()}  # the executor's alone
