@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 from zlib import crc32
 
 import numpy as np
@@ -25,7 +25,6 @@ from ddqn_planner.grid.moves import MOVES, UPHILL, actions_along, cells_along
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
-Step: TypeAlias = Callable[[Evidence], None]
 
 VERSION = 3  # 2 was never released
 PRIOR = "prior_"  # before the names of its arrays in a file
@@ -94,7 +93,7 @@ class Experience:
         self.evidence = Evidence(self.nominal_speed, self.robot_width, self.half_life)
         # The file that holds this experience, less what is new.
         self._synchronised: tuple[Path | None, int] = None, 0
-        self._news: list[Step] = []
+        self._news: list[Callable[[Evidence], None]] = []
 
     @property
     def options(self) -> dict[str, float]:
@@ -168,7 +167,7 @@ class Experience:
         visits = Visits(none, none[:, 0], none[:, 0], actions_along(none), waits)
         self._learn(partial(Evidence.add, visits=visits))
 
-    def _learn(self, step: Step) -> None:
+    def _learn(self, step: Callable[[Evidence], None]) -> None:
         step(self.evidence)
         if self._synchronised[0] is not None:
             self._news.append(step)

@@ -144,17 +144,6 @@ def test_cells_of_many_metres_learn_too(resolution: float) -> None:
     assert slowness[0, 0] == pytest.approx(4, rel=0.1)
 
 
-def test_evidence_fades_with_driven_time() -> None:
-    experience = driven(straight((2, 5), (12, 5), 4), half_life=40.0)
-    slow, unsure = (
-        at(HALL, array, 7, 5) for array in (experience.slowness(HALL), experience.uncertainty(HALL))
-    )
-    for _ in range(20):  # 10 half-lives
-        experience.record(*straight((2, 8.5), (12, 8.5)))
-    assert at(HALL, experience.slowness(HALL), 7, 5) < slow / 2
-    assert at(HALL, experience.uncertainty(HALL), 7, 5) > 1.5 * unsure
-
-
 def test_a_place_that_changes_is_learned_anew_at_once() -> None:
     drives = straight((2, 5), (12, 5), 4), straight((2, 2), (12, 2), 3)
     experience = driven(*drives * 10)
