@@ -177,15 +177,13 @@ class Evidence:
         squares = (np.floor(position / self.side) @ [1, 1j]).tolist()
         rows = np.array([self.rows.setdefault(it, len(self.rows)) for it in squares], np.int64)
         found, first = np.unique(rows, return_index=True)
-        new = first[found >= len(self.table)]
+        new = position[first[found >= len(self.table)]]
         fresh = np.zeros((len(new), len(COLUMNS)))
-        fresh[:, 5:] = position[new]
+        fresh[:, 5:] = new
         if self.posterior is not None:
-            places = self.posterior.places_at(fresh[:, 5:])
-            fresh[:, 4] = np.append(self.posterior.foretold, 0)[places]
+            fresh[:, 4] = np.append(self.posterior.foretold, 0)[self.posterior.places_at(new)]
         self.table = np.concatenate([self.table, fresh])
-        none = np.zeros((len(new), 2, len(MOVES)), np.float32)
-        self.directed = np.concatenate([self.directed, none])
+        self.directed = np.pad(self.directed, [(0, len(new)), (0, 0), (0, 0)])
         return rows
 
     def _fit(self) -> None:
