@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, neighbours, read_map_file
-from ddqn_planner.model.networks import GOAL, OBSTACLE, ROBOT, observation_background
+from ddqn_planner.model.networks import FREE, GOAL, OBSTACLE, ROBOT, observation_background
 from ddqn_planner.resources import find_resource
 from ddqn_planner.training.exploring_starts import initial_cells
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -67,8 +67,7 @@ class GridVectorEnvironment:
         self.background, self.next_cell = np.stack(maps), neighbours(self.shape)
         tables, to_number = (len(maps), len(MOVES), -1), np.array([1, self.shape[1]])
         legal = [s.grid.legal_moves(s.move_rule) for s in scenarios]
-        given = [(s.grid, s.start, s.goal, s.move_rule) for s in scenarios]
-        reward = [move_reward(*of_scenario, parameters) for of_scenario in given]
+        reward = [move_reward(s.grid, s.start, s.goal, s.move_rule, parameters) for s in scenarios]
         self.legal = np.stack(legal).reshape(tables)
         self.free_reward = np.stack(reward).reshape(tables)
         collision = np.float32(parameters.obstacle_reward)
@@ -76,8 +75,7 @@ class GridVectorEnvironment:
         self.start = np.array([s.start for s in scenarios]) @ to_number
         self.goal = np.array([s.goal for s in scenarios]) @ to_number
 
-        free_SC = np.stack([~s.grid.occupancy.ravel() for s in scenarios])
-        free_SC[np.arange(len(self.goal)), self.goal] = False
+        free_SC = self.background == FREE  # goals are not
         _, self._free = np.nonzero(free_SC)
         self._free_count = free_SC.sum(axis=1)
         self._free_first = np.cumsum(self._free_count) - self._free_count
@@ -88,10 +86,9 @@ class GridVectorEnvironment:
         self.visited, self.total_reward = np.zeros((count, most + 1), np.int64), np.zeros(count)
         self.terminated, self.truncated = np.zeros((2, count), np.bool_)
 
-    def reset(self, mask: NDArray[np.bool_] | None = None) -> None:
+    def reset(self, mask: Any = ...) -> None:
         """Start new episodes: all, or those where `mask` (N,) is True."""
-        mask = np.ones(len(self.cell), dtype=np.bool_) if mask is None else mask
-        scenario = self.random.integers(len(self.start), size=int(mask.sum()))
+        scenario = self.random.integers(len(self.start), size=len(self.cell[mask]))
         self.scenario[mask] = scenario
         free = self._free, self._free_first[scenario], self._free_count[scenario]
         start, p_r = self.start[scenario], self.parameters.p_r

@@ -145,12 +145,6 @@ def test_epsilon_falls_linearly_and_then_stays(small: Scenario) -> None:
     trainer = make(small, HyperParameters(epsilon_start=0.8, epsilon_end=0.2, epsilon_steps=100))
     for trainer.steps, epsilon in ((0, 0.8), (25, 0.65), (100, 0.2), (101, 0.2), (1000, 0.2)):
         assert trainer.epsilon == pytest.approx(epsilon)
-    # Without it the robot follows the network, which does not change, alone.
-    still = replace(QUICK, learning_starts=10**6, max_episode_steps=9, p_r=0.0)
-    for epsilon in (0.0, 1.0):
-        parameters = replace(still, epsilon_start=epsilon, epsilon_end=epsilon)
-        rollouts = {episode.cells for episode in train(make(small, parameters), 200)}
-        assert len(rollouts) == 1 if epsilon == 0 else len(rollouts) > 5
 
 
 def test_an_episode_adds_up_its_own_rewards_alone(small: Scenario) -> None:
@@ -172,16 +166,6 @@ def test_a_saved_model_plans_as_its_trainer(small: Scenario, tmp_path: Path) -> 
     said = found.network, found.gamma, found.move_rule, found.seed, found.steps
     assert said == ("paper", 0.8, MoveRule.UNIT, 3, 2)
     assert found.map_fingerprint == small.grid.fingerprint != other.grid.fingerprint
-
-
-def test_after_a_truncated_move_the_target_still_bootstraps(small: Scenario) -> None:
-    # Episodes of one move each: it collides, or the episode is out of steps.
-    trainer = make(small, replace(QUICK, max_episode_steps=1, p_r=0.0))
-    outcomes = [episode.outcome for episode in train(trainer, 40)]
-    assert {*outcomes} == {EpisodeEnd.COLLIDED, EpisodeEnd.OUT_OF_STEPS}
-    stored = trainer._replay.transitions.discount[:40]
-    expected = [0.0 if outcome is EpisodeEnd.COLLIDED else 0.95 for outcome in outcomes]
-    assert stored.tolist() == pytest.approx(expected)
 
 
 BRIEF = replace(QUICK, replay_capacity=100)

@@ -49,27 +49,6 @@ def part(trainer: Trainer) -> None:
         tensor += random.normal(0, 0.3, tensor.shape).astype(np.float32)
 
 
-def about_to_update(scenarios: list[Scenario], parameters: HyperParameters) -> Trainer:
-    """A trainer that makes its first update after the next step; its two networks differ."""
-    settings = {"learning_starts": 60, "environments": 5, "update_interval": 5}
-    parameters = replace(parameters, **settings, max_episode_steps=7)
-    trainer = Trainer(scenarios, parameters, seed=1)
-    for _ in trainer.run(60):
-        pass
-    part(trainer)
-    trainer._learner.settle()
-    return trainer
-
-
-def update(trainer: Trainer) -> Transitions:
-    """Let a trainer make its first update; return its batch."""
-    random = copy.deepcopy(trainer._sampling)
-    for _ in trainer.run(65):
-        pass
-    assert trainer.updates == 1
-    return trainer._replay.sample(trainer.parameters.batch_size, random)
-
-
 def mean_squared_error(
     trainer: Trainer, batch: Transitions, online: Q, selection: Q, evaluation: Q
 ) -> Tensor:
@@ -172,8 +151,12 @@ def test_an_update_is_the_equations_and_counts_each_reward_once(
         Scenario(GridMap(walls[::-1]), (4, 3), (0, 1), MoveRule.ROBOT_SAFE),
     ]
     settings = {"reward": "path_cost", "gamma": 0.5, "obstacle_reward": -20.0, "filters": 4}
-    parameters = HyperParameters(network="any_map", target=target, **settings)
-    trainer = about_to_update(scenarios, parameters)
+    settings |= {"learning_starts": 60, "environments": 5, "update_interval": 5}
+    parameters = HyperParameters("any_map", target, max_episode_steps=7, **settings)
+    trainer = Trainer(scenarios, parameters, seed=1)
+    list(trainer.run(60))
+    part(trainer)
+    trainer._learner.settle()
     trainer.network.tensors["prices.bias"][::2] = -1.0  # a multiplier below 1 is clipped
     before, target_weights = map(in_torch, trainer._parts[:2])
     for weight in before.values():
@@ -202,7 +185,10 @@ def test_an_update_is_the_equations_and_counts_each_reward_once(
                 value[scenario.goal] = 0.0
             by_target[scenario] = q_of(target_weights, scenario, value)
         by_online[scenario] = q_of(before, scenario, value)
-    batch = update(trainer)
+    random = copy.deepcopy(trainer._sampling)
+    list(trainer.run(65))
+    assert trainer.updates == 1
+    batch = trainer._replay.sample(parameters.batch_size, random)
     assert {0, 1} == set(batch.scenario)
     selection = by_target if target == "dqn" else by_online
     evaluation = by_online if target == "printed" else by_target
