@@ -96,17 +96,15 @@ def read_lattice(file: str | Path) -> Motions:
         for primitive in lattice["primitives"]:
             start, end = (int(primitive[f"{name}_angle_index"]) for name in ("start", "end"))
             length = float(primitive["trajectory_length"]) / cell
-            poses = np.array(primitive["poses"], dtype=np.float64).reshape(-1, 3)
-            poses = poses / (cell, cell, 1)
+            poses = np.array(primitive["poses"], np.float64).reshape(-1, 3) / (cell, cell, 1)
             poses[-1, 2] = angles[end]
             first = np.array([0, 0, angles[start]])
             if np.abs(poses[0] - first).max() > 1e-6:  # only old files begin with it
                 poses = np.vstack([first, poses])
             poses[:, 2] = np.unwrap(poses[:, 2])
             turn = float(np.abs(np.diff(poses[:, 2])).sum())
-            found.append(
-                (start, end, closer(poses, SPACING, SPACING / ANGLE), length or turn * TURN / cell)
-            )
+            poses, cost = closer(poses, SPACING, SPACING / ANGLE), length or turn * TURN / cell
+            found.append((start, end, poses, cost))
         motions = _motions(cell, angles, found)
         misses = max(np.abs(one[-1, :2] - np.rint(one[-1, :2])).max() for one in motions.poses)
     except (OSError, LookupError, TypeError, ValueError) as error:

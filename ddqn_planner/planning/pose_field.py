@@ -13,7 +13,7 @@ from ddqn_planner.grid import GridMap
 from ddqn_planner.planning import pose_kernels as kernels
 from ddqn_planner.planning.pose_kernels import Aim, Search, heap_of
 from ddqn_planner.planning.pose_paths import SAME, Way
-from ddqn_planner.planning.pose_world import SHIFT, TILE, State, World
+from ddqn_planner.planning.pose_world import SHIFT, TILE, State, World, occupied_for_body
 
 NO_RESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)  # not in all versions of Python
 HEAP = 2**18  # entries that a heap has room for, at least
@@ -142,12 +142,11 @@ class PoseField:
         way = np.empty((4, 1 + most * int(np.diff(body.first_pose).max())))
         return way[:, : kernels.follow(self._search, number, most, way)]
 
-    def repaired(
-        self, grid: GridMap, world: World, cells: NDArray[np.int64], opens: bool
-    ) -> PoseField:
+    def repaired(self, grid: GridMap, world: World, cells: NDArray[np.int64]) -> PoseField:
         """Return it for a map that differs in cells (N, 2), or a new one where that is quicker."""
-        # `opens` tells whether a way may have got cheaper: what is left to the start, too. If not,
+        # A way may have got cheaper where a cell is free: what is left to the start, too. If none,
         # what is open is in order still, and nothing costs less than was known to be the least.
+        opens = not occupied_for_body(grid)[cells[:, 1], cells[:, 0]].all()
         self.grid, self.world, self.way, self.visits = grid, world, None, 0
         is_near = np.zeros(world.tile.shape, np.bool_)
         far = world.body.reach // TILE + 1

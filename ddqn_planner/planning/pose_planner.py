@@ -182,8 +182,8 @@ class PosePlanner:
         for asked, known in self._fields.items():
             if asked[:2] != (request.goals, request.tolerance) or (way := known.way) is None:
                 continue
-            found = self._differences(known.grid, request.grid)
-            if found is None or len(found[0]):
+            cells = self._differences(known.grid, request.grid)
+            if cells is None or len(cells):
                 continue
             first = paths.nearest_pose(way.poses, request.start, request.grid, ON_PATH)
             plan = way.plan(first, request.grid) if first >= 0 else None
@@ -193,9 +193,9 @@ class PosePlanner:
 
     def _world(self, grid: GridMap) -> World:
         """Return a map for kernels, from the last one where that is quicker."""
-        found = self._differences(self._map[0], grid) if self._map else None
-        older = (self._map[1], found[0]) if self._map and found else ()
-        self._map = grid, world_of(grid, self.body, *older)
+        cells = self._differences(self._map[0], grid) if self._map else None
+        older = self._map[1] if self._map else None
+        self._map = grid, world_of(grid, self.body, older, cells)
         return self._map[1]
 
     def _field(self, request: PoseRequest, states: NDArray[np.int64]) -> PoseField:
@@ -203,9 +203,9 @@ class PosePlanner:
         grid, asked = request.grid, (request.goals, request.tolerance, states.tobytes())
         field = self._fields.pop(asked, None)
         if field is None or field.grid is not grid:
-            found = self._differences(field.grid, grid) if field else None
+            cells = self._differences(field.grid, grid) if field else None
             world = self._world(grid)
-            kept = field.repaired(grid, world, *found) if field and found else None
+            kept = field.repaired(grid, world, cells) if field and cells is not None else None
             field = kept or PoseField(states, grid, world)
         self._fields = dict([*self._fields.items(), (asked, field)][-KEPT:])
         return field

@@ -144,11 +144,13 @@ def body_costs(grid: GridMap) -> NDArray[np.int8] | None:
     return costs
 
 
-def world_of(grid: GridMap, body: Body, older: World | None = None, cells: Any = None) -> World:
+def world_of(
+    grid: GridMap, body: Body, older: World | None = None, cells: NDArray[np.int64] | None = None
+) -> World:
     """Return a map for kernels: from scratch, or from an older one that differs in cells (N, 2)."""
     occupied = occupied_for_body(grid)
     height, width = occupied.shape
-    if older is None:
+    if older is None or cells is None:
         bits = np.full((height + 2 * BORDER, (width + 2 * BORDER + 63) // 64 + 1), FULL)
         tile, room = np.zeros((2, -(-height // TILE), -(-width // TILE)), dtype=np.uint8)
         (left, bottom), (right, top) = (0, 0), (width, height)
@@ -169,18 +171,14 @@ def world_of(grid: GridMap, body: Body, older: World | None = None, cells: Any =
     return World(body, bits, tile, room, height, width, *layers)
 
 
-def differences(old: GridMap, new: GridMap) -> tuple[NDArray[np.int64], bool] | None:
-    """Return the cells (N, 2) in which maps of one place differ, and whether a way may be cheaper.
-
-    None if the maps cannot be compared, or differ in too much.
-    """
+def differences(old: GridMap, new: GridMap) -> NDArray[np.int64] | None:
+    """Return the cells (N, 2) in which maps differ for a body; None as `changed_cells`."""
     before, after = occupied_for_body(old), occupied_for_body(new)
 
     def differs(box: Box) -> Any:
         return (before[box] != after[box]) | (new.differs(old, box) & ~after[box])
 
-    cells = changed_cells(old, new, differs)
-    return None if cells is None else (cells, not after[cells[:, 1], cells[:, 0]].all())
+    return changed_cells(old, new, differs)
 
 
 @inlined
