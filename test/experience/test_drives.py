@@ -175,6 +175,8 @@ def test_drives_are_recorded_and_teach_over_restarts(tmp_path: Path) -> None:
     folder = record(tmp_path / "new" / "folder", 1).folder
     record(folder, 1, DriveEnd.ABORTED)
     first, second = read_drives(folder / "episodes.csv")
+    rows = (folder / "episodes.csv").read_text().splitlines()
+    assert [row.split(",")[0] for row in rows] == ["episode", "1", "2"]
     assert [first.outcome, second.outcome] == [DriveEnd.ARRIVED, DriveEnd.ABORTED]
     assert first.metres == pytest.approx(20)
     np.testing.assert_allclose(first.seconds, SLOW[0], atol=1e-3)
