@@ -138,7 +138,7 @@ class DriveRecorder:
                 f"the robot is at {(x, y)} at {seconds} s; give finite numbers up to {LATEST:g}"
             )
         if self._last is not None and seconds < self._last[0] - JUMP:
-            self.end(DriveEnd.STOPPED)
+            self.end()
             self.forget()
         if self._stands is None or math.dist(self._stands[1:], sample[1:]) > STAND_DISTANCE:
             if self._last is not None and not self._samples:
@@ -176,7 +176,7 @@ class DriveRecorder:
             self._samples.append(self._last)
         self.end(DriveEnd.ABORTED)
 
-    def end(self, outcome: DriveEnd) -> None:
+    def end(self, outcome: DriveEnd = DriveEnd.STOPPED) -> None:
         """End the drive, if there is one; the robot has to drive off again."""
         samples, self._samples = np.array(self._samples).reshape(-1, 3), []
         self._stands = self._last
@@ -272,7 +272,7 @@ def read_recording(path: Path, grid: GridMap, *how: str) -> tuple[str, list[Driv
         recorder = DriveRecorder(drives.append)
         for sample in samples:
             recorder.add(*sample)
-        recorder.end(DriveEnd.STOPPED)
+        recorder.end()
     if not drives:
         raise ValueError(f"{path} holds no drive; drive on")
     at = np.concatenate([drive.positions for drive in drives])

@@ -17,13 +17,7 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
 
-from ddqn_planner.experience.drives import (
-    Drive,
-    DriveEnd,
-    DriveFolder,
-    DriveRecorder,
-    read_drives,
-)
+from ddqn_planner.experience.drives import Drive, DriveFolder, DriveRecorder, read_drives
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import occupancy_message
 from ddqn_planner.nodes.poses import Frames, listen
@@ -236,7 +230,7 @@ class Driving:
             self._node.state = "stopped"
             return True, "no drives were being recorded"
         for robot in self._robots:
-            robot.recorder.end(DriveEnd.STOPPED)
+            robot.recorder.end()
         folder.try_to_save()
         if folder.save_error:
             return False, folder.save_error

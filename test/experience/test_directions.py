@@ -21,7 +21,7 @@ def seconds(experience: Experience, grid: GridMap, *ends: tuple[float, float]) -
 
 @pytest.mark.parametrize("yaw", [0.0, math.pi / 2, -2.4])
 def test_a_ramp_takes_longer_upward_than_downward(yaw: float) -> None:
-    ramp = driven(*[UP, DOWN] * 6)
+    ramp = driven(*[UP, DOWN] * 6, straight((2, 9), (12, 9)))
     middle = GridMap(np.zeros((120, 120)), 0.25, (0, 0, yaw)).cell_to_world((60, 60))
     grid = GridMap(np.zeros((120, 120)), 0.25, (7 - middle[0], 5 - middle[1], yaw))
     assert seconds(ramp, grid, WEST, EAST) == pytest.approx(60, rel=0.15)

@@ -86,7 +86,7 @@ def test_a_new_goal_ends_a_drive(robot: Robot, end: float, outcome: str) -> None
     robot.recorder.set_goal(9.0, 2.0)
     assert robot.outcomes == [outcome]
     robot.move(1)
-    robot.recorder.end(DriveEnd.STOPPED)
+    robot.recorder.end()
     assert robot.outcomes == [outcome, "stopped"]
 
 
@@ -95,7 +95,7 @@ def test_a_long_pause_ends_a_drive_and_the_next_begins_there(robot: Robot) -> No
     robot.stand(300)
     assert robot.outcomes == ["paused"]
     robot.move(2)
-    robot.recorder.end(DriveEnd.STOPPED)
+    robot.recorder.end()
     assert robot.outcomes == ["paused", "stopped"]
     assert robot.drives[1].positions[0] == pytest.approx([2.1, 2], abs=0.1)
 
@@ -114,7 +114,7 @@ def test_who_gives_up_ends_a_drive_also_before_it_moved(robot: Robot) -> None:
 
 def test_a_long_drive_is_cut_and_goes_on(robot: Robot) -> None:
     robot.move(0.06 * 2.5 * MOST_SAMPLES, speed=1.2)
-    robot.recorder.end(DriveEnd.STOPPED)
+    robot.recorder.end()
     assert robot.outcomes == ["cut", "cut", "stopped"]
     for before, after in pairwise(robot.drives):
         assert before.seconds[-1] == after.seconds[0]
@@ -128,7 +128,7 @@ def test_a_clock_that_jumps_back_ends_the_drive_and_the_next_has_its_times(
     robot.now -= jump
     robot.x = 0.0
     robot.move(2)
-    robot.recorder.end(DriveEnd.STOPPED)
+    robot.recorder.end()
     assert robot.outcomes == ["stopped"] * drives
     for _, seconds, positions in robot.drives[-drives:]:
         assert drives == 1 or (np.diff(seconds) > 0).all()
@@ -141,7 +141,7 @@ def test_numbers_that_name_no_place_are_refused(robot: Robot, wrong: float) -> N
         with pytest.raises(ValueError, match="give finite numbers"):
             robot.recorder.add(*np.roll([wrong, 0.0, 0.0], place).tolist())
     robot.move(1)
-    robot.recorder.end(DriveEnd.STOPPED)
+    robot.recorder.end()
     assert robot.outcomes == ["stopped"]
 
 
@@ -175,6 +175,8 @@ def test_drives_are_recorded_and_teach_over_restarts(tmp_path: Path) -> None:
     folder = record(tmp_path / "new" / "folder", 1).folder
     record(folder, 1, DriveEnd.ABORTED)
     first, second = read_drives(folder / "episodes.csv")
+    rows = (folder / "episodes.csv").read_text().splitlines()
+    assert [row.split(",")[0] for row in rows] == ["episode", "1", "2"]
     assert [first.outcome, second.outcome] == [DriveEnd.ARRIVED, DriveEnd.ABORTED]
     assert first.metres == pytest.approx(20)
     np.testing.assert_allclose(first.seconds, SLOW[0], atol=1e-3)
@@ -303,5 +305,5 @@ def test_a_drive_knows_how_far_it_was_and_counts_no_noise() -> None:
     robot = Robot()
     for now, at in zip(seconds, noisy[-400:].repeat(3, axis=0), strict=True):
         robot.recorder.add(now, *at)
-    robot.recorder.end(DriveEnd.STOPPED)
+    robot.recorder.end()
     assert robot.drives == []

@@ -25,6 +25,9 @@ def test_without_drives_every_place_takes_its_nominal_time() -> None:
         assert (experience.slowness(HALL) == 1).all()
         assert (experience.uncertainty(HALL) == experience.uncertainty(HALL)[0, 0]).all()
         assert experience.expected_time(HALL, [(0, 0)]).seconds == 0
+        experience.record(*straight((9, 5), (4, 6), 2))  # as if there had been no drive before
+    assert forgotten.evidence.driven == experience.evidence.driven
+    np.testing.assert_array_equal(forgotten.evidence.table, experience.evidence.table)
 
 
 @given(st.floats(1.5, 10), st.sampled_from([1, 5, 10, 50]), st.sampled_from([0, 1.75e9]))
