@@ -333,8 +333,7 @@ class FieldCache:
     def find(self, grid: GridMap, goals: Goals, rule: MoveRule) -> QField | None:
         """Return the field of a map toward the nearest of some goals if it is kept, else None."""
         for field in self._kept:
-            same_goals = field.goals == goals and field.move_rule is rule
-            if same_goals and grid.same_cells(field.grid):
+            if field.goals == goals and field.move_rule is rule and grid.same_cells(field.grid):
                 field.grid = grid  # it may lie elsewhere
                 self._kept = [*(other for other in self._kept if other is not field), field]
                 return field
@@ -368,10 +367,9 @@ class FieldCache:
             field.grid = grid
         else:
             field = DistanceField(goals, grid, costs, rule)
-            for old in self._of_rule(rule):
-                if old.goals == goals and field.take_over(old, start):
-                    replaced = old  # the place will hardly be again what it was
-                    break
+            older = (old for old in self._of_rule(rule) if old.goals == goals)
+            # The place will hardly be again what it was.
+            replaced = next((old for old in older if field.take_over(old, start)), None)
         kept = [*(other for other in self._kept if other is not replaced), field]
         sizes = [each.nbytes + (each.costs.patch.nbytes if each.costs else 0) for each in kept]
         number = sum(size <= self.nbytes for size in accumulate(reversed(sizes)))
