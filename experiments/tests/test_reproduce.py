@@ -33,6 +33,12 @@ PATIENCE = 300
 """Seconds to wait for what should come at once: a loaded machine is slow, not wrong."""
 
 
+@pytest.fixture
+def small(small: Scenario) -> Scenario:
+    """As the paper's robot moves."""
+    return replace(small, move_rule=trainings.MOVE_RULE)
+
+
 @pytest.mark.filterwarnings("ignore:All-NaN")  # of one seed that learns nothing
 def test_every_experiment_writes_its_report_and_trains_what_is_new(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
