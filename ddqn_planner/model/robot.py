@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -71,28 +70,29 @@ class RobotNetwork(QNetwork):
     def untrained(cls, footprint: Float64, motions: Motions) -> RobotNetwork:
         """Return the network of a robot that knows nothing yet; a ValueError for no robot."""
         *_, units = units_of(motions)
-        count = len(units)
-        side = swept_cells(footprint, replace(motions, poses=tuple(units))).shape[1]
+        swept_USS = swept_cells(footprint, units)
         poses = [len(one) for one in motions.poses]
         columns = motions.start, motions.end, *motions.offset.T, motions.cost, poses
         tensors: dict[str, Any] = {
-            "weight": np.zeros((count, side, side), np.float32),
-            "threshold": np.zeros(count, np.float32),
+            "weight": np.zeros(swept_USS.shape, np.float32),
+            "threshold": np.zeros(len(swept_USS), np.float32),
             "primitive": np.column_stack(columns).astype(np.float64),
             "pose": np.concatenate(motions.poses),
             "footprint": footprint,
             "angle": motions.angles,
             "resolution": np.array([motions.resolution]),
         }
-        sizes = count, side, len(poses), sum(poses), len(footprint)
+        sizes = *swept_USS.shape[:2], len(poses), sum(poses), len(footprint)
         return cls(dict(zip(cls.size_names, sizes, strict=True)), tensors)
 
     def __init__(self, sizes: Mapping[str, int], tensors: Mapping[str, Any]) -> None:
         super().__init__(sizes, tensors)
         self.footprint = read_footprint(tensors["footprint"].tolist())
         self.motions = _motions_of(self.tensors)
-        self.unit, self.turns, self.unit_poses = units_of(self.motions)
-        found = {"units": len(self.unit_poses), "side": self.swept_by_unit.shape[1]}
+        self.unit, self.turns, units = units_of(self.motions)
+        # (U, S, S): the cells that the body sweeps on one primitive of each unit
+        self.swept_by_unit = swept_cells(self.footprint, units)
+        found = dict(zip(self.size_names, self.swept_by_unit.shape[:2], strict=False))
         if wrong := {name: size for name, size in found.items() if size != sizes[name]}:
             raise ValueError(
                 f"its body and motions need {wrong}, not {dict(sizes)}; train it again"
@@ -101,11 +101,6 @@ class RobotNetwork(QNetwork):
     def supports(self, shape: tuple[int, int]) -> bool:
         """Say whether the network can plan cells on maps of shape (H, W): it plans poses."""
         return False
-
-    @cached_property
-    def swept_by_unit(self) -> NDArray[np.bool_]:
-        """The cells that the body sweeps on one primitive of each unit: (U, S, S)."""
-        return swept_cells(self.footprint, replace(self.motions, poses=tuple(self.unit_poses)))
 
     def of_primitives(self, array_USS: NDArray[Any]) -> NDArray[Any]:
         """Return what each primitive has of its unit, in the directions of the map: (P, S, S)."""
@@ -143,8 +138,8 @@ class RobotNetwork(QNetwork):
         return self.of_primitives(learned_USS)
 
 
-def units_of(motions: Motions) -> tuple[NDArray[np.int64], NDArray[np.int64], list[Float64]]:
-    """Return the unit of each primitive, its quarter turns, (P,), and the poses of each unit."""
+def units_of(motions: Motions) -> tuple[NDArray[np.int64], NDArray[np.int64], Motions]:
+    """Return the unit of each primitive, its quarter turns, (P,), and motions with units' poses."""
     turns_P, numbers = motions.start // QUARTER, []
     units: list[Float64] = []
     for turns, poses in zip(turns_P.tolist(), motions.poses, strict=True):
@@ -156,7 +151,7 @@ def units_of(motions: Motions) -> tuple[NDArray[np.int64], NDArray[np.int64], li
         numbers.append(next(alike, len(units)))
         if numbers[-1] == len(units):
             units.append(back)
-    return np.array(numbers), turns_P, units
+    return np.array(numbers), turns_P, replace(motions, poses=tuple(units))
 
 
 def _is_same(poses: Float64, others: Float64) -> bool:
