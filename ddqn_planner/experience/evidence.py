@@ -258,14 +258,18 @@ class Evidence:
         return posterior
 
     def merge(self, other: Evidence) -> None:
-        """Add what other evidence has."""
+        """Add what other evidence has, which takes over the prior."""
+        known, prior = len(self.table), other.prior if self.prior is None else self.prior
+        for each in (self, other):
+            each.use_prior(prior)
         rows = self._rows_at(other.table[:, 5:])
         self.table[rows, :4] += other.table[:, :4]
+        self.table[rows[rows >= known], 4] = other.table[rows >= known, 4]
         self.directed[rows] += other.directed
         self.errors += other.errors
         self.surprises += other.surprises
         self.driven += other.driven
-        self.use_prior(other.prior if self.prior is None else self.prior)
+        self._fit()
 
     def use_prior(self, prior: Prior | None) -> None:
         """Let another prior foretell; its level, learned from these places, counts but once."""

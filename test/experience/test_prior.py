@@ -2,10 +2,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from experience.straight_drives import straight
 from hypothesis import given
 from strategies import occupancies
 
-from ddqn_planner import GridMap, inflate
+from ddqn_planner import Experience, GridMap, inflate
 from ddqn_planner.experience.prior import FEATURES, Prior, map_features
 
 
@@ -61,6 +62,20 @@ def test_a_prior_survives_as_arrays() -> None:
     again = Prior.from_arrays(prior._asdict())
     assert again.log_slowness(features).dtype == np.float32
     assert all(np.array_equal(one, other) for one, other in zip(prior, again, strict=True))
+
+
+def test_what_was_foretold_of_places_stays_with_them_after_a_merge() -> None:
+    other, nothing, elsewhere = (Experience(0.5) for _ in range(3))
+    elsewhere.record(*straight((2, 8), (12, 8), 2))
+    other.prior = some_prior()
+    other.apply(GridMap(np.zeros((40, 60), dtype=bool), 0.25))
+    other.record(*straight((2, 2), (12, 2), 2))
+    for one in (nothing, elsewhere):
+        one.merge(other)
+    assert nothing.to_bytes() == other.to_bytes()
+    foretold = other.evidence.table[:, 4]
+    assert (foretold != other.prior.level).all()
+    assert (elsewhere.evidence.table[-len(foretold) :, 4] == foretold).all()
 
 
 def test_places_unlike_all_known_ones_are_foretold_as_the_least_unlike() -> None:
