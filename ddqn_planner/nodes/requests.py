@@ -34,6 +34,7 @@ from ddqn_planner.planning.pose_planner import PoseRequest
 from ddqn_planner.warm_up import warm_up
 
 HEADING = 2 * math.pi / HEADINGS  # radians that a robot turns until that is a reason to plan
+REST_AFTER = 1.0  # seconds until the rest is compiled: what waits for the model is planned first
 UNCHANGED = Outcome("UNCHANGED", "the active goal needs no new plan")
 
 T = TypeVar("T")
@@ -142,7 +143,9 @@ class ModelSource:
             except Exception as error:
                 return None, f"{str(error) or repr(error)}; or set the parameter 'model'"
             gc.freeze()  # a collection of all that would stop the node for 45 ms
-            threading.Thread(target=next, args=[compiling], daemon=True).start()  # the rest
+            rest = threading.Timer(REST_AFTER, next, [compiling])
+            rest.daemon = True  # no end of the process waits for it
+            rest.start()
             return planner, file
 
         self.loading = self._worker.call(read)
