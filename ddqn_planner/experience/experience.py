@@ -180,9 +180,12 @@ class Experience:
         ValueError
             If the two have other parameters.
         """
+        self._check_kind(other)
+        self._learn(partial(Evidence.merge, other=copy.deepcopy(other.evidence)))
+
+    def _check_kind(self, other: Experience) -> None:
         if changed := differences(other.options, self.options):
             raise ValueError(f"the other experience has {changed}; give those of one kind of robot")
-        self._learn(partial(Evidence.merge, other=copy.deepcopy(other.evidence)))
 
     @property
     def learned_speed(self) -> float:
@@ -288,6 +291,7 @@ class Experience:
             old = path.read_bytes() if path.exists() else None
             if old is not None and self._synchronised != (path, crc32(old)):
                 saved = Experience.load(path)
+                saved._check_kind(self)
                 if self._synchronised[0] == path:
                     for step in self._news:
                         step(saved.evidence)

@@ -311,6 +311,10 @@ def test_two_processes_that_save_one_file_lose_nothing(tmp_path: Path) -> None:
     assert (Experience.load(file).slowness(HALL) == 1).all()
     with pytest.raises(ValueError, match=r"robot_width 0.4 \(now 0.5\)"):
         driven(robot_width=0.4).save(file)
+    file.unlink()
+    driven(robot_width=0.4).save(file)
+    with pytest.raises(ValueError, match=r"robot_width 0.5 \(now 0.4\)"):
+        one.save(file)
 
 
 def test_what_was_merged_is_as_if_one_robot_had_driven_all() -> None:
