@@ -241,17 +241,28 @@ class Requests:
             wrong = f"the tolerance is {metres}; give metres, finite and 0 or more"
             raise RequestError("INVALID_TOLERANCE", wrong)
         request: Any
-        options = {"switch_threshold": settings.switch_threshold}
         if planner.pose_planner is not None:
             first, second, *more = map(pose_of, poses)
-            limits = metres, settings.yaw_tolerance
-            request = PoseRequest(grid, first, (second,), limits, settings.path_bound, **options)
+            request = PoseRequest(
+                grid,
+                start=first,
+                goals=(second,),
+                tolerance=(metres, settings.yaw_tolerance),
+                bound=settings.path_bound,
+                switch_threshold=settings.switch_threshold,
+            )
         else:
-            rule = MoveRule(settings.move_rule or planner.metadata.move_rule)
-            is_simplified = settings.path_simplification != "none"
-            how = rule, PlanMethod(settings.mode), metres / grid.resolution, is_simplified
-            options["start_clearing_radius"] = _clearing_radius(settings, grid)
-            request = PlanRequest(grid, first, (second,), *how, **options)
+            request = PlanRequest(
+                grid,
+                start=first,
+                goals=(second,),
+                move_rule=MoveRule(settings.move_rule or planner.metadata.move_rule),
+                method=PlanMethod(settings.mode),
+                tolerance=metres / grid.resolution,
+                simplified=settings.path_simplification != "none",
+                switch_threshold=settings.switch_threshold,
+                start_clearing_radius=_clearing_radius(settings, grid),
+            )
         if active is not None:
             active.poses[:] = poses[1:]  # there they stay, though their own frame moves
             followed = active.followed
