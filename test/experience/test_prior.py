@@ -76,6 +76,11 @@ def test_what_was_foretold_of_places_stays_with_them_after_a_merge() -> None:
     foretold = other.evidence.table[:, 4]
     assert (foretold != other.prior.level).all()
     assert (elsewhere.evidence.table[-len(foretold) :, 4] == foretold).all()
+    own = Experience(0.5)
+    own.prior = some_prior()._replace(level=np.float32(0.25))
+    own.merge(other)  # its own prior stays, and each level counts but once
+    level = own.evidence.table[:, 4] - foretold
+    assert level == pytest.approx(0.25 - float(some_prior().level), abs=1e-9)
 
 
 def test_places_unlike_all_known_ones_are_foretold_as_the_least_unlike() -> None:
