@@ -134,8 +134,8 @@ class PosePlanner:
             return plan
         share, least = cost / new if new else 1.0, 0.0  # without a plan nothing is proved
         if has_plan:
-            cost = share * (plan.cost or 0.0) / (grid.seconds_per_cell or 1.0)
-            least = cost / (share * plan.bound)
+            of_plan = (plan.cost or 0.0) / (grid.seconds_per_cell or 1.0)
+            cost, least = share * of_plan, of_plan / plan.bound
         cells, spent = paths.cells_of(paths.in_cells(rest, grid)), np.linspace(0, cost, len(rest))
         kept = paths.Way(rest, cells, spent, least).plan(0, grid)
         ms = plan.field_ms, plan.rollout_ms

@@ -53,6 +53,16 @@ def test_a_robot_a_little_beside_its_path_keeps_it(
         assert plan(planner, grid, start, **under_way).status is PlanStatus.START_OCCUPIED
 
 
+@pytest.mark.parametrize("past", [(0.1, 0, 0), (0.2, 0.1, 0.1), (0, 0.1, 0)])
+def test_a_robot_past_its_goal_has_arrived(planner: Planner, past: Any) -> None:
+    hall = GridMap(np.zeros((20, 60)), CELL)
+    path = plan(planner, hall, START)
+    kept = plan(planner, hall, path.poses[-1] + past, under_way=path.poses)
+    assert kept.status is PlanStatus.SUCCEEDED
+    assert np.array_equal(kept.poses, path.poses[-1:])
+    assert (kept.cost, kept.extra_cost, kept.bound) == (0.0, -1.0, 1.0)
+
+
 def test_a_body_explores_within_the_share_alone(planner: Planner) -> None:
     random = np.random.default_rng(0)
     slowness = random.uniform(4, 8, (3, 20, 40)).astype(np.float32)
