@@ -63,6 +63,17 @@ def test_a_robot_past_its_goal_has_arrived(planner: Planner, past: Any) -> None:
     assert (kept.cost, kept.extra_cost, kept.bound) == (0.0, -1.0, 1.0)
 
 
+def test_a_kept_path_is_proved_as_far_as_the_new_one(planner: Planner) -> None:
+    occupancy = np.random.default_rng(1).random((20, 60)) < 0.02
+    occupancy[6:15, :12] = occupancy[6:15, 28:42] = False  # around both ends
+    hall = GridMap(occupancy, CELL)
+    path = plan(planner, hall, START, bound=1.5)
+    kept = plan(planner, hall, START, under_way=path.poses, switch_threshold=0.5, bound=1.5)
+    new = plan(planner, hall, START, bound=1.5)
+    assert min(new.bound, path.bound) > 1
+    assert kept.bound == pytest.approx(new.bound * (1 + kept.extra_cost))
+
+
 def test_a_body_explores_within_the_share_alone(planner: Planner) -> None:
     random = np.random.default_rng(0)
     slowness = random.uniform(4, 8, (3, 20, 40)).astype(np.float32)
