@@ -73,7 +73,8 @@ class LiveView(Node):
         points = [stamped.pose.position for stamped in message.poses]
         origin, rotation = info.origin.position, info.origin.orientation
         metres = np.array([complex(p.x - origin.x, p.y - origin.y) for p in points])
-        cells = metres * complex(rotation.w, -rotation.z) ** 2 / (info.resolution or 1.0)
+        turn = complex(rotation.w, -rotation.z) ** 2
+        cells = metres * turn / (abs(turn) or 1.0) / (info.resolution or 1.0)
         strip = np.stack([cells.real, info.height - cells.imag], axis=1)
         style: Any = {"radii": rr.Radius.ui_points(radius), "colors": ImageColor.getrgb(colour)}
         lines = rr.LineStrips2D([strip] if points else [], **style, draw_order=ORDER[name])

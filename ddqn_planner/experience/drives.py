@@ -25,6 +25,7 @@ from ddqn_planner.experience.experience import (
 from ddqn_planner.experience.posterior import cells_of
 from ddqn_planner.files import Appender, WorkFolder, differences
 from ddqn_planner.grid import GridMap
+from ddqn_planner.grid.rotations import Rotation
 
 Float64 = NDArray[np.float64]
 Sample = tuple[float, float, float]  # seconds, and x and y in metres in the frame of the map
@@ -392,9 +393,12 @@ def _moves(
 ) -> Iterator[tuple[str, str, Sample]]:
     """Take transforms; yield each robot that one moves, the frame that moved, and its pose."""
     for stamped in message.transforms:
-        moved, turn = stamped.transform.translation, stamped.transform.rotation
+        moved, sent = stamped.transform.translation, stamped.transform.rotation
+        turn = Rotation(sent.x, sent.y, sent.z, sent.w)
+        if not turn.is_rounded:  # tf2 ignores such transforms, too
+            continue
         child, parent = stamped.child_frame_id.lstrip("/"), stamped.header.frame_id.lstrip("/")
-        turned = cmath.rect(1, 2 * math.atan2(turn.z, turn.w))
+        turned = cmath.rect(1, turn.yaw)
         tree[child] = parent, complex(moved.x, moved.y), turned
         for robot in tree:
             if robot != robot_frame and (robot_frame or robot.rpartition("/")[2] != BASE):

@@ -19,12 +19,14 @@ from ddqn_planner.grid.arguments import Cells
 from ddqn_planner.grid.body import grid_from_costmap
 from ddqn_planner.grid.map_file import MAX_CELLS
 from ddqn_planner.grid.moves import positions
+from ddqn_planner.grid.rotations import Rotation
 
 Origin = tuple[float, float, float]
 Float64 = NDArray[np.float64]
 
 MAP_PARAMETERS = ("occupied_threshold", "allow_unknown", "use_map_costs", "map_type")
-TOLERANCE = 1e-4  # how far the norm of a quaternion may be from 1
+MAX_TILT = 0.01  # sine of half an angle: two decimals of a quaternion round to less
+AS_SENT = 1e-6  # a norm so near to 1 is left as it is
 MIN_RESOLUTION = 1e-6  # metres per cell
 LABEL = "ddqn_planner {} 1 sha256:{}"  # of bytes: their kind, its version and their digest
 SAME_DIRECTION = 1e-6  # radians: poses along a segment are rounded
@@ -32,7 +34,7 @@ SAME_DIRECTION = 1e-6  # radians: poses along a segment are rounded
 
 def grid_from_message(message: OccupancyGrid, *rules: Any) -> GridMap:
     """Make a grid map of a map message by rules of `MAP_PARAMETERS`, or a ValueError."""
-    info, turned = message.info, message.info.origin.orientation
+    info = message.info
     size = f"{info.width} x {info.height} cells"
     needs, has = info.width * info.height, len(message.data)
     metres = f"give metres per cell, finite and above {MIN_RESOLUTION}"
@@ -46,10 +48,12 @@ def grid_from_message(message: OccupancyGrid, *rules: Any) -> GridMap:
         if not is_right:
             raise ValueError(f"the map's {wrong}")
     _check_pose("the map's origin", info.origin)
-    if math.hypot(turned.x, turned.y) > TOLERANCE:
-        raise ValueError(f"the map's origin is rolled or pitched ({_numbers(turned)}); give a yaw")
+    turned = rotation(info.origin.orientation)
+    if turned.tilt > MAX_TILT:
+        numbers = _numbers(info.origin.orientation)
+        raise ValueError(f"the map's origin is rolled or pitched ({numbers}); give a yaw")
     values = np.frombuffer(message.data, np.int8).reshape(info.height, info.width)
-    origin = (info.origin.position.x, info.origin.position.y, 2 * math.atan2(turned.z, turned.w))
+    origin = (info.origin.position.x, info.origin.position.y, turned.yaw)
     try:
         return grid_from_values(values, info.resolution, origin, *rules)
     except MemoryError:
@@ -181,27 +185,43 @@ def cell_from_pose(name: str, stamped: PoseStamped, grid: GridMap, frame: str) -
 
 def pose_of(stamped: PoseStamped) -> Origin:
     """Return x, y and yaw of a pose, about z alone."""
-    position, turned = stamped.pose.position, stamped.pose.orientation
-    ahead = 1 - 2 * (turned.y**2 + turned.z**2)
-    yaw = math.atan2(2 * (turned.x * turned.y + turned.w * turned.z), ahead)
-    return position.x, position.y, yaw
+    position = stamped.pose.position
+    return position.x, position.y, rotation(stamped.pose.orientation).yaw
+
+
+def rotation(message: Quaternion) -> Rotation:
+    """Return the numbers of a message."""
+    return Rotation(message.x, message.y, message.z, message.w)
+
+
+def with_unit_quaternion(stamped: PoseStamped) -> PoseStamped:
+    """Return a pose that `check_pose` accepts, or a copy of it whose quaternion has the norm 1.
+
+    Whoever reads a path may refuse others, as Nav2 does.
+    """
+    sent = rotation(stamped.pose.orientation)
+    if abs(sent.norm - 1) <= AS_SENT:
+        return stamped
+    x, y, z, w = sent.normalised()
+    pose = Pose(position=stamped.pose.position, orientation=Quaternion(x=x, y=y, z=z, w=w))
+    return PoseStamped(header=stamped.header, pose=pose)
 
 
 def quaternion(yaw: float) -> Quaternion:
     """Return the rotation by `yaw` radians about z, counter-clockwise."""
-    rotation = Quaternion()
-    rotation.z, rotation.w = math.sin(yaw / 2), math.cos(yaw / 2)
-    return rotation
+    turned = Quaternion()
+    turned.z, turned.w = math.sin(yaw / 2), math.cos(yaw / 2)
+    return turned
 
 
 def _check_pose(name: str, pose: Pose) -> None:
-    position, rotation = pose.position, pose.orientation
+    position = pose.position
     if not all(map(math.isfinite, (position.x, position.y, position.z))):
         raise ValueError(f"{name}'s position is ({_numbers(position)}); give finite numbers")
-    # A comparison that NaN fails.
-    norm = math.hypot(rotation.x, rotation.y, rotation.z, rotation.w)
-    if not abs(norm - 1) <= TOLERANCE:
-        wrong = f"{name}'s orientation is ({_numbers(rotation)}), a quaternion of norm {norm:.6g}"
+    turned = rotation(pose.orientation)
+    if not turned.is_rounded:
+        numbers = _numbers(pose.orientation)
+        wrong = f"{name}'s orientation is ({numbers}), a quaternion of norm {turned.norm:.6g}"
         raise ValueError(f"{wrong}; give one of norm 1 (w = 1 and the rest 0 means no rotation)")
 
 

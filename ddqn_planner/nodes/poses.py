@@ -8,13 +8,14 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion, TransformStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.time import Time
 
-from ddqn_planner.nodes.conversions import check_pose, quaternion
+from ddqn_planner.grid.rotations import Rotation
+from ddqn_planner.nodes.conversions import check_pose, quaternion, rotation, with_unit_quaternion
 from ddqn_planner.nodes.report import PATIENCE, Refusals, RequestError
 from ddqn_planner.nodes.runtime import STEADY, BaseNode
 
@@ -56,7 +57,7 @@ class Frames:
         self.check(name, stamped, map_frame)
         frame = stamped.header.frame_id
         if frame == map_frame:
-            return stamped
+            return with_unit_quaternion(stamped)
         try:
             stamp = Time.from_msg(stamped.header.stamp)
             return transformed(stamped, self._lookup(map_frame, frame, stamp))
@@ -116,20 +117,29 @@ class Frames:
 
 
 def transformed(stamped: PoseStamped, transform: TransformStamped) -> PoseStamped:
-    """Return a pose in the transform's frame, projected to the plane: z is 0, and yaw is left."""
-    turn, shift = transform.transform.rotation, transform.transform.translation
-    position = stamped.pose.position
+    """Return a pose in the transform's frame, projected to the plane: z is 0, and yaw is left.
+
+    A ValueError if the transform has no rotation.
+    """
+    turn = rotation(transform.transform.rotation)
+    if not turn.is_rounded:
+        frames = f"{transform.child_frame_id!r} to {transform.header.frame_id!r}"
+        wrong = f"the transform from {frames} has a quaternion of norm {turn.norm:.6g}"
+        raise ValueError(f"{wrong}; publish one of norm 1")
+    turn = turn.normalised()
+    facing = rotation(stamped.pose.orientation).normalised()
+    position, shift = stamped.pose.position, transform.transform.translation
     x, y, _ = _turned(turn, (position.x, position.y, position.z))
-    ahead_x, ahead_y, _ = _turned(turn, _turned(stamped.pose.orientation, (1.0, 0.0, 0.0)))
+    ahead_x, ahead_y, _ = _turned(turn, _turned(facing, (1.0, 0.0, 0.0)))
     result = PoseStamped(header=transform.header)
     result.pose.position.x, result.pose.position.y = x + shift.x, y + shift.y
     result.pose.orientation = quaternion(math.atan2(ahead_y, ahead_x))
     return result
 
 
-def _turned(rotation: Quaternion, point: tuple[float, ...]) -> tuple[float, ...]:
+def _turned(turn: Rotation, point: tuple[float, ...]) -> tuple[float, ...]:
     """Return p + 2 r × (r × p + w p), where r is the quaternion's vector and w its real part."""
-    x, y, z, w = rotation.x, rotation.y, rotation.z, rotation.w
+    x, y, z, w = turn
     px, py, pz = point
     a, b, c = y * pz - z * py + w * px, z * px - x * pz + w * py, x * py - y * px + w * pz
     return px + 2 * (y * c - z * b), py + 2 * (z * a - x * c), pz + 2 * (x * b - y * a)

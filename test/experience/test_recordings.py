@@ -34,7 +34,7 @@ geometry_msgs/Transform: geometry_msgs/Vector translation, geometry_msgs/Quatern
 geometry_msgs/TransformStamped: std_msgs/Header header, string child_frame_id, \
 geometry_msgs/Transform transform
 geometry_msgs/Vector: float64 x, float64 y
-geometry_msgs/Quaternion: float64 z, float64 w
+geometry_msgs/Quaternion: float64 x, float64 y, float64 z, float64 w
 nav_msgs/msg/Odometry: std_msgs/Header header, geometry_msgs/PoseWithCovariance pose
 geometry_msgs/msg/PoseStamped: std_msgs/Header header, geometry_msgs/Pose pose
 geometry_msgs/msg/PoseWithCovarianceStamped: std_msgs/Header header, \
@@ -228,6 +228,19 @@ def test_transforms_of_a_bag_lead_from_a_frame_below_the_one_that_moves_to_the_m
     np.testing.assert_allclose(samples, driven(5.0), atol=1e-9)
     printed = console("learn", tmp_path, "--map", map_file).out
     assert "200 poses of /tf of base_link" in printed
+
+
+def test_transforms_with_rounded_rotations_count_and_those_without_do_not(tmp_path: Path) -> None:
+    messages, empty = tree("", 5.0), {"x": 0.0, "y": 0.0, "z": 0.0, "w": 0.0}
+    for _, _, sent in messages:
+        for each in sent["transforms"]:
+            numbers = each["transform"]["rotation"]
+            each["transform"]["rotation"] = {axis: round(n, 3) for axis, n in numbers.items()}
+    bad = transform(105, "map", "odom", 30.0, 3.0)
+    bad["transform"]["rotation"] = empty
+    messages.insert(90, ("/tf", "tf2_msgs/msg/TFMessage", {"transforms": [bad]}))
+    _, samples = read_mcap([write_mcap(tmp_path / "bag.mcap", messages)])
+    np.testing.assert_allclose(samples, driven(5.0), atol=1e-9)
 
 
 BY_TURNS = zip(tree("", 9.0, "/robot2/tf"), tree("", 1.0, "/robot1/tf"), strict=True)

@@ -2,7 +2,7 @@ import array
 import math
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from itertools import pairwise
 from types import SimpleNamespace
@@ -32,13 +32,20 @@ from ddqn_planner.nodes.conversions import (
     occupancy_message,
     path_bytes,
     path_message,
+    pose_of,
     quaternion,
+    rotation,
     turns,
+    with_unit_quaternion,
 )
 from ddqn_planner.nodes.poses import Frames, Places, transformed
 from ddqn_planner.nodes.report import Refusals, RequestError
 
 HEADER = Header(frame_id="map")
+
+
+def quaternion_of(numbers: Iterable[float]) -> Quaternion:
+    return Quaternion(**dict(zip("xyzw", map(float, numbers), strict=True)))
 
 
 def map_message(yaw: float = 0.3) -> OccupancyGrid:
@@ -72,11 +79,55 @@ def test_a_malformed_map_is_refused() -> None:
         ("info.width", 4, "data has 6 values; its 4 x 2 cells need 8"),
         ("info.origin.position.x", math.nan, "position is .x = nan"),
         ("info.origin.position.z", math.inf, "z = inf"),
-        *((at, Quaternion(w=1.001), "norm 1.001"), (at, Quaternion(x=math.nan), "norm nan")),
+        *((at, Quaternion(w=1.2), "norm 1.2"), (at, Quaternion(x=math.nan), "norm nan")),
+        (at, Quaternion(w=0.0), "norm 0"),
         (at, rolled, "rolled or pitched"),
+        (at, Quaternion(x=1.0, w=0.0), "rolled or pitched"),
     ):
         with pytest.raises(ValueError, match=reason):
             grid_from_message(changed(map_message(), field, value))
+
+
+@pytest.mark.parametrize(
+    ("numbers", "yaw"),
+    [
+        ((0, 0, 0.707, 0.707), math.pi / 2),
+        ((0.001, 0, 0.707, 0.707), math.pi / 2),
+        ((0.005, -0.005, 0.71, 0.71), math.pi / 2),
+        ((0, 0, -0.7, -0.7), math.pi / 2),
+        ((0, 0, -0.707, 0.707), -math.pi / 2),
+        ((0, 0, 0.9999, 0.0), math.pi),
+        ((0, 0, 0, 0.9), 0.0),
+        ((0, 0, 0, 1.1), 0.0),
+    ],
+)
+def test_the_origin_of_a_map_may_be_rounded(numbers: tuple[float, ...], yaw: float) -> None:
+    turned = quaternion_of(numbers)
+    grid = grid_from_message(changed(map_message(), "info.origin.orientation", turned))
+    assert grid.origin[:2] == (-1.0, 2.0)
+    assert math.remainder(grid.origin[2] - yaw, 2 * math.pi) == pytest.approx(0, abs=0.02)
+
+
+def test_a_rounded_pose_is_read_with_the_norm_1_and_others_stay_as_they_are() -> None:
+    for numbers, yaw in (
+        ((0, 0, 0.707, 0.707), math.pi / 2),
+        ((0, 0, -0.71, -0.71), math.pi / 2),
+        ((0, 0, 0.26, 0.97), 2 * math.atan2(0.26, 0.97)),
+        ((0, 0, 0, -0.95), 0.0),
+        ((1.05, 0, 0, 0), 0.0),  # upside down
+    ):
+        sent = stamped_pose((2.0, 0.0, 0.0), quaternion_of(numbers))
+        check_pose("the goal", sent)
+        read = with_unit_quaternion(sent)
+        turned = rotation(read.pose.orientation)
+        assert turned.norm == pytest.approx(1.0, abs=1e-12)
+        assert (read.header, read.pose.position) == (sent.header, sent.pose.position)
+        assert tuple(rotation(sent.pose.orientation)) == tuple(map(float, numbers))
+        for pose in (sent, read):
+            assert pose_of(pose) == pytest.approx((2.0, 0.0, yaw))
+    for exact in (quaternion(0.3), quaternion_of(np.float32([0, 0, 0.6, 0.8]))):
+        sent = stamped_pose((2.0, 0.0, 0.0), exact)
+        assert with_unit_quaternion(sent) is sent
 
 
 def test_a_pose_has_a_cell_also_off_the_map_or_is_refused_by_the_name_of_its_value() -> None:
@@ -143,7 +194,6 @@ NUMBERS = st.lists(st.floats(-1, 1), min_size=4, max_size=4)
 UNITS = NUMBERS.filter(lambda four: math.hypot(*four) > 0.1).map(
     lambda four: [number / math.hypot(*four) for number in four]
 )
-QUATERNIONS = UNITS.map(lambda four: Quaternion(**dict(zip("xyzw", four, strict=True))))
 
 
 def stamped_pose(point: tuple[float, ...], rotation: Quaternion) -> PoseStamped:
@@ -160,7 +210,14 @@ def transform(shift: tuple[float, ...], rotation: Quaternion) -> TransformStampe
     return message
 
 
-@given(POINTS, QUATERNIONS, POINTS, QUATERNIONS)
+ROUNDED = st.builds(
+    lambda four, norm: quaternion_of(n * norm for n in four),
+    UNITS,
+    st.floats(0.91, 1.09),
+)
+
+
+@given(POINTS, ROUNDED, POINTS, ROUNDED)
 def test_a_pose_is_turned_and_moved_in_space_and_projected_to_the_plane(
     point: tuple[float, ...], facing: Quaternion, shift: tuple[float, ...], turn: Quaternion
 ) -> None:
@@ -175,6 +232,13 @@ def test_a_pose_is_turned_and_moved_in_space_and_projected_to_the_plane(
     ahead = complex(*looks.apply((1, 0, 0))[:2])
     if abs(ahead) > 1e-3:  # else it looks up or down
         assert complex(rotation.w, rotation.z) ** 2 == pytest.approx(ahead / abs(ahead), abs=1e-6)
+
+
+@pytest.mark.parametrize("w", [0.0, 0.8, math.nan, math.inf])
+def test_a_transform_without_a_rotation_is_named(w: float) -> None:
+    bad = transform((1.0, 2.0, 0.0), Quaternion(w=w))
+    with pytest.raises(ValueError, match=f"from 'odom' to 'map' has a quaternion of norm {w:.6g}"):
+        transformed(stamped_pose((2.0, 0.0, 0.0), Quaternion()), bad)
 
 
 class Buffer:

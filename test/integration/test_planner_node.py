@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from client import values_of, wait_for
+from client import cells_of, values_of, wait_for
 from geometry_msgs.msg import PoseStamped, Quaternion
 from integration.robot import (
     ERROR,
     GOAL,
     GOAL_YAW,
     OK,
+    ORIGIN,
     RESOLUTION,
     START,
     WARN,
@@ -36,7 +37,7 @@ from std_msgs.msg import UInt8MultiArray
 from std_srvs.srv import Trigger
 
 from ddqn_planner.model import find_model
-from ddqn_planner.nodes.conversions import bytes_message
+from ddqn_planner.nodes.conversions import bytes_message, rotation
 from ddqn_planner.nodes.report import seconds
 from ddqn_planner.nodes.runtime import LATCHED
 
@@ -222,11 +223,31 @@ def test_a_malformed_map_or_start_is_refused_and_a_goal_has_an_empty_plan(robot:
     assert all(path.poses == [] for path in robot.plans.messages())
 
 
+def test_quaternions_of_three_decimals_are_taken_and_sent_on_with_the_norm_1(robot: Robot) -> None:
+    rounded = Quaternion(z=0.707, w=0.707)
+    message = changed(robot.map_message(), "info.origin.orientation", rounded)
+    grid = robot.grid_of(robot.values, (*ORIGIN[:2], math.pi / 2))
+    robot.clear()
+    robot.send_map(message)
+    start, goal = (
+        changed(robot.pose(cell, 0.0, grid), "pose.orientation", rounded) for cell in (START, GOAL)
+    )
+    robot.send_start(start)
+    robot.send_goal(goal)
+    published = robot.plans.wait(lambda path: len(path.poses) > 0)
+    for path in (published, robot.get_plan(start, goal)):
+        for pose in path.poses:
+            turned = rotation(pose.pose.orientation)
+            assert turned.norm == pytest.approx(1.0, abs=1e-9)
+        assert turned.yaw == pytest.approx(math.pi / 2)
+        assert cells_of(grid, path)[-1] == GOAL
+
+
 @pytest.mark.parametrize("name", ["start", "goal"])
 def test_a_bad_request_has_an_empty_plan_and_a_reason(robot: Robot, name: str) -> None:
     robot.change(start_clearing_radius=0.0)
     for field, value, reason in (
-        ("pose.orientation", Quaternion(w=1.01), "quaternion of norm 1.01"),
+        ("pose.orientation", Quaternion(w=1.2), "quaternion of norm 1.2"),
         ("header.frame_id", "odom", "frame is 'odom', .*the map's.* 'map'"),
         ("pose.position.x", 50.0, r"lies outside the map .*\(50, .*\) m.*6 x 6 cells"),
         ("pose.position.x", -1e300, r"lies outside the map .*\(-1e\+300, .*\) m"),
