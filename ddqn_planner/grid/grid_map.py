@@ -109,6 +109,10 @@ class GridMap:
                 value.flags.writeable = False
         vars(self).update(layers)  # the dataclass is frozen
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take what was pickled or copied: NumPy forgets that arrays are read-only."""
+        self._set(**state)
+
     @classmethod
     def from_occupancy_values(
         cls,

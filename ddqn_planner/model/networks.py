@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cache, partial
 from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
 import numpy as np
@@ -169,8 +168,10 @@ class PropagationQNetwork(QNetwork):
         prices = {name: t for name, t in tensors.items() if name.startswith("prices")}
         clear = {name: np.where(np.abs(t) < NOISE, 0, t) for name, t in prices.items()}
         super().__init__(sizes, {**tensors, **clear})
-        # What holds for all maps, so that it is computed once.
-        self._certify, self._proved = cache(partial(certify, self)), cache(self._proved_costs)
+        # What holds for all maps, so that it is computed once: by the rules, and by the arguments
+        # of `_proved_costs`. A cache of a bound method would keep the network in a cycle.
+        self._certificates: dict[tuple[MoveRule, ...], Certificate] = {}
+        self._proved: dict[tuple[MoveRule, bool, bool], MoveCosts | None] = {}
 
     @classmethod
     def _layers(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
@@ -215,13 +216,19 @@ class PropagationQNetwork(QNetwork):
 
     def certificate(self, move_rule: MoveRule) -> Certificate:
         """Return what is proved of its moves: under all rules, or the one it was trained for."""
-        return self._certify(MOVE_RULES if self.uses_costs else (move_rule,))
+        rules = MOVE_RULES if self.uses_costs else (move_rule,)
+        if rules not in self._certificates:
+            self._certificates[rules] = certify(self, rules)
+        return self._certificates[rules]
 
     def move_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts | None:
         """Return the costs of a map's moves if the possible ones are exactly the legal ones."""
         timed = grid.slowness is not None
         with_costs = self.uses_costs and grid.cost is not None and not timed
-        costs = self._proved(move_rule, with_costs, timed)
+        kind = move_rule, with_costs, timed
+        if kind not in self._proved:
+            self._proved[kind] = self._proved_costs(*kind)
+        costs = self._proved[kind]
         return costs and costs.on(grid)
 
     def _proved_costs(self, move_rule: MoveRule, with_costs: bool, timed: bool) -> MoveCosts | None:

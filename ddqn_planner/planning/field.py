@@ -129,6 +129,16 @@ class DistanceField(QField):
         self.goal, self.goals = goals[0], goals
         self._lock = threading.RLock()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy has: it grows anew, under a lock of its own."""
+        state = vars(self).copy()  # other threads add to it
+        return {name: value for name, value in state.items() if name not in ("known", "_lock")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Begin as a copy."""
+        vars(self).update(state)
+        self._lock = threading.RLock()
+
     @cached_property
     def known(self) -> Known:
         """What is known, at first the goals alone."""

@@ -120,6 +120,13 @@ class Plan:
             if type(value := getattr(self, name)) is not kind:
                 object.__setattr__(self, name, kind(value))
 
+    def __setstate__(self, state: dict[str, object]) -> None:
+        """Take what was pickled or copied: NumPy forgets that arrays are read-only."""
+        vars(self).update(state)
+        for value in state.values():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Plan) and self._identity() == other._identity()
 

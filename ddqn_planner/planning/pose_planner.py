@@ -67,10 +67,23 @@ class PosePlanner:
         self.motions, self.footprint = network.motions, network.footprint
         self.body = body_of(network.motions, network.swept())
         self.points = paths.points_of(self.footprint, self.motions.resolution)
+        self._forget()
+
+    def _forget(self) -> None:
+        """Begin without fields."""
         self._fields: dict[tuple[Any, ...], PoseField] = {}  # used last at the end
         self._map: tuple[GridMap, World] | None = None  # the last one
         self._differences = lru_cache(maxsize=1)(differences)
         self._lock = threading.Lock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy has, also in another process: no fields, and a lock of its own."""
+        return {name: value for name, value in vars(self).items() if not name.startswith("_")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Begin as a copy."""
+        vars(self).update(state)
+        self._forget()
 
     def steps(self, request: PoseRequest) -> Iterator[PosePlan | None]:
         """Yield None before each slow step, and last the plan."""
