@@ -95,7 +95,11 @@ def draw_body(axes: Any, footprint: Array, poses: Array, ends: Array) -> None:
         style: Any = {"facecolor": VALUE_COLOURS[2], "edgecolor": VALUE_COLOURS[3], "alpha": 0.3}
         axes.add_collection(PolyCollection(swept[:: len(swept) // OUTLINES + 1], **style))
         axes.plot(*poses.T[:2], color=PATH_COLOUR, linewidth=2, label="path")
-    nose = np.array([[1, 0], [0, 0.5], [0, -0.5]]) * footprint.max(axis=0)
+    (back, _), (front, left) = footprint.min(axis=0), footprint.max(axis=0)
+    behind = max(0.0, back)  # of an origin that the body lies ahead of
+    if front <= 0:  # or behind
+        behind = (front + back) / 2
+    nose = np.array([[front, 0], [behind, left / 2], [behind, -left / 2]])
     for pose, label, colour in zip(ends, ("start", "goal"), ("white", PATH_COLOUR), strict=True):
         style = {"edgecolor": PATH_COLOUR, "zorder": 3}
         axes.fill(*placed(footprint, pose).T, label=label, facecolor=colour, **style)

@@ -152,6 +152,9 @@ def least_costs(
         hit = np.zeros((height, width), np.bool_)
         for y, x in np.argwhere(swept[number]):
             hit |= occupied[y : y + height, x : x + width]
+        for over, up in way:  # an origin outside of the body may leave the map
+            hit[max(height - up, 0) :] = hit[:, max(width - over, 0) :] = True
+            hit[: max(-up, 0)] = hit[:, : max(-over, 0)] = True
         y, x = np.nonzero(~hit)
         factor = np.zeros(len(x))
         for (over, up), (share, *moved) in way.items():

@@ -83,12 +83,15 @@ def is_free(poses: Float64, grid: GridMap, body: Body) -> bool:
     """Return whether a body has room along a path, and leaves no cell as it forbids."""
     path = in_cells(poses, grid)
     occupied, (outline, within) = occupied_for_body(grid).view(np.uint8), body
+    cells = cells_of(path)
+    if not ((cells >= 0) & (cells < occupied.shape[::-1])).all():
+        return False  # an origin outside of the body leaves the map
     # What is inside the body at a later pose has come through its outline.
     if touches(path, outline, occupied) or touches(path[:1], within, occupied):
         return False
     if grid.forbidden is None:
         return True
-    x, y = cells_of(path).T
+    x, y = cells.T
     leaves = ACTIONS[np.clip(np.diff(y), -1, 1) + 1, np.clip(np.diff(x), -1, 1) + 1]
     return not (grid.forbidden[y[:-1], x[:-1]] >> leaves & 1).any()
 

@@ -46,7 +46,11 @@ class Body(NamedTuple):
     pose: NDArray[np.float64]  # (N, 4): all but the first of each, and its share of the cost
     first_pose: NDArray[np.int64]  # (P + 1,)
     angle: NDArray[np.float64]  # (16,)
-    reach: int  # cells that a primitive sweeps to any side of its begin or end, at most
+    least: NDArray[np.int64]  # (P, 2): how far its origin leaves its first cell, x and y, at least
+    most: NDArray[np.int64]  # (P, 2): and at most
+    reach: (
+        int  # cells that a primitive, or its origin, gets to any side of its begin or end, at most
+    )
 
 
 class World(NamedTuple):
@@ -76,7 +80,11 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
         standing[after] &= around[-1]
         core[before] &= around.all(axis=0)
         either |= around.any(axis=0)
-    reach = int(np.abs(np.argwhere(either) - swept.shape[1] // 2).max())
+    least, most = (
+        np.array([bound(cells[:, :2], axis=0) for cells, _ in passed]) for bound in (np.min, np.max)
+    )
+    # The origin may lie outside of the body.
+    reach = int(max(np.abs(np.argwhere(either) - swept.shape[1] // 2).max(), (most - least).max()))
     around = np.ones((1, 2 * reach + TILE + 1, 2 * reach + TILE + 1), dtype=np.bool_)
     parts = [rows_of(masks) for masks in (swept, standing, core, core.all(axis=0)[None], around)]
     row, bits, counts = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
@@ -99,6 +107,8 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
         pose=np.concatenate(ways),
         first_pose=np.cumsum([0, *map(len, ways)]),
         angle=motions.angles,
+        least=least,
+        most=most,
         reach=reach,
     )
 
@@ -236,9 +246,21 @@ def cost_of(x: int, y: int, number: int, world: Any) -> Any:
 
 
 @inlined
+def leaves_map(x: int, y: int, mask: int, world: Any) -> bool:
+    """Return whether the origin leaves the map on a primitive, as one outside of the body can."""
+    least, most = world.body.least, world.body.most
+    if mask >= least.shape[0]:
+        return False
+    is_first_inside = is_inside(x + least[mask, 0], y + least[mask, 1], world)
+    return not (is_first_inside and is_inside(x + most[mask, 0], y + most[mask, 1], world))
+
+
+@inlined
 def is_possible(x: int, y: int, mask: int, world: Any) -> bool:
     """Return whether the body can take a primitive from a cell, or has room for another mask."""
-    return is_far(x, y, world) or not touches(x, y, mask, world)
+    if is_far(x, y, world):
+        return True
+    return not (touches(x, y, mask, world) or leaves_map(x, y, mask, world))
 
 
 @in_place

@@ -2,6 +2,7 @@
 
 import json
 import math
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,63 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ddqn_planner.grid.footprint import read_footprint, swept_cells
+from ddqn_planner.grid.footprint import inside, read_footprint, swept_cells
 from ddqn_planner.grid.motions import Motion, make_motions, read_lattice, turn_between
 
 ARROW = "[[0.4, 0], [-0.3, 0.3], [-0.1, 0], [-0.3, -0.3]]"
+FORMS = {
+    "U": [
+        (0.5, 0.3),
+        (0.5, 0.2),
+        (0, 0.2),
+        (0, -0.2),
+        (0.5, -0.2),
+        (0.5, -0.3),
+        (-0.3, -0.3),
+        (-0.3, 0.3),
+    ],
+    "T": [
+        (0.4, 0.3),
+        (0.4, -0.3),
+        (0.2, -0.3),
+        (0.2, -0.1),
+        (-0.4, -0.1),
+        (-0.4, 0.1),
+        (0.2, 0.1),
+        (0.2, 0.3),
+    ],
+    "L": [(0.5, 0.3), (0.1, 0.3), (0.1, 0.1), (-0.3, 0.1), (-0.3, -0.3), (0.5, -0.3)],
+    "plus": [
+        (0.4, 0.1),
+        (0.1, 0.1),
+        (0.1, 0.4),
+        (-0.1, 0.4),
+        (-0.1, 0.1),
+        (-0.4, 0.1),
+        (-0.4, -0.1),
+        (-0.1, -0.1),
+        (-0.1, -0.4),
+        (0.1, -0.4),
+        (0.1, -0.1),
+        (0.4, -0.1),
+    ],
+    "forklift": [
+        (1, 0.2),
+        (1, 0.1),
+        (0.3, 0.1),
+        (0.3, -0.1),
+        (1, -0.1),
+        (1, -0.2),
+        (-0.3, -0.2),
+        (-0.3, 0.2),
+    ],
+    "closed": [(0.4, 0.2), (-0.4, 0.2), (-0.4, -0.2), (0.4, -0.2), (0.4, 0.2)],
+    "corners twice": [(0.4, 0.2), (0.4, 0.2), (-0.4, 0.2), (-0.4, -0.2), (-0.4, -0.2), (0.4, -0.2)],
+    "points on a side": [(0.4, 0.2), (0.1, 0.2), (0, 0.2), (-0.4, 0.2), (-0.4, -0.2), (0.4, -0.2)],
+    "origin on a side": [(0, 0.2), (0, -0.2), (0.5, -0.2), (0.5, 0.2)],
+    "origin in a corner": [(0, 0), (0.4, 0), (0.4, 0.4), (0, 0.4)],
+    "origin outside": [(0.5, 0.2), (0.9, 0.2), (0.9, -0.2), (0.5, -0.2)],
+}
 LONG = "[[0.7, 0.2], [-0.2, 0.2], [-0.2, -0.2], [0.7, -0.2]]"
 
 
@@ -36,12 +90,81 @@ def test_primitives_lead_from_heading_to_heading_and_turn_no_sharper_than_allowe
             assert (turns <= steps / (radius / 0.05) * 1.02 + 1e-9).all()
 
 
-@given(padding=st.floats(1e-3, 0.5))
-def test_padding_makes_a_body_larger_on_each_side(padding: float) -> None:
-    for footprint in (LONG, "0.2"):
-        body, padded = (shapely.Polygon(read_footprint(footprint, by)) for by in (0.0, padding))
-        assert padded.buffer(1e-6).contains(body.buffer(padding))
-        assert padded.hausdorff_distance(body) <= 1.5 * padding + 1e-6
+@pytest.mark.parametrize("form", FORMS)
+def test_footprints_are_taken_in_every_form_that_nav2_takes(form: str) -> None:
+    points, expected = FORMS[form], shapely.Polygon(FORMS[form])
+    text = str(points).replace("(", "[").replace(")", "]")
+    written = text, text.replace(",", " "), text.replace("], ", "],\n\t"), f'"{text}"', str(points)
+    for footprint in (points, points[::-1], [*map(list, points)], np.array(points), *written):
+        corners = read_footprint(footprint)
+        body = shapely.Polygon(corners)
+        assert body.is_valid
+        assert body.symmetric_difference(expected).area < 1e-9
+        assert np.hypot(*np.diff(corners, axis=0, append=corners[:1]).T).min() > 0.01
+    np.testing.assert_array_equal(read_footprint(corners), corners)
+
+
+@pytest.mark.parametrize("radius", [1, 0.5, "0.5", " .5\n", "5e-1", np.float32(0.5), np.array(0.5)])
+def test_a_radius_is_a_circle_that_the_body_contains(radius: Any) -> None:
+    body = shapely.Polygon(read_footprint(radius))
+    assert body.buffer(1e-9).contains(shapely.Point(0, 0).buffer(float(radius)))
+    assert body.area < 1.01 * math.pi * float(radius) ** 2
+
+
+@given(
+    points=st.lists(
+        st.tuples(st.integers(-3, 3), st.integers(-3, 3)), min_size=3, max_size=7, unique=True
+    )
+)
+def test_every_polygon_without_crossing_sides_is_taken(points: Any) -> None:
+    polygon, sides = shapely.Polygon(points), list(pairwise([*points, points[0]]))
+    lines = [shapely.LineString(side) for side in sides]
+    crosses = any(
+        one.crosses(other)
+        and one.intersection(other).geom_type == "Point"
+        and not any(one.intersection(other).equals(shapely.Point(corner)) for corner in points)
+        for one, other in combinations(lines, 2)
+    )
+    if crosses or np.linalg.matrix_rank(np.subtract(points[1:], points[0])) < 2:
+        with pytest.raises(ValueError, match=r"cross|on one line"):
+            read_footprint(points)
+    else:
+        corners = read_footprint(points)
+        if polygon.is_valid:
+            assert shapely.Polygon(corners).equals(polygon)
+            axes = (np.arange(first, 3.4, 0.2618) for first in (-3.31415, -3.2718))  # on no side
+            cells = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+            within = shapely.contains_xy(polygon, cells)
+            np.testing.assert_array_equal(inside(cells, corners), within)
+
+
+@given(form=st.sampled_from([*FORMS, LONG, "0.2", "triangle"]), padding=st.floats(1e-3, 0.5))
+def test_padding_makes_a_body_larger_on_each_side(form: str, padding: float) -> None:
+    footprint = {"triangle": [(0.9, 0), (-0.2, 0.05), (-0.2, -0.05)], **FORMS}.get(form, form)
+    body = shapely.Polygon(read_footprint(footprint))
+    closes = form in ("U", "forklift") and padding >= (0.2 if form == "U" else 0.1)
+    if closes:
+        with pytest.raises(ValueError, match=r"padding of .* closes a gap .*; give less"):
+            read_footprint(footprint, padding)
+        return
+    padded = shapely.Polygon(read_footprint(footprint, padding))
+    assert padded.is_valid
+    assert padded.buffer(1e-6).contains(body.buffer(padding))
+    assert padded.hausdorff_distance(body) <= 1.5 * padding + 1e-6
+
+
+def test_an_outline_that_leads_around_twice_has_the_same_inside() -> None:
+    once, points = np.array(FORMS["L"]), np.random.default_rng(0).uniform(-0.6, 0.6, (200, 2))
+    twice = read_footprint(np.tile(once, (2, 1)))
+    assert 50 < inside(points, once).sum() < 150
+    np.testing.assert_array_equal(inside(points, twice), inside(points, once))
+    np.testing.assert_array_equal(inside(points, twice[::-1]), inside(points, once))
+
+
+def test_a_rectangle_is_padded_as_nav2_pads_it() -> None:
+    corners = np.array([(0.7, 0.2), (-0.2, 0.2), (-0.2, -0.2), (0.7, -0.2)])
+    padded = read_footprint(corners, 0.03)
+    np.testing.assert_allclose(padded, corners + 0.03 * np.sign(corners), atol=1e-12)
 
 
 def test_only_a_car_cannot_turn_on_the_spot_and_all_can_reverse() -> None:
@@ -92,8 +215,8 @@ def test_a_lattice_is_read_as_nav2_writes_it(tmp_path: Path) -> None:
             read_lattice(file)
 
 
-@pytest.mark.parametrize("footprint", [LONG, "0.3", ARROW])
-def test_swept_cells_are_those_that_a_polygon_touches(footprint: str) -> None:
+@pytest.mark.parametrize("footprint", [LONG, "0.3", ARROW, *FORMS.values()])
+def test_swept_cells_are_those_that_a_polygon_touches(footprint: Any) -> None:
     motions, corners = make_motions("differential", 0.3, 0.1), read_footprint(footprint)
     swept = swept_cells(corners, motions)
     reach = swept.shape[-1] // 2
@@ -119,9 +242,34 @@ def test_swept_cells_are_those_that_a_polygon_touches(footprint: str) -> None:
         ("[[1, 2], [3, 4]]", "three or more points"),
         ("a robot", "a robot.*give a radius"),
         ("[[0, 0], [1, 1], [1, 0], [0, 1]]", "cross"),
-        ("[[1, 1], [2, 1], [2, 2]]", "does not contain the robot's origin"),
+        ("[[0, 0], [1, 1], [2, 2]]", "on one line; give points around an area"),
+        ([(0, 0), (1, 0), (1, 0), (0, 0)], "three or more points"),
         ("-1", "the radius is -1"),
+        (0, "the radius is 0; give 0.001 to 100 metres"),
+        (True, "True and False are no radius"),
+        (np.False_, "True and False are no radius"),
+        ([[True, 1], [0, 1], [1, 0]], "True and False are no metres"),
+        ("True", "neither bracket nor number"),
+        (math.nan, "the radius is nan"),
+        (math.inf, "the radius is inf"),
+        (10**400, "the radius is 1000"),
+        ("0.3 m", "' m' is neither bracket nor number"),
+        (None, "the footprint is None"),
+        (2j, "the radius is 2j"),
+        ("", "no single list"),
+        ("[0.5]", "three or more points"),
+        ("[0.3, 0.2, 0.3, -0.2, -0.3, -0.2]", "three or more points"),
+        ("[[0.3, 0.2, 0], [0.3, -0.2, 0], [-0.3, -0.2, 0]]", "three or more points"),
+        ("[[0.3, 0.2], [0.3], [-0.3, -0.2]]", "give rows of one length"),
+        ("[[0.3, 0.2], [0.3, -0.2], [-0.3, -0.2]", "a bracket is not closed"),
+        ("[[0.3, 0.2], [0.3, -0.2], [-0.3, -0.2]]]", "a bracket is closed that"),
+        ("[" * 9999, "nested too deeply"),
+        ([["0.3", "0.2"], ["0.1", "0"], ["0", "0"]], "of type <U3; give numbers"),
+        ([[1j, 2], [0, 1], [1, 0]], "of type complex128; give numbers"),
         ([[0, 1], [math.nan, 2], [1, 2]], "no numbers"),
+        ([[0, 1], [math.inf, 2], [1, 2]], "no numbers from -100 to 100 metres"),
+        ([[0, 1e300], [0, 2], [1, 2]], "no numbers from -100 to 100 metres"),
+        ([[x, x * x % 97] for x in np.linspace(0, 9, 2000)], "2000 corners, and at most 1000"),
     ],
 )
 def test_wrong_footprints_are_named(text: Any, problem: str) -> None:

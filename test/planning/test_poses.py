@@ -2,6 +2,7 @@
 
 import math
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from types import SimpleNamespace
@@ -25,9 +26,18 @@ from ddqn_planner.planning.planner import last_step
 from ddqn_planner.planning.pose_kernels import way_left
 from ddqn_planner.planning.pose_paths import cost_of_poses
 from ddqn_planner.planning.pose_planner import Pose, PosePlanner, PoseRequest
-from ddqn_planner.planning.pose_world import State, rows_of, world_of
+from ddqn_planner.planning.pose_world import State, body_of, is_possible, rows_of, world_of
 
 CELL = 0.1
+FORMS = {
+    "U": "[[0.5, 0.3], [0.5, 0.2], [0, 0.2], [0, -0.2], [0.5, -0.2], [0.5, -0.3], [-0.2, -0.3], "
+    "[-0.2, 0.3]]",
+    "plus": "[[0.4, 0.1], [0.1, 0.1], [0.1, 0.4], [-0.1, 0.4], [-0.1, 0.1], [-0.4, 0.1], "
+    "[-0.4, -0.1], [-0.1, -0.1], [-0.1, -0.4], [0.1, -0.4], [0.1, -0.1], [0.4, -0.1]]",
+    "origin in a corner": "[[0, 0], [0.4, 0], [0.4, 0.4], [0, 0.4]]",
+    "ahead of its origin": "[[0.5, 0.1], [0.9, 0.1], [0.9, -0.1], [0.5, -0.1]]",
+    "beside its origin": "[[-0.2, 0.4], [0.2, 0.4], [0.2, 0.7], [-0.2, 0.7]]",
+}
 SQUARE = (0, 0), (0, 2), (2, 2), (2, 0)
 BODIES = {
     "differential": "[[0.25, 0.15], [-0.25, 0.15], [-0.25, -0.15], [0.25, -0.15]]",
@@ -37,15 +47,15 @@ BODIES = {
 
 
 @cache
-def robot(motion: str) -> tuple[Motions, NDArray[np.bool_]]:
+def robot(motion: str, body: str = "") -> tuple[Motions, NDArray[np.bool_]]:
     """Return motions and swept cells of a small robot."""
     motions = make_motions(motion, 0.2, CELL)
-    return motions, swept_cells(read_footprint(BODIES[motion]), motions)
+    return motions, swept_cells(read_footprint(body or BODIES[motion]), motions)
 
 
-def planner(motion: str) -> PosePlanner:
-    motions, swept = robot(motion)
-    body = read_footprint(BODIES[motion])
+def planner(motion: str, footprint: str = "") -> PosePlanner:
+    motions, swept = robot(motion, footprint)
+    body = read_footprint(footprint or BODIES[motion])
     return PosePlanner(SimpleNamespace(motions=motions, swept=lambda: swept, footprint=body))
 
 
@@ -289,6 +299,72 @@ def test_no_body_touches_an_occupied_cell(motion: str, seed: int) -> None:
         move[2] = (move[2] + math.pi) % (2 * math.pi) - math.pi
         for share in np.linspace(0, 1, 1 + math.ceil(max(abs(move[2]) / math.radians(2), 3))):
             assert not len(cells.query(placed(body, before + share * move), "intersects"))
+
+
+@pytest.mark.parametrize("form", FORMS)
+@settings(max_examples=4)
+@given(
+    motion=st.sampled_from(sorted(BODIES)), seed=st.integers(0, 2**32 - 1), has_costs=st.booleans()
+)
+def test_a_concave_body_or_one_beside_its_origin_takes_the_cheapest_free_path(
+    form: str, motion: str, seed: int, has_costs: bool
+) -> None:
+    random, height, width = np.random.default_rng(seed), 26, 34
+    occupancy = random.random((height, width)) < 0.005
+    cost = random.integers(0, 99, occupancy.shape) if has_costs else None
+    grid, (motions, swept) = GridMap(occupancy, CELL, cost=cost), robot(motion, FORMS[form])
+    body = planner(motion, FORMS[form])
+    states = random.integers((width, height, 16), size=(60, 3)).tolist()
+    free = [s for s in states if len(body._at(grid, pose_of(grid, s), body._world(grid)))]
+    shape = shapely.Polygon(read_footprint(FORMS[form])).buffer(-1e-6, join_style="mitre")
+    y, x = np.nonzero(np.pad(occupancy, 1, constant_values=True))
+    cells = shapely.STRtree(shapely.box(*np.array([x - 1, y - 1, x, y]) * CELL))
+    goal = free[0]
+    best = least_costs(
+        grid, motions, swept, tuple(body._at(grid, pose_of(grid, goal), body._world(grid))[0])
+    )
+    for start in free[1:4]:
+        own = tuple(body._at(grid, pose_of(grid, start), body._world(grid))[0])
+        found = plan(
+            planner(motion, FORMS[form]), grid, pose_of(grid, start), pose_of(grid, goal), bound=1.0
+        )
+        least = best[own[1], own[0], own[2]]
+        assert (found.status is PlanStatus.SUCCEEDED) == (least < math.inf)
+        if found.poses.size:
+            assert found.cost == pytest.approx(least, rel=2e-3, abs=1e-6)
+            assert all(map(grid.contains, found.cells))
+            assert not any(
+                len(cells.query(placed(shape, pose), "intersects")) for pose in found.poses
+            )
+            assert np.array_equal(body.rest_of(found.poses, found.poses[0], grid), found.poses)
+
+
+def test_a_path_on_which_the_origin_leaves_the_map_is_not_free() -> None:
+    grid, body = (
+        GridMap(np.zeros((30, 30)), CELL),
+        planner("differential", FORMS["ahead of its origin"]),
+    )
+    inside, outside = ([[x, 1.0, 0.0], [x + 0.05, 1.0, 0.0]] for x in (0.02, -0.1))
+    assert len(body.rest_of(inside, inside[0], grid)) == 2
+    assert not len(body.rest_of(outside, outside[0], grid))
+
+
+@pytest.mark.parametrize(("row", "is_free"), [(1, False), (2, True), (12, True), (13, False)])
+def test_a_primitive_on_which_the_origin_leaves_the_map_is_impossible(
+    row: int, is_free: bool
+) -> None:
+    motions, away = make_motions("differential", 0.2, CELL), 1 if row < 7 else -1
+    footprint = read_footprint([(0, 0.5 * away), (0.1, 0.5 * away), (0.1, 0.6 * away)])
+    ahead = np.flatnonzero((motions.start == 0) & (motions.offset == (4, 0)).all(axis=1))[0]
+    share = np.linspace(0, 1, 17)
+    # The origin comes two cells nearer to the border than both ends; the body is not there.
+    swing = -2 * away * np.sin(math.pi * share)
+    bent = np.column_stack([4 * share, swing, np.zeros(17)])
+    poses = *motions.poses[:ahead], bent, *motions.poses[ahead + 1 :]
+    motions = replace(motions, poses=poses)
+    grid = GridMap(np.zeros((15, 20)), CELL)
+    world = world_of(grid, body_of(motions, swept_cells(footprint, motions)))
+    assert is_possible(4, row, ahead, world) == is_free
 
 
 def test_a_plan_begins_and_ends_as_asked_and_the_rest_of_it_is_known() -> None:

@@ -18,6 +18,10 @@ TINY: Any = (
     0.25,
     None,
 )
+FORK = (
+    "[[0.56, 0.2], [0.56, 0.1], [0.4, 0.1], [0.4, -0.1], [0.56, -0.1], [0.56, -0.2], [0.3, -0.2], "
+    "[0.3, 0.2], [0.56, 0.2]]"
+)
 
 
 def test_the_command_trains_a_robot_that_is_proved(console: Any, tmp_path: Path) -> None:
@@ -35,6 +39,15 @@ def test_the_command_trains_a_robot_that_is_proved(console: Any, tmp_path: Path)
     np.testing.assert_array_equal(network.swept(), expected)
     assert 20_000 < metadata.steps < 2_000_000
     assert "no others do" in console("certify", path).out
+
+
+def test_a_concave_body_ahead_of_its_origin_is_learned() -> None:
+    trainer = RobotTrainer(FORK, "ackermann", 0.3, 0.25, None, 0)
+    *_, certificate = trainer.run(4_000_000)
+    assert certificate.proved
+    expected = swept_cells(trainer.network.footprint, trainer.network.motions)
+    np.testing.assert_array_equal(trainer.network.swept(), expected)
+    assert not expected[0, expected.shape[1] // 2, expected.shape[2] // 2]
 
 
 def test_the_same_seed_trains_the_same_model() -> None:
