@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import ddqn_planner as api
-from ddqn_planner.files import WorkFolder, differences, write_atomically, write_csv
+from ddqn_planner.files import WorkFolder, as_path, differences, write_atomically, write_csv
 from ddqn_planner.resources import find_map, with_remedy
 
 # A command imports what it needs, and no other command's libraries: the names of `api` do so, too.
@@ -161,9 +161,19 @@ def _show(
     return 0 if plan.cells else 1
 
 
+def file_of(argument: str) -> Path:
+    """Return the path that an argument names."""
+    try:
+        return as_path(argument)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
 def _add_options(parser: argparse.ArgumentParser, *options: tuple[str, Any, Any, str]) -> None:
     """Add options of a name, a type or choices, a default and words; a flag's type is bool."""
     for name, kind, default, words in options:
+        if kind is Path:
+            kind = file_of
         how = {"action": "store_true"} if kind is bool else {"type": kind, "metavar": "X"}
         how = {"choices": kind} if isinstance(kind, Sequence) else how
         if kind is not bool and default not in (None, ""):
@@ -240,8 +250,8 @@ def train_robot(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> in
         ("motion", str, None, "differential, ackermann or omnidirectional"),
         ("turning-radius", float, 0.0, "of its bends, metres; ackermann needs it"),
         ("resolution", float, 0.05, "of the maps, metres per cell"),
-        ("lattice", str, None, "a file of Nav2's lattice generator, instead of these three"),
-        ("out", str, "my_robot.safetensors", "the model's file"),
+        ("lattice", Path, None, "a file of Nav2's lattice generator, instead of these three"),
+        ("out", Path, "my_robot.safetensors", "the model's file"),
         ("seed", int, 0, "seed of the training"),
         ("steps", int, ROBOT.steps, "transitions after which to give up"),
     )
@@ -322,7 +332,7 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     from ddqn_planner.experience.drives import EXPERIENCE, LOCK, RECORD, Drive, read_recording
 
     words = "trainers' folders, bags, MCAP files, or CSV files with the columns seconds, x, y"
-    parser.add_argument("drives", type=Path, nargs="+", help=words)
+    parser.add_argument("drives", type=file_of, nargs="+", help=words)
     parser.add_argument("--map", required=True, help="ROS map YAML, or name of a shipped map")
     _add_options(
         parser,

@@ -4,6 +4,7 @@ import csv
 import fcntl
 import io
 import os
+import pwd
 import re
 import reprlib
 import secrets
@@ -13,15 +14,70 @@ from pathlib import Path
 from typing import Any
 
 TEMPORARY = re.compile(r"\..+\.[0-9a-f]{16}")  # the name of a file that is being written
+URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
+# $HOME, ${HOME}, and $(find-pkg-share ...) of launch files.
+VARIABLE = re.compile(r"(?P<name>\$(?:[A-Za-z_]\w*|\{[^/}]*\}|\([^)]*\)))[^/]*")
+MAX_NAME, MAX_PATH = 255, 4095  # bytes that Linux allows for a name, and for a path
 MAX_REST = 2**24  # bytes of records that are kept while a disk is full; those beyond are left out
 
 
 def as_path(path: Any, name: str = "path") -> Path:
-    """Return a path; ValueError for what is none."""
+    """Return what a person calls a path; ValueError for what is none.
+
+    ``~`` and ``~user`` are home folders, as a shell reads them, and ``file://`` is left out. What
+    nothing has replaced, as ``$HOME``, is an error, unless there is a file of that name.
+    """
     try:
-        return Path(path)
+        text = os.fspath(path)
     except TypeError:
         raise ValueError(f"{name} is {path!r}; give a str or a Path") from None
+    if not isinstance(text, str):
+        raise ValueError(f"{name} is {path!r}; give a str or a Path")
+    problem = f"{name} is {reprlib.repr(text)}"
+    text = text.removeprefix("file://")
+    _check_name(text, problem)
+    if URL.match(text):
+        raise ValueError(f"{problem}, the address of something else than a file; give a path")
+    if text.startswith("~"):
+        text = _with_home(text, problem)
+    variable = VARIABLE.search(text)
+    if variable and not os.path.lexists(text[: variable.end()]):
+        remedy = f"give its value instead of {variable['name']!r}, or ~ for your home folder"
+        raise ValueError(f"{problem}, with a variable that nothing has replaced; {remedy}")
+    # Path leaves out "./", with which a name that begins with ~ is no home folder.
+    return Path(text).absolute() if str(Path(text)).startswith("~") else Path(text)
+
+
+def _check_name(text: str, problem: str) -> None:
+    """Raise a ValueError for what no file system can have as a path."""
+    if not text.strip():
+        raise ValueError(f"{problem}; give a path")
+    if "\0" in text:
+        raise ValueError(f"{problem}, which holds a NUL character; give a path without")
+    try:
+        sizes = [len(os.fsencode(part)) for part in text.split("/")]
+    except UnicodeEncodeError:
+        raise ValueError(f"{problem}, which holds half a character; give another path") from None
+    if max(sizes) > MAX_NAME or sum(sizes) + len(sizes) > MAX_PATH:
+        limits = f"{MAX_NAME} bytes a name, {MAX_PATH} in all"
+        raise ValueError(f"{problem}, which is too long; give at most {limits}")
+
+
+def _with_home(text: str, problem: str) -> str:
+    """Return a path that begins with ~ with the home folder instead."""
+    first, slash, rest = text.partition("/")
+    user = first[1:]
+    if user and os.path.lexists(first):  # a name, as that of an editor's copy
+        return os.path.join(os.curdir, text)
+    home = os.environ.get("HOME", "") if not user else ""
+    if not home:
+        with suppress(KeyError):
+            home = (pwd.getpwnam(user) if user else pwd.getpwuid(os.getuid())).pw_dir
+    if not home:
+        whose = f"a user {user!r}" if user else "this user"
+        remedy = f"give the full path, or ./{first} for a file of that name"
+        raise ValueError(f"{problem}, but no home folder of {whose} is known; {remedy}")
+    return home.rstrip("/") + slash + rest or "/"
 
 
 def write_atomically(path: Path, content: bytes) -> None:
@@ -68,8 +124,9 @@ class WorkFolder(ExitStack):
     # A folder with one of the files `marks` is the right one; the first of them is the lock. The
     # other arguments are words of errors: what it should hold, what is done there, what then.
     def __init__(
-        self, folder: Path, marks: Sequence[str], content: str, works: str, after: str = ""
+        self, folder: str | Path, marks: Sequence[str], content: str, works: str, after: str = ""
     ) -> None:
+        folder = as_path(folder, "the folder")
         folder.mkdir(parents=True, exist_ok=True)
         names = sorted(path.name for path in folder.iterdir())
         if names and not any((folder / name).is_file() for name in marks):

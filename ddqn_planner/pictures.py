@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ddqn_planner.files import as_path
 from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap
 from ddqn_planner.grid.footprint import placed
 
@@ -82,7 +83,7 @@ def save_picture(
             axes.scatter(x[end], y[end], size, label=label, marker=marker, **style)
     if cells or body is not None:
         figure.legend(loc="outside lower center", ncols=4, frameon=False)
-    figure.savefig(path)
+    figure.savefig(as_path(path))
 
 
 def draw_body(axes: Any, footprint: Array, poses: Array, ends: Array) -> None:

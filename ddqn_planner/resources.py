@@ -4,6 +4,8 @@ import os
 from pathlib import Path
 from typing import Final
 
+from ddqn_planner.files import as_path
+
 PACKAGE: Final = "ddqn_planner"
 ROS: Final = "install ROS 2 Jazzy and source it, or in the repository: pip install '.[ros]'"
 
@@ -39,10 +41,16 @@ def find_resource(folder: str, name: str) -> Path:
 
 
 def find_map(name: str) -> Path:
-    """Return the file of a path, of a ``file://`` or ``package://`` URL, or of a shipped map."""
+    """Return the file of a path, of a ``file://`` or ``package://`` URL, or of a shipped map.
+
+    A FileNotFoundError says why there can be none.
+    """
     if name.startswith("package://"):
         return _package_path(name)
-    path = Path(name.removeprefix("file://"))
+    try:
+        path = as_path(name, "the map")
+    except ValueError as error:
+        raise FileNotFoundError(str(error)) from None
     # A file in the working directory has priority. Whoever reads a file reports that it is missing.
     if path.name != name or os.path.isfile(path):
         return path

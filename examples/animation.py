@@ -18,6 +18,7 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from ddqn_planner import GridMap, Plan, Planner, inflate
+from ddqn_planner.files import as_path
 from ddqn_planner.grid import read_map_file
 from ddqn_planner.pictures import PATH_COLOUR, VALUE_COLOURS, draw_obstacles
 from ddqn_planner.resources import find_map
@@ -50,7 +51,7 @@ def save_film(path: str, grid: GridMap, plan: Plan, value: NDArray[Any], steps: 
         line.set_data(*np.reshape(plan.cells[: frame[1]], (-1, 2)).T)
         return field, line
 
-    FuncAnimation(figure, draw, frames).save(path, PillowWriter(FRAMES_PER_SECOND))
+    FuncAnimation(figure, draw, frames).save(as_path(path), PillowWriter(FRAMES_PER_SECOND))
     plt.close(figure)
 
 

@@ -17,6 +17,7 @@ from matplotlib.animation import FuncAnimation, PillowWriter
 from numpy.typing import NDArray
 
 from ddqn_planner import GridMap, Planner
+from ddqn_planner.files import as_path
 from ddqn_planner.grid.footprint import placed
 from ddqn_planner.model import RobotNetwork
 from ddqn_planner.pictures import PATH_COLOUR, VALUE_COLOURS, draw_obstacles
@@ -75,7 +76,7 @@ def main(arguments: Sequence[str]) -> int:
         return [body for *_, body in bodies]
 
     frames = [*range(0, longest, 2), *[longest] * LAST_FRAMES]
-    FuncAnimation(figure, draw, frames).save(arguments[0], PillowWriter(FRAMES_PER_SECOND))
+    FuncAnimation(figure, draw, frames).save(as_path(arguments[0]), PillowWriter(FRAMES_PER_SECOND))
     return 0
 
 

@@ -25,6 +25,7 @@ from scipy.sparse.csgraph import dijkstra
 from tables import table
 
 from ddqn_planner import GridMap, Planner, load_map
+from ddqn_planner.cli import file_of
 from ddqn_planner.grid import MOVES, Cell, MoveRule
 from ddqn_planner.grid.footprint import read_footprint
 from ddqn_planner.grid.motions import HEADINGS, Motion, Motions, make_motions
@@ -329,7 +330,7 @@ def main() -> None:
     """Print the figure that is asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--figure", choices=FIGURES, required=True)
-    parser.add_argument("--maps", type=Path, metavar="FOLDER", help="ROS maps of 0.05 m")
+    parser.add_argument("--maps", type=file_of, metavar="FOLDER", help="ROS maps of 0.05 m")
     parser.add_argument("--requests", type=int, default=30, metavar="N", help="of each map")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--model", default="differential_robot", help="whose times count")

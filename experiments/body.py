@@ -19,7 +19,7 @@ HEADER = "clearance_weight | solved | length, mean | worst | metres to obstacles
 
 def main(arguments: Sequence[str]) -> int:
     """Print a row for each weight; return 1 if a request was not solved."""
-    path = str(arguments[0] if arguments else find_map("office"))
+    path = str(find_map(arguments[0] if arguments else "office"))
     radius = float(arguments[1]) if len(arguments) > 1 else 0.15
     grid, planner = load_map(path), Planner.load("any_map")
     inflated, metres = inflate(grid, radius), clearance(grid.occupancy) * grid.resolution

@@ -24,7 +24,7 @@ from tables import table, write_report
 from trainings import in_parallel, make_folder, parser_of
 
 from ddqn_planner import Experience, GridMap
-from ddqn_planner.cli import exit_code
+from ddqn_planner.cli import exit_code, file_of
 from ddqn_planner.grid.noise import random_requests
 
 Options = argparse.Namespace
@@ -301,7 +301,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; return the exit code."""
     parser = parser_of("driving.py", __doc__, "runs/driving")
     add = parser.add_argument
-    add("--maps", type=Path, metavar="FOLDER", help="measure on the ROS maps of a folder too")
+    add("--maps", type=file_of, metavar="FOLDER", help="measure on the ROS maps of a folder too")
     add("--figure", action="append", choices=FIGURES, help="measure some of the figures alone")
     words = "what `Experience.apply` is given (default: %(default)s)"
     add("--exploration", type=float, default=0.1, metavar="SHARE", help=words)

@@ -22,7 +22,7 @@ from tables import table
 from tqdm import tqdm
 
 from ddqn_planner import GridMap, MoveRule, Planner, QField
-from ddqn_planner.cli import exit_code
+from ddqn_planner.cli import exit_code, file_of
 from ddqn_planner.grid import MOVES, Cell, legal_moves, read_map_file, shortest_distances
 from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.noise import random_costs, random_requests, unknown_costs
@@ -287,7 +287,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rules = [rule.value for rule in MoveRule]
     add("--move-rule", choices=rules, default="robot_safe", help="which diagonal moves are legal")
     data = "MovingAI .map and .scen, ROS .yaml instead of generated maps"
-    add("--data", type=Path, metavar="FOLDER", help=data)
+    add("--data", type=file_of, metavar="FOLDER", help=data)
     add("--kinds", nargs="+", choices=KINDS, default=[*KINDS], help="kinds of generated maps")
     add("--sizes", nargs="+", type=int, default=[32, 64, 128, 256], help="sides of maps, cells")
     add("--maps", type=int, default=3, metavar="N", help="maps per kind and size")

@@ -1,6 +1,5 @@
 """Writes map files, for the nodes and programs that read them."""
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -8,13 +7,13 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from ddqn_planner.files import write_atomically
+from ddqn_planner.files import as_path, write_atomically
 from ddqn_planner.grid import GridMap, MapFile, MapFileError
 
 
 def save_map(grid: GridMap | MapFile, path: str | Path) -> None:
     """Write a ROS map: YAML and PGM, and one for directions; `GridMap.obstacles` is left out."""
-    path = Path(os.path.expanduser(path))
+    path = as_path(path)
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise MapFileError(f"{path}: ends in {path.suffix!r}; give a path that ends in .yaml")
     if isinstance(grid, GridMap):

@@ -266,7 +266,7 @@ def measure_trainer(client: ros.Client) -> Iterator[bool]:
 
 def main(arguments: Sequence[str]) -> int:
     """Print each figure beside its bound, on another ROS map (a path) too; 1 if one is missed."""
-    map_file = Path(arguments[0] if arguments else find_map("office"))
+    map_file = find_map(arguments[0] if arguments else "office")
     with processes.claim_ros_domain():
         missed = [*measure_starts()]
         gc.freeze()  # else this process pauses to look for garbage among what it has imported

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from ddqn_planner.cli import file_of
 from ddqn_planner.files import write_atomically, write_csv
 from ddqn_planner.grid import LENGTHS, neighbours
 from ddqn_planner.model import PaperQNetwork
@@ -106,11 +107,11 @@ def parser_of(program: str, description: str | None, out: str) -> argparse.Argum
     )
     add = parser.add_argument
     add("--seeds", type=int, default=5, metavar="N", help="trainings, or worlds of each kind")
-    add("--out", type=Path, default=Path(out), help="folder of what is written")
+    add("--out", type=file_of, default=Path(out), help="folder of what is written")
     add("--quick", action="store_true", help="a short trial, into the folder quick")
     words = "what runs the work: this machine's cores, or a cluster"
     add("--backend", choices=BACKENDS, default="loky", help=words)
-    add("--page", type=Path, metavar="FILE", help="a page of the docs that gets the results too")
+    add("--page", type=file_of, metavar="FILE", help="a page of the docs that gets the results too")
     return parser
 
 

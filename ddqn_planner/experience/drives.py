@@ -23,7 +23,7 @@ from ddqn_planner.experience.experience import (
     ways,
 )
 from ddqn_planner.experience.posterior import cells_of
-from ddqn_planner.files import Appender, WorkFolder, differences
+from ddqn_planner.files import Appender, WorkFolder, as_path, differences
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.rotations import Rotation
 
@@ -104,7 +104,7 @@ class Drive(NamedTuple):
 def read_drives(path: str | Path) -> Iterator[Drive]:
     """Yield the drives of an ``episodes.csv`` in its complete rows; an OSError if it has none."""
     ends = {end.value.encode(): end for end in DriveEnd}
-    with Path(path).open("rb") as file:
+    with as_path(path).open("rb") as file:
         for row in map(ROW.fullmatch, file):
             if row and row[2] in ends:
                 text = [sample.split(b":") for sample in row[4].split()]
@@ -194,7 +194,7 @@ class DriveFolder(WorkFolder):
         self, folder: str | Path, nominal_speed: float, robot_width: float, older: str = ""
     ) -> None:
         after = "the recording continues, and saving is tried again"
-        super().__init__(Path(folder), [LOCK], "drives", "records", after)
+        super().__init__(folder, [LOCK], "drives", "records", after)
         self.record_path, self.experience_path = self.folder / RECORD, self.folder / EXPERIENCE
         self.experience = Experience(nominal_speed, robot_width)
         with self.opening():

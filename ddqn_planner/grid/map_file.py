@@ -4,7 +4,6 @@ import os
 import re
 import reprlib
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -119,9 +118,10 @@ def load_map(
 
 def read_map_file(path: str | Path) -> MapFile:
     """Read all that a map file holds; see `load_map` for the path and the errors."""
-    path = as_path(path)
-    with suppress(ValueError):  # "~" with a user name that is impossible
-        path = Path(os.path.expanduser(path))
+    try:
+        path = as_path(path)
+    except ValueError as error:
+        raise MapNotFoundError(str(error)) from None
     if not os.path.isfile(path):
         raise MapNotFoundError(f"{str(path)!r}: no such file; give the path of a map")
     if path.suffix.lower() not in (".yaml", ".yml", ".map"):
@@ -208,6 +208,8 @@ def _read_image(
     if not isinstance(name, str) or not name:
         raise ValueError(f"{key} is {_short(name)}; give the path of an image")
     file = path.parent / name
+    if name.startswith("~") and not os.path.lexists(file):
+        file = as_path(name, key)
     if not os.path.isfile(file):
         raise MapDataError(f"{str(file)!r}: no such image; check {key!r} in the YAML file")
     # In a linked colcon workspace the YAML file is itself a link: allow the folder of either.

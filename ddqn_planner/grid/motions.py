@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ddqn_planner.files import as_path
 from ddqn_planner.grid.arguments import POSITIVE, Choice, as_number
 
 Array = NDArray[np.float64]
@@ -88,8 +89,9 @@ def make_motions(motion: Motion | str, turning_radius: float, resolution: float)
 
 def read_lattice(file: str | Path) -> Motions:
     """Read the motion primitives of a state lattice in Nav2's JSON format; else a ValueError."""
+    file = as_path(file, "the lattice")
     try:
-        lattice = json.loads(Path(file).read_text())
+        lattice = json.loads(file.read_text())
         about = lattice["lattice_metadata"]
         cell, angles = float(about["grid_resolution"]), np.array(about["heading_angles"], float)
         found = []

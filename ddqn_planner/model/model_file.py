@@ -64,10 +64,14 @@ def package_version() -> str:
 
 def find_model(name: str | Path) -> Path:
     """Return the file of a model given by path, or by the name of a shipped one."""
-    if as_path(name, "the model").suffix == MODEL_SUFFIX or Path(name).name != str(name):
-        if os.path.isfile(name):
-            return Path(name)
-        raise ModelFileError(f"there is no model file {str(name)!r}; check the path")
+    try:
+        path = as_path(name, "the model")
+    except ValueError as error:
+        raise ModelFileError(str(error)) from None
+    if path.suffix == MODEL_SUFFIX or path.name != str(name):
+        if os.path.isfile(path):
+            return path
+        raise ModelFileError(f"there is no model file {str(path)!r}; check the path")
     try:
         return find_resource("models", f"{name}{MODEL_SUFFIX}")
     except FileNotFoundError as error:
@@ -78,7 +82,7 @@ def find_model(name: str | Path) -> Path:
 
 def save_model(path: str | Path, network: QNetwork, description: ModelMetadata) -> None:
     """Write a model file; the old file stays complete until the new one is."""
-    write_atomically(Path(path), model_bytes(network, description))
+    write_atomically(as_path(path), model_bytes(network, description))
 
 
 def model_bytes(network: QNetwork, description: ModelMetadata) -> bytes:

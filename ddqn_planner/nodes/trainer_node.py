@@ -18,6 +18,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.timer import Timer
 from std_msgs.msg import Float32, Header, String, UInt8MultiArray
 
+from ddqn_planner.files import as_path
 from ddqn_planner.grid import Cell, MoveRule, read_map_file
 from ddqn_planner.nodes import conversions, runtime
 from ddqn_planner.nodes.driving import NO_MAP, Driving, Float64, MapInFrame, explained
@@ -105,12 +106,14 @@ class TrainerNode(BaseNode):
     @property
     def folder(self) -> FilePath:
         """The parameter ``output_folder``."""
-        return FilePath(self.value("output_folder")).absolute()
+        return as_path(self.value("output_folder"), "output_folder").absolute()
 
     def check_parameters(self, new: dict[str, Any]) -> None:
         """Check new values as `BaseNode` does, and hyper-parameters together: some limit others."""
         super().check_parameters(new)
         check_source("pose_source", new.get("pose_source", ""), "'odometry'")
+        if "output_folder" in new:
+            as_path(new["output_folder"], "output_folder")
         self._hyper_parameters(new)
 
     def _hyper_parameters(self, new: dict[str, Any]) -> HyperParameters:

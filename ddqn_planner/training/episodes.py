@@ -6,7 +6,7 @@ from enum import Enum
 from pathlib import Path
 from typing import NamedTuple
 
-from ddqn_planner.files import Appender, write_atomically
+from ddqn_planner.files import Appender, as_path, write_atomically
 from ddqn_planner.grid import Cell, MoveRule, path_length
 
 HEADER = b"episode,step,scenario,outcome,moves,length,total_reward,average_reward,cells\r\n"
@@ -61,7 +61,7 @@ def record(episode: Episode, move_rule: MoveRule) -> bytes:
 
 def read_cells(path: str | Path, every: int) -> Iterator[tuple[Cell, ...]]:
     """Yield the cells of each `every`-th complete row; an OSError without a file."""
-    with Path(path).open("rb") as file:
+    with as_path(path).open("rb") as file:
         for row in map(ROW.fullmatch, file):
             if row and int(row[1]) % every == 0:
                 x_y = (cell.split(b":") for cell in row[2].split())

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -51,7 +52,7 @@ class RobotTrainer:
         motion: str | None,
         turning_radius: float,
         resolution: float,
-        lattice: str | None,
+        lattice: str | Path | None,
         seed: int,
         padding: float = 0.0,
     ) -> None:

@@ -26,7 +26,7 @@ class TrainingRun(WorkFolder):
         seed: int,
     ) -> None:
         after = f"the training continues and tries again every {SAVE_INTERVAL} steps"
-        super().__init__(Path(folder), MARKS, "training", "trains", after)
+        super().__init__(folder, MARKS, "training", "trains", after)
         self.model_path = self.folder / "model.safetensors"
         self.checkpoint_path = self.folder / CHECKPOINT
         with self.opening(), _memory_with_remedy():

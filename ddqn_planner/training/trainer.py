@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from safetensors import safe_open
 
-from ddqn_planner.files import differences, write_atomically
+from ddqn_planner.files import as_path, differences, write_atomically
 from ddqn_planner.grid import MOVES
 from ddqn_planner.model import (
     NETWORKS,
@@ -171,12 +171,12 @@ class Trainer:
         tensors = {name: np.asarray(t, order="C") for name, t in self._tensors().items()}
         text = json.dumps(self._description())
         metadata = {CHECKPOINT_KEY: text, DIGEST_KEY: _digest(text, tensors)}
-        write_atomically(path, safetensors.numpy.save(tensors, metadata))
+        write_atomically(as_path(path), safetensors.numpy.save(tensors, metadata))
 
     def restore(self, path: Path) -> None:
         """Take over a checkpoint of this training, whatever its `steps`, or a CheckpointError."""
         try:
-            with safe_open(path, framework="np") as file:
+            with safe_open(as_path(path), framework="np") as file:
                 metadata, now = file.metadata(), self._description()
                 saved = json.loads(metadata[CHECKPOINT_KEY])
                 if saved["scenarios"] != now["scenarios"]:

@@ -218,7 +218,7 @@ def test_a_missing_file_and_a_broken_one_have_different_errors(tmp_path: Path) -
     os.mkfifo(tmp_path / "pipe.yaml")
     missing = [tmp_path / name for name in ("none.yaml", "folder.yaml", "pipe.yaml", "", "nul\0")]
     for name in (*missing, "~\0/map.yaml", "~\ud800/map.yaml", "nul\0.yaml", "x" * 5000):
-        with pytest.raises(MapNotFoundError, match="no such file"):
+        with pytest.raises(MapNotFoundError, match=r"no such file|give (a|another) path|too long"):
             read_map_file(name)
     path = write(tmp_path, PIXELS)
     with pytest.raises(MapMetadataError, match=r"ends in '\.png'"):
