@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 Float64: TypeAlias = NDArray[np.float64]
 
 # Shapes: P = 256 patterns of occupied cells around a free one, A = 8 actions, F = filters,
-# I = inputs, C = 18 inputs for costs and unknown cells, U = outputs of a layer, B = a batch.
+# I = inputs, C = 18 inputs for costs and unknown cells, U = outputs of a layer, B = a batch,
+# V = 101 values of a free cell: the costs 0 to 99, and last unknown.
 
 # One of each class: under `MoveRule.UNIT`, the same moves are legal as under the second.
 MOVE_RULES: Final = (MoveRule.ROBOT_SAFE, MoveRule.CORNER_CUTTING)
@@ -169,19 +170,60 @@ def _extremes(weight_CPU: Float64, feature_PI: NDArray[np.float32]) -> tuple[Flo
 def _multiplier_error(
     network: PropagationQNetwork, feature_PI: NDArray[np.float32], legal_PA: NDArray[np.bool_]
 ) -> float:
-    """Bound the relative error of legal moves' cost multipliers; true ones are at least 1."""
+    """Return the greatest relative error of legal moves' cost multipliers, over all costs."""
     if not network.uses_costs:  # 1 instead of at most the greatest one
         return 1 - 1 / MAX_COST_MULTIPLIER
-    error_IA = network.tensors["prices.weight"].T.astype(np.float64, order="C")
-    for action, (dx, dy) in enumerate(MOVES.tolist()):
-        for cell in (CENTRE, CENTRE + 3 * dy + dx):
-            error_IA[[9 + cell, 18 + cell], action] -= (MAX_COST_MULTIPLIER - 1) / 2
-    base_PA = feature_PI @ error_IA + network.tensors["prices.bias"]
-    low_PA, high_PA = _extremes(error_IA[COSTS, None], feature_PI)
-    error_PA = np.maximum(base_PA + high_PA, -base_PA - low_PA)
-    error_PA += _rounding_error(network, [("prices", np.ones_like(feature_PI[0]))])
-    error = float(error_PA[legal_PA].max())
+    weight_IA = network.tensors["prices.weight"].T.astype(np.float64, order="C")
+    bias_A = network.tensors["prices.bias"].astype(np.float64)
+    # Every pair of costs of a move's two cells is looked at. What the layer adds for other inputs
+    # should be nothing: their least and greatest sums are enough.
+    actions, cell_2A = np.arange(len(MOVES)), CENTRE + np.outer([0, 1], MOVES @ [1, 3])
+    cost_2A, unknown_2A = COSTS.start + cell_2A, COSTS.start + 9 + cell_2A
+    other_IA = weight_IA.copy()
+    for input_2A in (cell_2A, cost_2A, unknown_2A):
+        other_IA[input_2A, actions] = 0
+    base_PA = feature_PI @ other_IA + bias_A
+    low_PA, high_PA = _extremes(other_IA[COSTS, None], feature_PI)
+    size_A = np.abs(other_IA).sum(axis=0) + np.abs(bias_A)
+    error = 0.0
+    for cuts_corners in (False, True):
+        legal_of_rule_PA = legal_PA & (feature_PI[:, -1:] == cuts_corners)
+        for action in np.flatnonzero(legal_of_rule_PA.any(axis=0)):
+            pattern = legal_of_rule_PA[:, action]
+            others = _Others(
+                low=float((base_PA + low_PA)[pattern, action].min()),
+                high=float((base_PA + high_PA)[pattern, action].max()),
+                size=float(size_A[action]),
+            )
+            cost_2 = weight_IA[cost_2A[:, action], action]
+            unknown_2 = weight_IA[unknown_2A[:, action], action]
+            error = float(np.maximum(error, _error_of_pairs(cost_2, unknown_2, others)))
     return math.inf if math.isnan(error) else error
+
+
+class _Others(NamedTuple):
+    """What the layer of cost multipliers adds for other inputs than the costs of a move's cells."""
+
+    low: float
+    high: float
+    size: float  # the greatest sum of the terms' sizes
+
+
+def _error_of_pairs(cost_2: Float64, unknown_2: Float64, others: _Others) -> float:
+    """Return the greatest relative error of a multiplier for all 101 x 101 values of two cells.
+
+    The arguments are the weights of the two cells' costs, 0 to 0.99, and of unknown cells.
+    """
+    share_V = np.append(np.arange(OCCUPIED) / OCCUPIED, 1.0)  # the last one is of an unknown cell
+    before_V, after_V = np.column_stack([cost_2[:, None] * share_V[:-1], unknown_2])
+    sum_VV = before_V[:, None] + after_V
+    true_VV = 1 + (MAX_COST_MULTIPLIER - 1) * (share_V[:, None] + share_V) / 2
+    above_VV = 1 + np.maximum(sum_VV + others.high, 0) - true_VV
+    below_VV = true_VV - 1 - np.maximum(sum_VV + others.low, 0)
+    # The planner adds them up in float32, and halves of the 1 with them.
+    size_VV = 1 + np.abs(before_V)[:, None] + np.abs(after_V) + others.size
+    rounding_VV = (COSTS.stop + 3) * ROUNDING * size_VV
+    return float(((np.maximum(above_VV, below_VV) + rounding_VV) / true_VV).max())
 
 
 def _rounding_error(
