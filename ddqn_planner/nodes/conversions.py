@@ -3,6 +3,7 @@
 import array
 import hashlib
 import math
+import pickle
 from collections.abc import Sequence
 from itertools import compress
 from typing import Any
@@ -29,6 +30,13 @@ MAX_TILT = 0.01  # sine of half an angle: two decimals of a quaternion round to 
 AS_SENT = 1e-6  # a norm so near to 1 is left as it is
 MIN_RESOLUTION = 1e-6  # metres per cell
 LABEL = "ddqn_planner {} 1 sha256:{}"  # of bytes: their kind, its version and their digest
+BLANK_POSES = pickle.dumps(
+    [
+        PoseStamped(header=header, pose=Pose(orientation=rotation))
+        for header, rotation in [(Header(), Quaternion())]
+        for _ in range(64)
+    ]
+)
 SAME_DIRECTION = 1e-6  # radians: poses along a segment are rounded
 
 
@@ -87,17 +95,22 @@ def path_message(
     centres: Float64, yaws: Float64, header: Header, last: Quaternion | None = None
 ) -> Path:
     """Make a path message of positions and directions, see `path_bytes`."""
-    path, new, checked = Path(header=header), object.__new__, header._check_fields
-    # Poses in the same direction share a quaternion, and all are made without their constructors,
-    # which take fifteen times as long: most of an answer's time is making messages.
+    path = Path(header=header)
+    # Most of an answer's time is making messages. Poses in the same direction share a quaternion,
+    # and all are copies, which take a quarter of the time of the messages' constructors.
+    poses: list[PoseStamped] = []
+    while len(poses) < len(centres):
+        poses += pickle.loads(BLANK_POSES)
+    del poses[len(centres) :]
     towards = {yaw: quaternion(yaw) for yaw in {*yaws.tolist()}}
     orientations = [*map(towards.get, yaws.tolist()), last]
-    for (x, y), orientation in zip(centres.tolist(), orientations, strict=False):
-        stamped, pose, point = new(PoseStamped), new(Pose), new(Point)
-        stamped._header, stamped._pose, stamped._check_fields = header, pose, checked
-        pose._position, pose._orientation, pose._check_fields = point, orientation, checked
-        point._x, point._y, point._z, point._check_fields = x, y, 0.0, checked
-        path.poses.append(stamped)
+    places = centres.tolist()
+    for stamped, (x, y), orientation in zip(poses, places, orientations, strict=False):
+        stamped.header = header
+        stamped.pose.orientation = orientation
+        stamped.pose.position.x = x
+        stamped.pose.position.y = y
+    path.poses = poses
     return path
 
 

@@ -1,60 +1,141 @@
 """A node that a lifecycle manager, or the node itself, configures, activates, and stops."""
 
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 from uuid import uuid4
 
-from lifecycle_msgs.srv import ChangeState
+from lifecycle_msgs.msg import State, Transition, TransitionDescription, TransitionEvent
+from lifecycle_msgs.srv import ChangeState, GetAvailableStates, GetAvailableTransitions, GetState
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
-from rclpy.lifecycle import LifecycleNodeMixin
 from rclpy.timer import Timer
 
-from ddqn_planner.nodes.executor import KINDS
 from ddqn_planner.nodes.runtime import STEADY, BaseNode, Parameters
 
 BEAT_PERIOD, BEAT_TIMEOUT = 0.5, 4.0  # seconds; the timeout as Nav2's lifecycle manager has it
 
-ENTITIES = {"publisher": "publishers", **KINDS}
+ENTITIES = {
+    "publisher": "publishers",
+    "subscription": "subscriptions",
+    "guard_condition": "guards",
+    "timer": "timers",
+    "client": "clients",
+    "service": "services",
+}
 """What a node can create, and where it has them; beside waitables."""
 
+STATES = {
+    "unknown": 0,
+    "unconfigured": 1,
+    "inactive": 2,
+    "active": 3,
+    "finalized": 4,
+    "configuring": 10,
+    "cleaningup": 11,
+    "shuttingdown": 12,
+    "activating": 13,
+    "deactivating": 14,
+    "errorprocessing": 15,
+}
+"""The numbers of ROS's states, which lifecycle_msgs/msg/State lists."""
 
-class ManagedNode(LifecycleNodeMixin, BaseNode):
+
+class Change(NamedTuple):
+    """A transition that can be asked for, with ROS's numbers."""
+
+    number: int
+    label: str
+    start: str
+    during: str  # the state while the node works
+    goal: str
+    ends: int  # the number of its success; failure and error have the next two
+
+
+CHANGES = (
+    Change(1, "configure", "unconfigured", "configuring", "inactive", 10),
+    Change(2, "cleanup", "inactive", "cleaningup", "unconfigured", 20),
+    Change(3, "activate", "inactive", "activating", "active", 30),
+    Change(4, "deactivate", "active", "deactivating", "inactive", 40),
+    Change(5, "shutdown", "unconfigured", "shuttingdown", "finalized", 50),
+    Change(6, "shutdown", "inactive", "shuttingdown", "finalized", 50),
+    Change(7, "shutdown", "active", "shuttingdown", "finalized", 50),
+)
+
+
+def _state(label: str) -> State:
+    return State(id=STATES[label], label=label)
+
+
+def _description(number: int, label: str, start: str, goal: str) -> TransitionDescription:
+    transition = Transition(id=number, label=label)
+    ends = {"start_state": _state(start), "goal_state": _state(goal)}
+    return TransitionDescription(transition=transition, **ends)
+
+
+def _transition_graph() -> Iterator[TransitionDescription]:
+    """Yield ROS's transitions, also those of a node that fails, as tools draw them."""
+    ends = {}
+    for change in CHANGES:
+        yield _description(change.number, change.label, change.start, change.during)
+        failed = change.goal if change.label == "shutdown" else change.start
+        ends[change.ends] = change.during, change.goal, failed, "errorprocessing"
+    ends[60] = "errorprocessing", "unconfigured", "finalized", "finalized"
+    for first, (during, *goals) in ends.items():
+        labels = "transition_success", "transition_failure", "transition_error"
+        for offset, (label, goal) in enumerate(zip(labels, goals, strict=True)):
+            yield _description(first + offset, label, during, goal)
+
+
+# Not on rclpy's LifecycleNode: its answer to a transition that the state does not have ends the
+# process, what its transitions call cannot say why it fails, and its services outlive the node.
+class ManagedNode(BaseNode):
     """Node that destroys what `configure` created if that fails, and at ``cleanup``."""
 
     def __init__(self, name: str, parameters: Parameters) -> None:
-        BaseNode.__init__(self, name, parameters)
-        # Reentrant: the state can be asked for while a transition waits.
-        LifecycleNodeMixin.__init__(self, callback_group=ReentrantCallbackGroup())
-        # rclpy's answer ends the process on a transition that the state does not have, and what its
-        # transitions call cannot say why they fail. Here both are logged, and it answers so.
-        self.answer_with(ChangeState, self._on_change_state)
-        self._is_changing = False
+        # First, as a node that cannot start is destroyed, too.
+        self.state = "unconfigured"  # or inactive, active or finalized
+        self._is_changing = self._is_destroyed = False
         self._beats: Timer | None = None
-
-    @property
-    def state(self) -> str:
-        """The name of the state: unconfigured, inactive, active or finalized."""
-        return str(self._state_machine.current_state[1])
+        super().__init__(name, parameters)
+        self._events = self.create_publisher(TransitionEvent, "~/transition_event", 10)
+        group = ReentrantCallbackGroup()  # the state can be asked for while a transition waits
+        for kind, service, callback in (
+            (ChangeState, "change_state", self._on_change_state),
+            (GetState, "get_state", self._on_get_state),
+            (GetAvailableStates, "get_available_states", self._on_get_states),
+            (GetAvailableTransitions, "get_available_transitions", self._on_get_transitions),
+            (GetAvailableTransitions, "get_transition_graph", self._on_get_graph),
+        ):
+            self.create_service(kind, f"~/{service}", callback, callback_group=group)
 
     def change(self, label: str) -> None:
         """Do a transition; if that raises an error, the state stays."""
+        (change,) = [it for it in self._changes() if it.label == label]
         try:
             getattr(self, label)()
         except Exception:
             if label == "configure":
                 self.cleanup()
             raise
-        getattr(self, f"trigger_{label}")()
+        self.state = change.goal
+        for start, goal in ((change.start, change.during), (change.during, change.goal)):
+            event = TransitionEvent(start_state=_state(start), goal_state=_state(goal))
+            self._events.publish(event)
+
+    def _changes(self) -> list[Change]:
+        """Return the transitions that the state has."""
+        return [change for change in CHANGES if change.start == self.state]
 
     def destroy_node(self) -> None:
         """Free all that the node has, and destroy it, so that it leaves the graph at once."""
-        last_state = self.state
+        if self._is_destroyed:  # newer releases destroy a context's nodes when it is shut down
+            return
+        self._is_destroyed = True
         # First, as a lifecycle manager calls them when the bond breaks, and waits without end.
-        self._state_machine.destroy_when_not_in_use()
         for service in [*self.services]:
             self.destroy_service(service)
         if self.context.ok():
-            self.shutdown(last_state)
+            self.shutdown()
         super().destroy_node()
 
     async def prepare(self, transition: str) -> bool:
@@ -89,17 +170,36 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         for server in servers:
             server.destroy()
 
-    def shutdown(self, state: str = "") -> None:
-        """Stop the node and free all that it has, in a state or that of now."""
-        state = state or self.state
-        if state == "active":
+    def shutdown(self) -> None:
+        """Stop the node and free all that it has."""
+        is_active = self.state == "active"
+        if is_active:
             self.deactivate()
-        if state in ("active", "inactive"):
+        if is_active or self.state == "inactive":
             self.cleanup()
+
+    def _on_get_state(self, _: Any, response: Any) -> Any:
+        response.current_state = _state(self.state)
+        return response
+
+    def _on_get_states(self, _: Any, response: Any) -> Any:
+        response.available_states = [_state(label) for label in STATES]
+        return response
+
+    def _on_get_transitions(self, _: Any, response: Any) -> Any:
+        response.available_transitions = [
+            _description(change.number, change.label, change.start, change.during)
+            for change in self._changes()
+        ]
+        return response
+
+    def _on_get_graph(self, _: Any, response: Any) -> Any:
+        response.available_transitions = [*_transition_graph()]
+        return response
 
     async def _on_change_state(self, request: Any, response: Any) -> Any:
         asked = request.transition
-        known = {number: label for number, label, *_ in self._state_machine.available_transitions}
+        known = {change.number: change.label for change in self._changes()}
         label = asked.label or known.get(asked.id, "")
         if self._is_changing or label not in known.values():
             what = repr(asked.label) if asked.label else f"transition {asked.id}"

@@ -22,7 +22,7 @@ from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidHandle, NameValidationException, ParameterException
-from rclpy.executors import await_or_execute
+from rclpy.executors import SingleThreadedExecutor, await_or_execute
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -35,8 +35,6 @@ from rclpy.subscription import Subscription
 from rclpy.task import Task
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
-
-from ddqn_planner.nodes.executor import new_executor
 
 # Late subscribers receive the last message too: for maps, plans, saved models.
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -312,7 +310,7 @@ def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | 
     try:
         # With rclpy's handlers, nothing could be published any more when the node ends.
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        executor = new_executor()
+        executor = SingleThreadedExecutor()
         # A task, not a flag: the executor wakes and returns.
         _at_signals(lambda: executor.create_task(stopping.set))
         node = make_node()

@@ -14,17 +14,23 @@ import pytest
 import rclpy
 from client import TIMEOUT, generated_map, initial_pose, plan_request, wait_for
 from integration.robot import ERROR, GOAL, NUMBERS, START, WARN, Robot, ask_for_plan
-from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.msg import State, Transition, TransitionEvent
+from lifecycle_msgs.srv import (
+    ChangeState,
+    GetAvailableStates,
+    GetAvailableTransitions,
+    GetState,
+)
 from nav_msgs.srv import GetPlan
 from processes import cpu_seconds
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.task import Future
+from rclpy.lifecycle import LifecycleNode
+from rclpy.utilities import try_shutdown
 
-from ddqn_planner.nodes import executor as of_nodes
 from ddqn_planner.nodes.planner_node import PlannerNode
 from ddqn_planner.nodes.runtime import LATCHED
 
+LABELS = ("configure", "activate", "deactivate", "cleanup", "shutdown")
 OF_CONFIGURED = {"planner/get_plan", "planner/reload_model", "plan", "map", "goal_pose"}
 
 
@@ -166,8 +172,7 @@ def test_a_stop_answers_what_waits(run_waiting: Any, load_gate: Path) -> None:
         assert robot.plans.messages() == []
         assert robot.transition("shutdown")
         assert robot.state == "finalized"
-        labels = "configure", "activate", "deactivate", "cleanup", "shutdown"
-        assert not any(map(robot.transition, labels))
+        assert not any(map(robot.transition, LABELS))
 
 
 def test_a_stop_breaks_the_bond(run_robot: Any, model: Path) -> None:
@@ -225,46 +230,83 @@ def test_a_planner_that_plans_leaves_the_graph_at_once(robot: Robot) -> None:
     assert not all(answer.done() for answer in answers)
 
 
-def test_with_another_rclpy_its_own_executor_runs_the_node(monkeypatch: pytest.MonkeyPatch) -> None:
-    rclpy.init()
-    assert type(of_nodes.new_executor()) is of_nodes.NodeExecutor
-    monkeypatch.setattr(of_nodes, "PARTS", (*of_nodes.PARTS, "_of_another_version"))
-    assert type(of_nodes.new_executor()) is SingleThreadedExecutor
+SERVICES = {
+    "get_state": GetState,
+    "get_available_states": GetAvailableStates,
+    "get_available_transitions": GetAvailableTransitions,
+    "get_transition_graph": GetAvailableTransitions,
+}
+
+
+def test_the_lifecycle_is_that_of_rclpys_own_nodes() -> None:
+    """Except for their answer to a transition that the state does not have: it ends a process."""
+    rclpy.init(args=["--ros-args", "-p", "autostart:=false"])
+    planner = PlannerNode()
+    nodes = [planner, LifecycleNode("example")]
+    listener, executor = rclpy.create_node("listener"), SingleThreadedExecutor()
+    for node in (*nodes, listener):
+        executor.add_node(node)
+    events: list[list[tuple[State, State]]] = [[], []]
+    for node, seen in zip(nodes, events, strict=True):
+
+        def hear(event: TransitionEvent, seen: list[tuple[State, State]] = seen) -> None:
+            seen.append((event.start_state, event.goal_state))
+
+        name = f"/{node.get_name()}/transition_event"
+        listener.create_subscription(TransitionEvent, name, hear, 100)
+        while not listener.count_publishers(name):
+            executor.spin_once(timeout_sec=0.05)
+
+    def ask(service: str, kind: Any, **request: Any) -> list[Any]:
+        """Return what both nodes answer."""
+        answers = []
+        for node in nodes:
+            client = listener.create_client(kind, f"/{node.get_name()}/{service}")
+            while not client.service_is_ready():
+                executor.spin_once(timeout_sec=0.05)
+            future = client.call_async(kind.Request(**request))
+            executor.spin_until_future_complete(future, TIMEOUT)
+            answers.append(future.result())
+            listener.destroy_client(client)
+        return answers
+
+    try:
+        for label in ("", *LABELS):
+            if label:
+                ours, example = ask("change_state", ChangeState, transition=Transition(label=label))
+                assert ours.success
+                assert example.success
+            for service, kind in SERVICES.items():
+                ours, example = ask(service, kind)
+                for field in kind.Response.get_fields_and_field_types():
+                    values = [
+                        sorted(value, key=repr) if isinstance(value, list) else value
+                        for value in (getattr(ours, field), getattr(example, field))
+                    ]
+                    assert values[0] == values[1]
+        assert planner.state == "finalized"
+        while len(events[0]) < 2 * len(LABELS) or len(events[1]) < 2 * len(LABELS):
+            executor.spin_once(timeout_sec=TIMEOUT)
+        assert events[0] == events[1]
+    finally:
+        for node in (*nodes, listener):
+            node.destroy_node()
+        executor.shutdown()
+        try_shutdown()
+
+
+@pytest.mark.parametrize("state", ["unconfigured", "inactive", "active", "finalized"])
+def test_a_node_can_be_destroyed_after_the_shutdown_and_twice(state: str, model: Path) -> None:
+    rclpy.init(args=["--ros-args", "-p", "autostart:=false", "-p", f"model:={model}"])
+    node = PlannerNode()
+    for label in {"inactive": LABELS[:1], "active": LABELS[:2]}.get(state, ()):
+        node.change(label)
+    if state == "finalized":
+        node.change("shutdown")
+    assert node.state == state
     rclpy.shutdown()
-
-
-def test_callbacks_resume_in_order_unless_destroyed() -> None:
-    called, awaited, stopping = [], Future(), threading.Event()
-
-    async def begin() -> None:
-        called.append("begin")
-        node.destroy_guard_condition(destroyed)
-        another.trigger()
-        await awaited
-        called.append("go on")
-
-    def end() -> None:
-        called.append("end")
-        executor.create_task(stopping.set)
-
-    rclpy.init()
-    node, group = rclpy.create_node("calls"), MutuallyExclusiveCallbackGroup()
-    executor = of_nodes.NodeExecutor()
-    executor.add_node(node)
-    for callback in (begin, end):
-        node.create_guard_condition(callback, group).trigger()
-    destroyed = node.create_guard_condition(lambda: called.append("destroyed"))
-    destroyed.trigger()
-    another = node.create_guard_condition(lambda: awaited.set_result(None))
-    late = threading.Timer(60.0, executor.create_task, [stopping.set])
-    late.start()
-    while not stopping.is_set():
-        executor.spin_once()
-    late.cancel()
     node.destroy_node()
-    executor.shutdown()
-    rclpy.shutdown()
-    assert called == ["begin", "go on", "end"]
+    node.destroy_node()
 
 
 @pytest.mark.parametrize("case", ["good", "broken", "replaced"])
