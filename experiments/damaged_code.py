@@ -1,0 +1,103 @@
+"""Damages all files of compiled code, in each way, and checks the plans and warnings after it."""
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from processes import run_script
+from tables import table
+
+BLOCK = 4096  # bytes that a disk writes at once
+WARNING = "ddqn_planner's compiled code: "
+# With a tolerance, a plan needs functions that others do not.
+PLAN = """
+import numpy as np
+from ddqn_planner import GridMap, Planner
+from ddqn_planner.warm_up import warm_up
+
+planner = Planner.load("any_map")
+for _ in warm_up(planner, learns=True):
+    pass
+occupancy = np.random.default_rng(0).random((40, 50)) < 0.2
+occupancy[30] = True
+for start, goal, tolerance in [((2, 2), (40, 4), 0), ((3, 9), (44, 38), 40)]:
+    for grid in (GridMap(occupancy), GridMap(occupancy, cost=np.ones((40, 50), np.int8))):
+        plan = planner.plan(grid, start, goal, tolerance=tolerance, simplified=bool(tolerance))
+        print(plan.status.name, plan.length, plan.cells)
+"""
+Damage = Callable[[bytes, np.random.Generator], bytes]
+
+
+def zero_a_block(content: bytes, random: np.random.Generator) -> bytes:
+    """Return the content as after a power cut before one block was written."""
+    first = int(random.integers(len(content))) // BLOCK * BLOCK
+    length = len(content[first : first + BLOCK])
+    return content[:first] + bytes(length) + content[first + length :]
+
+
+def flip_a_bit(content: bytes, random: np.random.Generator) -> bytes:
+    """Return the content with one bit changed."""
+    damaged = bytearray(content)
+    damaged[random.integers(len(content))] ^= 1 << int(random.integers(8))
+    return bytes(damaged)
+
+
+DAMAGES: dict[str, Damage] = {
+    "empty": lambda content, random: b"",
+    "cut": lambda content, random: content[: random.integers(len(content))],
+    "zeros": lambda content, random: bytes(len(content)),
+    "a block of zeros": zero_a_block,
+    "one bit": flip_a_bit,
+    "random": lambda content, random: random.bytes(len(content)),
+}
+
+
+def make_folder(path: Path) -> None:
+    """Put an empty folder in the place of a file."""
+    path.unlink()
+    path.mkdir()
+
+
+def plan(folder: Path, python: str) -> subprocess.CompletedProcess[str]:
+    """Run the program that plans, with its compiled code in a folder."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder)}
+    command = [python, "-c", PLAN]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Damage the files with this Python or another; return 1 if a plan or a warning was wrong."""
+    python = arguments[0] if arguments else sys.executable
+    random = np.random.default_rng(0)
+    rows, n_wrong = [], 0
+    with tempfile.TemporaryDirectory() as name:
+        intact, folder = Path(name, "intact"), Path(name, "code")
+        first = plan(intact, python)
+        if first.returncode or not first.stdout:
+            raise RuntimeError(f"no plan with an empty folder: {first.stderr}")
+        for suffix in (".nbi", ".nbc"):
+            for damage in (*DAMAGES, "a folder"):
+                shutil.rmtree(folder, ignore_errors=True)
+                shutil.copytree(intact, folder)
+                for path in sorted(folder.rglob(f"*{suffix}")):
+                    if damage == "a folder":
+                        make_folder(path)
+                    else:
+                        path.write_bytes(DAMAGES[damage](path.read_bytes(), random))
+                runs = [plan(folder, python) for _ in range(2)]
+                are_right = [run.returncode == 0 and run.stdout == first.stdout for run in runs]
+                n_warnings = [run.stderr.count(WARNING) for run in runs]
+                n_wrong += not all(are_right) or n_warnings != [1, 0]
+                rows.append([suffix, damage, *are_right, *n_warnings])
+    words = "plans are right | and with the next start | warnings | with the next start"
+    print(table(f"files | damage | {words}", rows))
+    return int(n_wrong > 0)
+
+
+if __name__ == "__main__":
+    run_script(main)
