@@ -26,6 +26,10 @@ setup(
         (f"share/{PACKAGE}/maps", glob("maps/*")),
         (f"share/{PACKAGE}/models", glob("models/*")),
         (f"share/{PACKAGE}/rviz", glob("rviz/*")),
+        (f"share/{PACKAGE}/launch", glob("launch/*.launch.py")),
+        # The examples look for their helpers where these lie in the repository.
+        (f"share/{PACKAGE}/examples", glob("examples/*.py")),
+        (f"share/{PACKAGE}/experiments", glob("experiments/*.py")),
     ],
     zip_safe=False,
     python_requires=">=3.10",

@@ -69,6 +69,15 @@ print(ddqn_planner.__file__, find_map("dilemma"), find_model("dilemma"))
 """
 
 
+IMPORT_EXAMPLE = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import demo_training
+import figures
+print(figures.__file__)
+"""
+
+
 # --user and Debian's Python install beside another share folder than the interpreter's, as the
 # last two do.
 @pytest.mark.slow
@@ -94,10 +103,18 @@ def test_maps_and_models_come_everywhere(wheel: Path, tmp_path: Path, option: st
     assert "4,096" in run(program, "certify")
     for name in ("map_server_node", "planner_node", "trainer_node"):
         assert (program.parent / name).is_file()
+    (marker,) = folder.glob("**/resource_index/packages/ddqn_planner")  # where ROS looks
+    share = marker.parents[3] / "ddqn_planner"
+    for name in ("launch", "rviz"):
+        # pip compiles also what is written in Python here.
+        shipped = {path.name: path.read_bytes() for path in (ROOT / name).glob("*.*")}
+        assert {path.name: path.read_bytes() for path in (share / name).glob("*.*")} == shipped
+    # An example finds its helpers.
+    helper = run("-c", IMPORT_EXAMPLE, share / "examples")
+    assert Path(helper.strip()).parent == share / "experiments"
     for name in ("maps", "models"):
         shipped = {path.name: path.read_bytes() for path in (ROOT / name).iterdir()}
-        (marker,) = folder.glob("**/resource_index/packages/ddqn_planner")  # where ROS looks
-        for copy in (package.parent / name, marker.parents[3] / "ddqn_planner" / name):
+        for copy in (package.parent / name, share / name):
             assert {path.name: path.read_bytes() for path in copy.iterdir()} == shipped
 
 

@@ -58,9 +58,9 @@ def test_colcon_puts_everything_where_ros_looks_for_it(install: Path) -> None:
         assert os.access(prefix / "lib" / "ddqn_planner" / name, os.X_OK), name
     assert (prefix / "share/ament_index/resource_index/packages/ddqn_planner").is_file()
     assert (share / "package.xml").is_file()
-    for folder in ("maps", "models"):
-        shipped = {path.name: path.read_bytes() for path in (ROOT / folder).iterdir()}
-        assert {path.name: path.read_bytes() for path in (share / folder).iterdir()} == shipped
+    for folder in ("maps", "models", "rviz", "launch"):
+        shipped = {path.name: path.read_bytes() for path in (ROOT / folder).glob("*.*")}
+        assert {path.name: path.read_bytes() for path in (share / folder).glob("*.*")} == shipped
 
 
 def test_a_linked_workspace(source_copy: Path, tmp_path: Path, monkeypatch: Any) -> None:
