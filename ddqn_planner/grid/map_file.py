@@ -9,16 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from ddqn_planner.files import as_path
 from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell, as_number, cell_inside, numbers
 from ddqn_planner.grid.grid_map import GridMap
+from ddqn_planner.grid.map_yaml import as_float, as_truth, read_yaml
 
 MAX_CELLS = 2**26  # a larger map is refused before its cells are read
 MAX_YAML_BYTES = 2**16
-YES, NO = ("1", "y", "yes", "true", "on"), ("0", "n", "no", "false", "off")  # for ``negate``
 
 # In other layouts Pillow drops bits, or map_server takes the fourth byte of a pixel as its opacity.
 LAYOUTS = {"1", "1;I", "L", "L;2", "L;4", "LA", "I;16B", "P", "P;1", "P;2", "P;4"}
@@ -91,8 +90,6 @@ def load_map(
     - Images that Pillow reads differently from map_server are refused: colours of 16 bits, PPM and
       PGM whose greatest value is not 255 (or 65535 for grey), BMP of 16 or 32 bits without an alpha
       channel, and PNG with a transparent colour outside a palette.
-    - The image must lie in the folder of the YAML file or below it, so that a map from elsewhere
-      cannot name any file of this machine.
     - The YAML may hold ``ddqn_planner: {start: [x, y], goal: [x, y], directions: FILE}``: the cells
       of a scenario, and an image of the same size in 8-bit grey (PGM or PNG), whose values are
       those of `GridMap.forbidden`: 0, black, where all moves are legal. map_server ignores it.
@@ -116,8 +113,12 @@ def load_map(
     return read_map_file(path).grid(occupied_threshold, allow_unknown, use_map_costs)
 
 
-def read_map_file(path: str | Path) -> MapFile:
-    """Read all that a map file holds; see `load_map` for the path and the errors."""
+def read_map_file(path: str | Path, only_below: bool = False) -> MapFile:
+    """Read all that a map file holds; see `load_map` for the path and the errors.
+
+    With `only_below` its images must lie in the folder of the YAML file or below it, so that a
+    path from elsewhere, as in a service's request, cannot show any file of this machine.
+    """
     try:
         path = as_path(path)
     except ValueError as error:
@@ -127,7 +128,8 @@ def read_map_file(path: str | Path) -> MapFile:
     if path.suffix.lower() not in (".yaml", ".yml", ".map"):
         raise MapMetadataError(f"{path}: ends in {path.suffix!r}; give a .yaml, .yml or .map file")
     try:
-        return _read_moving_ai(path) if path.suffix.lower() == ".map" else _read_ros(path)
+        is_moving_ai = path.suffix.lower() == ".map"
+        return _read_moving_ai(path) if is_moving_ai else _read_ros(path, only_below)
     except MapFileError:
         raise
     except ValueError as error:
@@ -166,17 +168,12 @@ def _read_moving_ai(path: Path) -> MapFile:
     return MapFile(np.where(free, np.int8(0), np.int8(OCCUPIED)))
 
 
-def _read_ros(path: Path) -> MapFile:
-    # BaseLoader returns each scalar as text and knows no tags and no merge keys: nothing in the
-    # file can run, or grow, when it is read. map_server converts scalars by their key too.
-    try:
-        content = _read_bytes(path, MAX_YAML_BYTES, MapMetadataError)
-        document = yaml.load(content, Loader=yaml.BaseLoader)
-    except (yaml.YAMLError, OverflowError, RecursionError) as error:
-        raise ValueError(f"not a YAML file ({' '.join(str(error).split())})") from error
+def _read_ros(path: Path, only_below: bool) -> MapFile:
+    document = read_yaml(_read_bytes(path, MAX_YAML_BYTES, MapMetadataError))
     if not isinstance(document, dict):
         raise ValueError("not a YAML mapping; give 'key: value' lines: image, resolution, ...")
-    grey, clear = _read_image(path, document, "image", ("PPM", "PNG", "BMP", "JPEG"), LAYOUTS)
+    image = _image_path(path, document, "image", only_below)
+    grey, clear = _read_image(image, ("PPM", "PNG", "BMP", "JPEG"), LAYOUTS)
     mode = _choice({"mode": "trinary", **document}, "mode", ("trinary", "scale", "raw"))
     values = _percent_of_grey(document, mode)[grey]
     if mode != "raw":
@@ -188,7 +185,8 @@ def _read_ros(path: Path) -> MapFile:
         raise ValueError(f"ddqn_planner is {_short(ours)}; give some of {keys}")
     forbidden = None
     if "directions" in ours:
-        forbidden, _ = _read_image(path, ours, "directions", ("PPM", "PNG"), {"L"})
+        directions = _image_path(path, ours, "directions", only_below)
+        forbidden, _ = _read_image(directions, ("PPM", "PNG"), {"L"})
         name = ours.pop("directions")
         if forbidden.shape != values.shape:
             has, right = (f"{w} x {h}" for h, w in (forbidden.shape, values.shape))
@@ -198,24 +196,40 @@ def _read_ros(path: Path) -> MapFile:
     return MapFile(values[::-1], resolution, origin, **cells, forbidden=forbidden)
 
 
-def _read_image(
-    path: Path, document: dict[str, Any], key: str, formats: tuple[str, ...], layouts: set[str]
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Return an image's grey values, and which pixels are not opaque."""
-    from PIL import Image  # 17 ms, and a planner that is sent its maps reads no image
-
+def _image_path(path: Path, document: dict[str, Any], key: str, only_below: bool) -> Path:
+    """Return the path of an image that a YAML file names."""
     name = document.get(key)
     if not isinstance(name, str) or not name:
         raise ValueError(f"{key} is {_short(name)}; give the path of an image")
     file = path.parent / name
     if name.startswith("~") and not os.path.lexists(file):
         file = as_path(name, key)
+    if only_below and not _is_below(file, path):
+        problem = f"{key} is {name!r}, outside of the folder of the YAML"
+        reason = "a service reads no other files"
+        raise ValueError(f"{problem}, and {reason}; put it beside")
     if not os.path.isfile(file):
-        raise MapDataError(f"{str(file)!r}: no such image; check {key!r} in the YAML file")
+        # Often the absolute path of the computer on which the map was saved.
+        beside = re.split(r"[/\\]", name)[-1]
+        remedy = f"check {key!r} in the YAML file"
+        if beside != name and beside and os.path.isfile(path.parent / beside):
+            remedy = f"{beside!r} lies beside the YAML file: write '{key}: {beside}' there"
+        raise MapDataError(f"{str(file)!r}: no such image; {remedy}")
+    return file
+
+
+def _is_below(file: Path, path: Path) -> bool:
     # In a linked colcon workspace the YAML file is itself a link: allow the folder of either.
     folders = path.parent.resolve(), path.resolve().parent
-    if not any(file.resolve().is_relative_to(folder) for folder in folders):
-        raise ValueError(f"{key} is {name!r}, outside of the folder of the YAML; put it beside")
+    return any(file.resolve().is_relative_to(folder) for folder in folders)
+
+
+def _read_image(
+    file: Path, formats: tuple[str, ...], layouts: set[str]
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Return an image's grey values, and which pixels are not opaque."""
+    from PIL import Image  # 17 ms, and a planner that is sent its maps reads no image
+
     try:
         with Image.open(file, formats=formats) as image:
             _check_layout(image, layouts)
@@ -233,8 +247,10 @@ def _check_layout(image: Any, layouts: set[str]) -> None:
     layout, *rest = [arguments] if isinstance(arguments, str) else arguments
     # The last argument of a PPM is its greatest value, unless that is the greatest of its bytes.
     greatest = 65535 if image.mode == "I" else 255
-    scaled = codec.startswith("ppm") and rest not in ([], [greatest])
-    if scaled or layout not in layouts or codec == "bmp_rle":
+    if codec.startswith("ppm") and rest not in ([], [greatest]):
+        right = "255, or 65535 for grey"  # versions of map_server disagree on what others mean
+        raise ValueError(f"its greatest value is {rest[0]}; give {right}, or an 8-bit grey PNG")
+    if layout not in layouts or codec == "bmp_rle":
         raise ValueError(f"its pixels are stored as {codec} {arguments}; save an 8-bit grey PNG")
     if "transparency" in image.info and image.mode != "P":
         raise ValueError("one of its colours is transparent; save it with an alpha channel")
@@ -268,8 +284,8 @@ def _numbers(document: dict[str, Any], key: str) -> Any:
     """Return a number, or a list of them; whoever takes them checks how many there are."""
     value: Any = document.get(key)
     try:
-        return [float(each) for each in value] if isinstance(value, list) else float(value)
-    except (TypeError, ValueError):
+        return [*map(as_float, value)] if isinstance(value, list) else as_float(value)
+    except ValueError:
         raise ValueError(f"{key} is {_short(value)}; give numbers") from None
 
 
@@ -279,14 +295,18 @@ def _percent_of_grey(document: dict[str, Any], mode: str) -> NDArray[np.int8]:
     free_thresh, occupied_thresh = (as_number(key, _numbers(document, key), 0, 1) for key in keys)
     if free_thresh > occupied_thresh:
         raise ValueError(f"free_thresh is {free_thresh}; give at most {occupied_thresh}")
-    negate = _choice(document, "negate", YES + NO)
+    try:
+        is_negated = as_truth(document.get("negate"))
+    except ValueError:
+        problem = f"negate is {_short(document.get('negate'))}"
+        raise ValueError(f"{problem}; give 0 or 1, or true or false") from None
     grey = np.arange(256)
     if mode == "raw":
         return np.where(grey <= 100, grey, -1).astype(np.int8)
     # map_server computes in single precision, and a grey value may equal a threshold.
     free, occupied = np.float32(free_thresh), np.float32(occupied_thresh)
     p = grey.astype(np.float32) / np.float32(255)
-    if negate in NO:
+    if not is_negated:
         p = np.float32(1) - p
     percent = np.full(256, -1.0)
     if mode == "scale":

@@ -58,11 +58,11 @@ class MapServerNode(BaseNode):
         self.create_trigger("~/scatter_obstacles", self._on_scatter_obstacles)
         self.create_trigger("~/restore_map", self._on_restore_map)
 
-    def _load(self, url: str) -> int:
+    def _load(self, url: str, only_below: bool = False) -> int:
         """Load a map and serve it, or log why not; return the result code of LoadMap."""
         try:
             path = find_map(url)
-            loaded = read_map_file(path)
+            loaded = read_map_file(path, only_below)
             if not MIN_RESOLUTION < loaded.resolution < np.finfo(np.float32).max:
                 bounds = f"more than {MIN_RESOLUTION}, and no more than a float32 holds"
                 wrong = f"resolution is {loaded.resolution}; a map message needs {bounds}"
@@ -91,7 +91,7 @@ class MapServerNode(BaseNode):
         return response
 
     def _on_load_map(self, request: Any, response: Any) -> Any:
-        response.result = self._load(request.map_url)
+        response.result = self._load(request.map_url, only_below=True)
         if response.result == LoadMap.Response.RESULT_SUCCESS:
             response.map = self._served
         return response

@@ -144,10 +144,16 @@ def test_an_image_that_map_server_reads_differently_is_refused(tmp_path: Path) -
     wide = np.array([[256, 257, 511]], dtype=np.uint16)
     for reason, content in (
         *(("stored as raw", bitmap_of_32_bits(compression)) for compression in (0, 3)),
-        ("stored as ppm", after(b"P5 3 1 100\n", ">u1")),
-        ("stored as ppm", after(b"P5 3 1 1000\n", ">u2")),
-        ("stored as ppm", after(b"P6 1 1 65535\n", ">u2")),
-        ("stored as ppm", b"P2 3 1 100\n1 2 3"),
+        *(
+            (f"greatest value is {most}; give 255", after(b"P5 3 1 %d\n" % most, ">u1"))
+            for most in (1, 15, 100)
+        ),
+        *(
+            (f"greatest value is {most}; give 255", after(b"P5 3 1 %d\n" % most, ">u2"))
+            for most in (256, 1023)
+        ),
+        ("greatest value is 65535; give 255", after(b"P6 1 1 65535\n", ">u2")),
+        ("greatest value is 100; give 255", b"P2 3 1 100\n1 2 3"),
         ("transparent", png(wide, transparency=257)),
         ("transparent", png(wide.astype(np.uint8), transparency=1)),
     ):
@@ -180,11 +186,16 @@ def test_an_impossible_map_file_is_not_made() -> None:
     [
         *(({key: None}, f"{key} is None") for key in VALID if key != "mode"),
         *(({"resolution": 0}, "resolution is 0"), ({"resolution": 10**400}, "resolution is inf")),
-        ({"resolution": float("nan")}, r"resolution is \'\.nan\'"),
+        ({"resolution": float("nan")}, "resolution is nan; give metres per cell, > 0"),
+        ({"resolution": "1_0"}, "resolution is '1_0'; give numbers"),
         *(({"resolution": wrong}, "resolution is '") for wrong in ("fine", True)),
         *(({"origin": wrong}, "origin is") for wrong in ([0, 0, 10**400], ["a", 0, 0], "here")),
         *(({"origin": wrong}, "origin has shape") for wrong in ([0, 0], [0] * 4, 0)),
-        *(({"negate": 2}, "negate is '2'"), ({"occupied_thresh": 1.5}, r"occupied_thresh is 1\.5")),
+        *(
+            ({"negate": wrong}, f"negate is '{wrong}'; give 0 or 1")
+            for wrong in ("08", "tRUE", "0.0", "")
+        ),
+        ({"occupied_thresh": 1.5}, r"occupied_thresh is 1\.5"),
         *(({"free_thresh": 0.7}, r"free_thresh is 0\.7"), ({"image": []}, r"image is \[\]")),
         *(({"mode": "quaternary"}, "mode is 'quaternary'"), ({"mode": []}, r"mode is \[\]")),
         ({"ddqn_planner": {"start": [0, 9]}}, r"start \(0, 9\) lies outside the map of 2 x 2"),
@@ -283,7 +294,7 @@ def test_an_image_that_holds_no_directions_is_refused(tmp_path: Path) -> None:
         ),
         (GREY.convert("I;16"), "d.png", "stored as zip I;16B; save an 8-bit grey PNG"),
         (GREY, "d.jpg", "not readable .* give a PPM, PNG image"),
-        (b"P5\n3 2\n100\n" + bytes(6), "d.pgm", "save an 8-bit grey PNG"),
+        (b"P5\n3 2\n100\n" + bytes(6), "d.pgm", "8-bit grey PNG"),
         (b"P5\n3 2\n255\n" + bytes(5), "d.pgm", "not readable"),
     ):
         with pytest.raises(MapDataError, match=rf"{name}'.*{named}"):
@@ -303,15 +314,102 @@ def folder(tmp_path: Path) -> Path:
     return folder
 
 
-def test_an_image_lies_in_the_yamls_folder_named_in_any_way(folder: Path) -> None:
+def test_a_map_of_a_service_names_no_image_outside_of_its_folder(folder: Path) -> None:
     for inside in ("./good.pgm", f"{folder}/good.pgm", "below/good.pgm", "link.pgm"):
-        assert read_map_file(write(folder, PIXELS, image=inside)).values.shape == (3, 3)
+        path = write(folder, PIXELS, image=inside)
+        assert read_map_file(path, only_below=True).values.shape == (3, 3)
     outside = ["../good.pgm", f"{folder.parent}/good.pgm", "outside.pgm", "above/good.pgm"]
     for name, key in itertools.product(outside, ("image", "directions")):
         changes = {"ddqn_planner": {key: name}} if key == "directions" else {key: name}
         path = write(folder, np.zeros((3, 3), dtype=np.uint8), **changes)
-        with pytest.raises(MapMetadataError, match=r"outside of the folder .* put it beside"):
-            read_map_file(path)
+        with pytest.raises(
+            MapMetadataError, match=r"outside of .* a service reads .* put it beside"
+        ):
+            read_map_file(path, only_below=True)
+        if key == "image":
+            assert read_map_file(path).values.shape == (3, 3)
+
+
+@pytest.mark.parametrize("image", ["/home/r/maps/map.png", "maps/map.png", r"C:\maps\map.png"])
+def test_an_image_of_another_computer_is_named_where_it_lies_beside(
+    tmp_path: Path, image: str
+) -> None:
+    path = write(tmp_path, PIXELS, image=image)
+    with pytest.raises(MapDataError, match=r"'map.png' lies beside .* write 'image: map.png'"):
+        read_map_file(path)
+    (tmp_path / "map.png").unlink()
+    with pytest.raises(MapDataError, match="no such image; check 'image'"):
+        read_map_file(path)
+
+
+BEGIN = "image: map.png\nresolution: 0.05\norigin: [1.0, -2.0, 0.5]\n"
+END = "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+WITHOUT_NEGATE = BEGIN + END.partition("\n")[2]
+# All that map_server 1.3.x with yaml-cpp 0.8 reads as the same map.
+SAME_MAPS: dict[str, str | bytes] = {
+    "tabs after colons": (BEGIN + END).replace(": ", ":\t"),
+    "tabs before comments": (BEGIN + END).replace("\n", "\t# a comment\n"),
+    "tabs at ends of lines": (BEGIN + END).replace("\n", "\t\r\n"),
+    "tabs in a list": (BEGIN + END).replace("[1.0, -2.0, 0.5]", "[\t1.0,\t-2.0\t,\n\t0.5\t]"),
+    "tabs in JSON": '{\n\t"image": "map.png",\n\t"resolution":0.05,\n\t"origin":[1,-2,0.5],'
+    '\n\t"negate":false, "occupied_thresh":0.65,\n\t"free_thresh":0.196}',
+    "tabs after dashes": (BEGIN + END).replace(
+        "[1.0, -2.0, 0.5]", "\n-\t1.0\t# x\n-\t-2.0\n-\t0.5"
+    ),
+    "tabs first": "\t\n\t# a comment\n" + BEGIN + END,
+    "keys twice": BEGIN + END + "image: x.png\nresolution: 9\norigin: [0, 0, 0]\nnegate: 1\n",
+    "a wrong second value": BEGIN + END + "resolution: none\n'resolution': {}\n",
+    "two documents": BEGIN + END + "---\nresolution: 9\n",
+    "a broken second document": BEGIN + END + "...\n---\n[[[\n",
+    "a directive": "%YAML 1.2\n---\n" + BEGIN + END,
+    "a directive and no start": "# a\n%YAML 1.1\n" + BEGIN + END,
+    "Latin-1": ("# K\xfcche\n" + BEGIN + "author: J\xf6rg # \xe9\n" + END).encode("latin-1"),
+    "cp1252 and control characters": b"# \x80 \x93\x94 \x00\x01\x04\x1b\x7f\n"
+    + (BEGIN + END).encode(),
+    "line separators": "# a\x85b\u2028c\u2029d\n" + BEGIN + END,
+    "half a character": b"# \xe2\x82\n" + (BEGIN + END).encode(),
+    **{
+        code: (BEGIN + END + "# Küche\n").encode(code)
+        for code in ("utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-32-be")
+    },
+    "numbers": (BEGIN + END)
+    .replace("0.05", "+00.05")
+    .replace("0.196", ".196")
+    .replace("[1.0, -2.0, 0.5]", "[01, -2., 5e-1]"),
+    "numbers as text": (BEGIN + END).replace("0.05", "'0.05'").replace("0.65", '"0.65 "'),
+    "tags": (BEGIN + END).replace("0.05", "!!float 0.05").replace("0.65", "!x 0.65"),
+    "anchors": "a: &x 9\nb: &x 0.05\n" + (BEGIN + END).replace("0.05", "*x"),
+    "lists as keys": BEGIN + END + "[1, 2]: 3\n{a: b}: 4\n",
+    "a trailing comma": (BEGIN + END).replace("0.5]", "0.5,]"),
+    **{
+        f"negate: {negate}": f"{WITHOUT_NEGATE}negate: {negate}\n"
+        for negate in ("00", "-0", "+0", "0x0", "'0'", "False", "NO", "n", "off")
+    },
+}
+
+
+@pytest.mark.parametrize("case", SAME_MAPS)
+def test_a_yaml_is_read_as_map_server_reads_it(tmp_path: Path, case: str) -> None:
+    content = SAME_MAPS[case]
+    path = write(tmp_path, np.array([[0, 100, 255]], np.uint8))
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    read = read_map_file(path)
+    assert (read.resolution, read.origin) == (0.05, (1.0, -2.0, 0.5))
+    assert read.values.tolist() == [[100, -1, 0]]
+
+
+@pytest.mark.parametrize("negate", ["01", "0x1", "010", "2", "-1", "+1", "'1'", "TRUE", "Y", "On"])
+def test_what_is_not_0_negates_as_for_map_server(tmp_path: Path, negate: str) -> None:
+    path = write(tmp_path, np.array([[0, 100, 255]], np.uint8))
+    path.write_text(f"{WITHOUT_NEGATE}negate: {negate}\n")
+    assert read_map_file(path).values.tolist() == [[0, -1, 100]]
+
+
+def test_an_image_named_in_latin_1_is_found(tmp_path: Path) -> None:
+    path, name = write(tmp_path, PIXELS), b"k\xfcche.png"
+    (tmp_path / "map.png").rename(tmp_path / os.fsdecode(name))
+    path.write_bytes((BEGIN + END).encode().replace(b"map.png", name))
+    assert read_map_file(path).values.shape == (2, 2)
 
 
 def test_a_yaml_that_is_a_link_reads_the_image_beside_it_or_its_target(folder: Path) -> None:

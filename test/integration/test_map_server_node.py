@@ -135,6 +135,7 @@ def test_a_failed_load_keeps_the_map(
         *((url, "", "", NO_FILE) for url in no_files),
         *((image, "", "", BAD_YAML), (bad, "(?s).*", "[1, 2", BAD_YAML)),
         *((bad, "good.pgm", name, BAD_DATA) for name in ("missing.pgm", "cut.pgm")),
+        *((bad, "good.pgm", name, BAD_YAML) for name in ("/etc/passwd", f"../{tmp_path.name}.pgm")),
         # Files may have these, messages may not.
         *((bad, "resolution: .*", f"resolution: 1e{n}", BAD_YAML) for n in (-300, 300)),
     ):
