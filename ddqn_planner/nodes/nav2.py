@@ -2,26 +2,29 @@
 
 import time
 from collections.abc import Awaitable, Callable
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
+from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
 from rclpy.action.server import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 
-from ddqn_planner.nodes.report import Outcome
-from ddqn_planner.nodes.runtime import SERVICE_QUALITY, BaseNode
+from ddqn_planner.nodes.other_planners import (
+    ACTIONS,
+    QUEUES,
+    GivenUp,
+    OtherPlanners,
+    action_name,
+)
+from ddqn_planner.nodes.report import ALL_GOALS, Outcome
+from ddqn_planner.nodes.runtime import BaseNode
 from ddqn_planner.planning import PlanStatus
 
-GivenUp = Callable[[], Outcome | None]  # returns why a request is given up now, or None
-# Plans from a start, or None, through goals, by a planner's name.
-Plan = Callable[[Any, list[PoseStamped], str, GivenUp], Awaitable[tuple[Path, Outcome]]]
-
-# Those of an action's services: without them, goals are lost like requests.
-QUEUES: dict[str, Any] = {
-    f"{service}_service_qos_profile": SERVICE_QUALITY for service in ("goal", "cancel", "result")
-}
+# Returns the answer of another planner to a goal's handle, or the outcome if there is none.
+AskOther = Callable[[Any, GivenUp, Callable[[], bool]], Awaitable[Any]]
 RESULT_TIMEOUT = 2  # seconds to keep a result: each request goes over all goals with theirs
 CANCELED = Outcome("CANCELED", "the goal was canceled")
 PREEMPTED = Outcome("PREEMPTED", "a newer goal of the same action came")
@@ -44,12 +47,38 @@ def error_code(status: str, result: Any) -> int:
     return int(getattr(result, CODES.get(status, status), result.UNKNOWN))
 
 
-# Without Nav2's types, so that it can be tested where these are not installed.
-class PathAction:
-    """Answers the goals of one action, of which the newest one preempts the one under way."""
+class Task(NamedTuple):
+    """What a goal asks for."""
 
-    def __init__(self, result: Any, refusal: GivenUp, plan: Plan) -> None:
-        self._result, self._refusal, self._plan = result, refusal, plan
+    start: PoseStamped | None  # None: where the robot is
+    goals: list[PoseStamped]
+    planner_id: str
+    has_via_points: bool = False  # all goals but the last
+
+
+Plan = Callable[[Task, GivenUp], Awaitable[tuple[Path, Outcome]]]
+
+
+class PathAction:
+    """Answers the goals of one action, of which the newest one preempts the one under way.
+
+    Releases have added fields to the action; `kind` says which of them its messages have.
+    """
+
+    def __init__(
+        self,
+        kind: Any,
+        refusal: GivenUp,
+        plan: Plan,
+        ask_other: AskOther | None = None,
+        is_ours: Callable[[str], bool] = lambda planner_id: True,
+    ) -> None:
+        self._result, self._refusal, self._plan = kind.Result, refusal, plan
+        self._ask_other, self._is_ours = ask_other, is_ours
+        self._has_goals = hasattr(kind.Goal, "goals")
+        self._has_via_points = hasattr(kind.Goal, "viapoints")
+        self._has_error_msg = hasattr(kind.Result, "error_msg")
+        self._has_last_reached = hasattr(kind.Result, "last_reached_index")
         self._newest: Any = None
 
     def accept(self, goal: Any) -> GoalResponse:
@@ -69,15 +98,23 @@ class PathAction:
                 return CANCELED
             return None if handle is self._newest else PREEMPTED
 
-        began, goal = time.monotonic(), handle.request
-        start = goal.start if goal.use_start else None
-        goals = [*goal.goals] if hasattr(goal, "goals") else [goal.goal]
-        path, outcome = await self._plan(start, goals, goal.planner_id, given_up)
+        began = time.monotonic()
+        path = Path()
+        if self._is_others(handle):
+            answer = await self._answer_of_other(handle, given_up)
+            if not isinstance(answer, Outcome):
+                return answer
+            outcome = answer
+        else:
+            path, outcome = await self._plan(self._task(handle.request), given_up)
         result = self._result(path=path)
         result.planning_time = Duration(seconds=time.monotonic() - began).to_msg()
         result.error_code = error_code(outcome.status, self._result)
-        if hasattr(result, "error_msg"):  # Nav2 has added it later
-            result.error_msg = outcome.reason if result.error_code else ""
+        is_partial = outcome.last_reached != ALL_GOALS
+        if self._has_error_msg:
+            result.error_msg = outcome.reason if result.error_code or is_partial else ""
+        if self._has_last_reached:
+            result.last_reached_index = outcome.last_reached
         if handle.is_cancel_requested:
             handle.canceled()
         elif outcome.status == PlanStatus.SUCCEEDED.name:
@@ -86,11 +123,61 @@ class PathAction:
             handle.abort()
         return result
 
+    def _task(self, goal: Any) -> Task:
+        start = goal.start if goal.use_start else None
+        if self._has_goals:
+            return Task(start, poses_of(goal.goals), goal.planner_id)
+        via_points = [*goal.viapoints] if self._has_via_points else []
+        return Task(start, [*via_points, goal.goal], goal.planner_id, bool(via_points))
 
-def serve_nav2(
-    node: BaseNode, refusal: GivenUp, plan: Plan, on_is_path_valid: Callable[..., Any]
-) -> None:
-    """Create Nav2's actions and service, or log what is missing."""
+    def _is_others(self, handle: Any) -> bool:
+        """Return whether a goal names another planner, and there may be one."""
+        return self._ask_other is not None and not self._is_ours(handle.request.planner_id)
+
+    async def _answer_of_other(self, handle: Any, given_up: GivenUp) -> Any:
+        """Return another planner's result, and set the handle's state, or why there is none."""
+
+        def is_kept() -> bool:  # its server lets the newest goal preempt it
+            return self._newest is not handle and self._is_others(self._newest)
+
+        assert self._ask_other is not None
+        answer = await self._ask_other(handle, given_up, is_kept)
+        if isinstance(answer, Outcome):
+            return answer
+        if handle.is_cancel_requested and answer.status == GoalStatus.STATUS_CANCELED:
+            handle.canceled()
+        elif answer.status == GoalStatus.STATUS_SUCCEEDED:
+            handle.succeed()
+        else:
+            handle.abort()
+        return answer.result
+
+
+def poses_of(goals: Any) -> list[PoseStamped]:
+    """Return the poses of a sequence, or since Kilted of a nav_msgs/msg/Goals with a header."""
+    if not hasattr(goals, "goals"):
+        return [*goals]
+    return [
+        stamped if stamped.header.frame_id else PoseStamped(header=goals.header, pose=stamped.pose)
+        for stamped in goals.goals
+    ]
+
+
+class Planning(NamedTuple):
+    """What answers Nav2's requests."""
+
+    refusal: GivenUp
+    plan: Plan
+    ask_other: Callable[[OtherPlanners, Any, GivenUp, Callable[[], bool]], Awaitable[Any]]
+    is_ours: Callable[[str], bool]  # a planner's name
+    on_is_path_valid: Callable[..., Any]
+
+
+def serve_nav2(node: BaseNode, planning: Planning, other_planners: str = "") -> None:
+    """Create Nav2's actions and service, or log what is missing.
+
+    ``other_planners`` is the prefix of the actions to which the goals of other planners are sent.
+    """
     try:
         from nav2_msgs.action import ComputePathThroughPoses, ComputePathToPose
         from nav2_msgs.srv import IsPathValid
@@ -101,11 +188,13 @@ def serve_nav2(
     group = ReentrantCallbackGroup()
     options = {"callback_group": group, "result_timeout": RESULT_TIMEOUT, **QUEUES}
     options["cancel_callback"] = lambda _: CancelResponse.ACCEPT
-    for name, kind in (
-        ("compute_path_to_pose", ComputePathToPose),
-        ("compute_path_through_poses", ComputePathThroughPoses),
-    ):
-        action = PathAction(kind.Result, refusal, plan)
+    for name, kind in zip(ACTIONS, (ComputePathToPose, ComputePathThroughPoses), strict=True):
+        ask_other = None
+        if other_planners:
+            others = OtherPlanners(node, kind, action_name(other_planners, name))
+            ask_other = partial(planning.ask_other, others)
+        action = PathAction(kind, planning.refusal, planning.plan, ask_other, planning.is_ours)
         begin = {"goal_callback": action.accept, "handle_accepted_callback": action.begin}
         ActionServer(node, kind, name, action.execute, **begin, **options)
+    on_is_path_valid = planning.on_is_path_valid
     node.create_service(IsPathValid, "is_path_valid", on_is_path_valid, callback_group=group)

@@ -56,6 +56,12 @@ PLANNER_PARAMETERS: Final = {
         CACHE_BYTES, "Bytes for kept Q fields; the last three always stay", (0, 2**40)
     ),
     "planner_id": Declared("GridBased", "What Nav2's requests may name, or leave empty"),
+    "other_planners": Declared(
+        "", "Prefix of planner_server's actions, for another planner_id; '': none", read_only=True
+    ),
+    "allow_partial_planning": Declared(
+        False, "Through several poses: as far as there is a path, if there is one to the first"
+    ),
     "experience": Declared("", "What drives taught: a file or folder; '': none"),
     "exploration": Declared(0.1, "Share by which a path may take longer, to learn", (0, 10)),
     "follow_trainer": Declared(False, "Load what the trainer saves", read_only=True),

@@ -18,7 +18,9 @@ from ddqn_planner.nodes.conversions import along, bytes_of, path_bytes, path_mes
 from ddqn_planner.nodes.display import FieldDisplay
 from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
-from ddqn_planner.nodes.nav2 import GivenUp, serve_nav2
+from ddqn_planner.nodes.nav2 import Planning as Nav2Planning
+from ddqn_planner.nodes.nav2 import Task, serve_nav2
+from ddqn_planner.nodes.other_planners import GivenUp, OtherPlanners, check_prefix
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.poses import Places, check_source
 from ddqn_planner.nodes.report import NO_REQUEST, NOT_ACTIVE, Outcome, Report, RequestError
@@ -80,7 +82,14 @@ class PlannerNode(ManagedNode):
         reentrant = ReentrantCallbackGroup()
         self.create_service(GetPlan, "~/get_plan", self._on_get_plan, callback_group=reentrant)
         self.create_trigger("~/reload_model", self._model.on_reload)
-        serve_nav2(self, lambda: self._refusal, self._plan_for_action, self._on_is_path_valid)
+        planning = Nav2Planning(
+            refusal=lambda: self._refusal,
+            plan=self._plan_for_action,
+            ask_other=self._ask_other_planner,
+            is_ours=lambda planner_id: planner_id in ("", self._settings.planner_id),
+            on_is_path_valid=self._on_is_path_valid,
+        )
+        serve_nav2(self, planning, self._settings.other_planners)
 
     def activate(self) -> None:
         """Answer requests from now on."""
@@ -131,6 +140,7 @@ class PlannerNode(ManagedNode):
         """Check new values as `BaseNode` does, whether TF can be used, and load a new model."""
         super().check_parameters(new)
         check_source("start_source", new.get("start_source", ""), "'initialpose' or 'odometry'")
+        check_prefix(self, new.get("other_planners", ""))
         if "model" in new and hasattr(self, "_settings"):  # a worker loads the first one
             self._candidate = read_model(new["model"])
 
@@ -207,10 +217,15 @@ class PlannerNode(ManagedNode):
             self._plan_publisher.publish(*_paths(outcome, path_bytes))
         self._display.show(outcome)
 
-    async def _plan_for_action(
-        self, start: PoseStamped | None, goals: list[PoseStamped], name: str, given_up: GivenUp
-    ) -> tuple[Path, Outcome]:
-        planning = self._requests.plan(start, goals, None, name, self._followed)
+    async def _plan_for_action(self, task: Task, given_up: GivenUp) -> tuple[Path, Outcome]:
+        start, goals, planner_id, has_via_points = task
+        planning = self._requests.plan(
+            start,
+            goals,
+            planner_id=planner_id,
+            followed=self._followed,
+            has_via_points=has_via_points,
+        )
         outcome = await self._answer(goals, planning, given_up)
         to_publish, path = _paths(outcome, path_bytes, path_message)
         if len(outcome.plan.path):
@@ -220,6 +235,29 @@ class PlannerNode(ManagedNode):
             self._plan_publisher.publish(to_publish)
         self._report.log(outcome)
         return path, outcome
+
+    async def _ask_other_planner(
+        self, others: OtherPlanners, handle: Any, given_up: GivenUp, is_kept: Callable[[], bool]
+    ) -> Any:
+        """Return another planner's answer to a goal, or the outcome if there is none."""
+        goal = handle.request
+        self._answering += 1
+        try:
+            answer = await others.ask(
+                goal.planner_id,
+                goal,
+                handle.goal_id,
+                given_up=lambda: self._refusal or given_up(),
+                is_kept=is_kept,
+            )
+        except Exception as error:  # the node must survive
+            answer = Outcome("FAILED", f"the other planner could not be asked ({error!r})")
+        finally:
+            self._answering -= 1
+        if isinstance(answer, Outcome):
+            self._report.note(answer)
+            self._report.log(answer)
+        return answer
 
     def _improve_later(self, outcome: Outcome) -> None:
         """Look for the least path of a body, unless it would not be worth a switch."""

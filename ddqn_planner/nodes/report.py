@@ -24,6 +24,7 @@ PATIENCE = 1.0  # seconds within which a new listener hears a first map, odometr
 PERIOD = 0.9  # seconds until diagnostics are due when nothing changes: at the next look
 
 TOLERANCE = ", or a greater tolerance"  # does not help with several goals: none of them moves
+ALL_GOALS = -1  # as in ComputePathThroughPoses
 REMEDIES = {
     PlanStatus.START_OUTSIDE_MAP: "set the start on the map",
     PlanStatus.GOAL_OUTSIDE_MAP: "set the goal on the map",
@@ -56,6 +57,7 @@ class Outcome:
     map_header: Header | None = None  # of the map that it was planned on
     is_dense: bool = False  # whether its path has a pose at least every cell
     header: Header = field(default_factory=Header)  # of its path
+    last_reached: int = ALL_GOALS  # of several goals, the index of the one where the path ends
 
 
 NO_REQUEST = Outcome("NO_REQUEST", "no plan was asked for yet")

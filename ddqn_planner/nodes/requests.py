@@ -24,7 +24,15 @@ from ddqn_planner.model.certificate import NO_CERTIFICATE
 from ddqn_planner.nodes.conversions import cell_from_pose, pose_of, turns
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.poses import Places
-from ddqn_planner.nodes.report import Outcome, Report, Request, RequestError, reached, reason_of
+from ddqn_planner.nodes.report import (
+    ALL_GOALS,
+    Outcome,
+    Report,
+    Request,
+    RequestError,
+    reached,
+    reason_of,
+)
 from ddqn_planner.nodes.runtime import BaseNode, Worker
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus
 from ddqn_planner.planning.field import shift_between
@@ -35,6 +43,7 @@ from ddqn_planner.warm_up import warm_up
 
 HEADING = 2 * math.pi / HEADINGS  # radians that a robot turns until that is a reason to plan
 REST_AFTER = 1.0  # seconds until the rest is compiled: what waits for the model is planned first
+THE_GOAL = "the goal"  # what errors call one
 UNCHANGED = Outcome("UNCHANGED", "the active goal needs no new plan")
 
 T = TypeVar("T")
@@ -224,13 +233,14 @@ class Requests:
         planner_id: str = "",
         followed: Outcome | None = None,
         active: ActiveGoal | None = None,
+        has_via_points: bool = False,
     ) -> Outcome:
         """Plan from a start or where the robot is, through all goals; to one if they are active."""
         # As they are now, like the map and the model, whatever changes while it waits.
         settings, several = self.settings, len(goals) > 1
         check_request(goals, planner_id, settings.planner_id)
         header, grid, planner = await self._inputs()
-        names = [f"goal {n}" for n in range(1, len(goals) + 1)] if several else ["the goal"]
+        names = _names(len(goals), has_via_points)
         in_map = partial(self._in_map, grid, header.frame_id)
         ends = [await in_map(*named) for named in zip(names, goals, strict=True)]
         start = start or await self._wait_for(self.places.start)
@@ -282,10 +292,27 @@ class Requests:
         plan, number = joined(plans) if more else plans[0], len(plans)
         before, goal = poses[number - 1], poses[number + reached(request, plan)]
         reason = reason_of(request, plan, before, goal, settings.robot_radius)
+        last_reached = ALL_GOALS
         if more and not len(plan.path):
-            reason = f"goal {number} of {len(goals)}: {reason}"
-        is_dense = settings.path_simplification == "straight"
-        return Outcome(plan.status.name, reason, planner, request, plan, goal, header, is_dense)
+            missed = names[number - 1]
+            if missed != THE_GOAL:
+                missed += f" of {len(goals) - has_via_points}"
+            reason = f"{missed}: {reason}"
+            if settings.allow_partial_planning and number > 1 and not has_via_points:
+                plan, goal = joined(plans[:-1]), poses[number - 1]
+                reason = f"a partial path of {plan.length:.2f} cells, {reason}"
+                last_reached = number - 2
+        return Outcome(
+            plan.status.name,
+            reason,
+            planner,
+            request,
+            plan,
+            goal,
+            map_header=header,
+            is_dense=settings.path_simplification == "straight",
+            last_reached=last_reached,
+        )
 
     async def improve(self, outcome: Any) -> Outcome:
         """Return the outcome of a request for poses with a path of the least cost."""
@@ -362,6 +389,13 @@ class Requests:
                     raise
             self.look_soon()
             await self.next_look
+
+
+def _names(count: int, has_via_points: bool) -> list[str]:
+    """Return what errors call the goals of a request."""
+    if has_via_points:
+        return [*(f"via-point {n}" for n in range(1, count)), THE_GOAL]
+    return [f"goal {n}" for n in range(1, count + 1)] if count > 1 else [THE_GOAL]
 
 
 def check_request(goals: list[PoseStamped], planner_id: str, known_id: str) -> None:

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable, Coroutine, Iterator
+from dataclasses import replace
 from functools import partialmethod
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,10 +21,12 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.task import Future
 from rclpy.utilities import try_shutdown
+from std_msgs.msg import Header
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes import nav2
-from ddqn_planner.nodes.nav2 import PREEMPTED, GivenUp, PathAction, error_code
+from ddqn_planner.nodes.nav2 import PREEMPTED, PathAction, Task, error_code, poses_of
+from ddqn_planner.nodes.other_planners import GivenUp
 from ddqn_planner.nodes.planner_node import PlannerNode
 from ddqn_planner.nodes.report import NOT_ACTIVE, Outcome, RequestError
 from ddqn_planner.nodes.requests import check_request
@@ -107,18 +110,34 @@ class Handle:
     canceled = partialmethod(_end, "canceled", "canceling")
 
 
+class ToPose:
+    """The action of Jazzy, whose messages have these fields."""
+
+    Result = Result
+
+    class Goal:
+        goal = start = planner_id = use_start = None
+
+
+class ThroughPoses:
+    Result = Result
+
+    class Goal:
+        goals = start = planner_id = use_start = None
+
+
 class Server:
     """An action whose plans are there when the test says so."""
 
-    def __init__(self) -> None:
+    def __init__(self, kind: Any = ToPose, **options: Any) -> None:
         self.asked: list[tuple[Any, Any]] = []
+        self.tasks: list[Task] = []
         self.planned, self.refusal = Future(), None
-        self.action = PathAction(Result, lambda: self.refusal, self.plan)
+        self.action = PathAction(kind, lambda: self.refusal, self.plan, **options)
 
-    async def plan(
-        self, start: PoseStamped | None, goals: list[PoseStamped], name: str, given_up: GivenUp
-    ) -> tuple[PathMessage, Outcome]:
-        self.asked.append((start, goals))
+    async def plan(self, task: Task, given_up: GivenUp) -> tuple[PathMessage, Outcome]:
+        self.asked.append((task.start, task.goals))
+        self.tasks.append(task)
 
         async def planning() -> Any:
             return await self.planned
@@ -144,11 +163,13 @@ def end(execution: Coroutine[Any, Any, Any]) -> Any:
     ("outcome", "state", "code"), [(FOUND, "succeeded", 0), (NO_PATH, "aborted", 308)]
 )
 def test_a_goal_ends_with_the_outcome_of_its_plan(outcome: Outcome, state: str, code: int) -> None:
-    server, first, second = Server(), Handle(use_start=False), Handle(goals=3)
-    server.begin(first).close()
+    first, second = Handle(use_start=False), Handle(goals=3)
+    one, server = Server(), Server(ThroughPoses)
+    one.begin(first).close()
     execution = server.begin(second)
     request = second.request
-    assert server.asked == [(None, [first.request.goal]), (request.start, request.goals)]
+    assert one.asked == [(None, [first.request.goal])]
+    assert server.asked == [(request.start, request.goals)]
     server.planned.set_result(outcome)
     result = end(execution)
     assert (second.state, result.error_code) == (state, code)
@@ -180,6 +201,140 @@ def test_a_goal_is_canceled_before_it_is_planned_meanwhile_or_once_it_is_preempt
         assert (handle.state, result.error_code, result.error_msg) == ("canceled", 0, "")
 
 
+class Goals(SimpleNamespace):
+    """What a nav_msgs/msg/Goals has."""
+
+
+class LyricalToPose:
+    """The action of Lyrical, whose messages have these fields."""
+
+    Result = Result
+
+    class Goal:
+        goal = start = viapoints = planner_id = use_start = None
+
+
+class LyricalThroughPoses:
+    class Goal:
+        goals = start = planner_id = use_start = None
+
+    class Result(Result):
+        last_reached_index = -1
+
+
+def test_goals_without_a_frame_have_that_of_their_list() -> None:
+    own, none = PoseStamped(), PoseStamped()
+    own.header.frame_id, own.header.stamp.sec = "odom", 3
+    none.header.stamp.sec = 4  # of no use without a frame
+    none.pose.position.x = 7.0
+    header = Header(frame_id="map")
+    server, handle = Server(LyricalThroughPoses), Handle(goals=0)
+    handle.request.goals = Goals(header=header, goals=[own, none])
+    server.begin(handle).close()
+    ((_, goals),) = server.asked
+    assert goals == [own, PoseStamped(header=header, pose=none.pose)]
+    assert poses_of(Goals(header=header, goals=[])) == []
+
+
+def test_a_path_leads_through_via_points_to_its_goal() -> None:
+    server, handle = Server(LyricalToPose), Handle()
+    points = [PoseStamped(), PoseStamped()]
+    points[1].pose.position.x = 5.0
+    handle.request.viapoints = points
+    server.begin(handle).close()
+    handle.request.viapoints = []
+    server.begin(handle).close()
+    goal = handle.request.goal
+    assert [goals for _, goals in server.asked] == [[*points, goal], [goal]]
+    assert [task.has_via_points for task in server.tasks] == [True, False]
+
+
+@pytest.mark.parametrize("kind", [ThroughPoses, LyricalThroughPoses])
+def test_a_partial_path_says_which_goal_it_reaches_if_the_message_can(kind: Any) -> None:
+    partial_path = replace(FOUND, reason="goal 3 of 4: no path", last_reached=1)
+    for outcome, last_reached, error_msg in (
+        (partial_path, 1, "goal 3 of 4: no path"),
+        (FOUND, -1, ""),
+        (NO_PATH, -1, "no path leads there"),
+    ):
+        server, handle = Server(kind), Handle(goals=4)
+        execution = server.begin(handle)
+        server.planned.set_result(outcome)
+        result = end(execution)
+        expected = last_reached if kind is LyricalThroughPoses else "missing"
+        assert getattr(result, "last_reached_index", "missing") == expected
+        assert result.error_msg == error_msg
+        assert handle.state == ("aborted" if outcome is NO_PATH else "succeeded")
+
+
+def test_a_result_of_the_first_releases_has_no_message() -> None:
+    class Old:
+        Goal = ToPose.Goal
+
+        class Result(SimpleNamespace):
+            UNKNOWN, NO_VALID_PATH = 200, 208
+
+    server, handle = Server(Old), Handle()
+    execution = server.begin(handle)
+    server.planned.set_result(NO_PATH)
+    result = end(execution)
+    assert result.error_code == 208
+    assert not hasattr(result, "error_msg")
+
+
+class Other:
+    """Another planner, which answers when the test says so."""
+
+    def __init__(self) -> None:
+        self.answer, self.is_kept = Future(), bool
+
+    async def ask(self, handle: Any, given_up: GivenUp, is_kept: Any) -> Any:
+        self.is_kept = is_kept
+
+        async def answering() -> Any:
+            return await self.answer
+
+        return await unless(answering(), given_up)
+
+
+@pytest.mark.parametrize(
+    ("status", "state"), [(4, "succeeded"), (5, "aborted"), (6, "aborted"), (None, "aborted")]
+)
+def test_the_answer_of_another_planner_is_returned_as_it_is(status: Any, state: str) -> None:
+    other, handle, ours = Other(), Handle(), Handle()
+    server = Server(ask_other=other.ask, is_ours=lambda name: name in ("", "ddqn"))
+    handle.request.planner_id, ours.request.planner_id = "GridBased", "ddqn"
+    server.begin(ours).close()
+    execution = server.begin(handle)
+    assert len(server.asked) == 1
+    content = Result()
+    lost = Outcome("PLANNER_LOST", "it ended")
+    other.answer.set_result(
+        lost if status is None else SimpleNamespace(status=status, result=content)
+    )
+    result = end(execution)
+    assert handle.state == state
+    if status is None:
+        assert (result.error_code, result.error_msg) == (300, "it ended")
+        assert result.path == PathMessage()
+    else:
+        assert result is content
+
+
+def test_a_newer_goal_preempts_that_of_another_planner_there_or_here() -> None:
+    for planner_id, is_kept in (("Smac", True), ("", False)):
+        other, first, second = Other(), Handle(), Handle()
+        server = Server(ask_other=other.ask, is_ours=lambda name: not name)
+        first.request.planner_id, second.request.planner_id = "GridBased", planner_id
+        execution = server.begin(first)
+        assert not other.is_kept()
+        kept = other.is_kept
+        server.begin(second).close()
+        assert kept() == is_kept
+        assert end(execution).error_msg == PREEMPTED.reason
+        assert first.state == "aborted"
+
+
 def test_goals_are_rejected_while_the_node_is_not_active_and_aborted_when_it_stops() -> None:
     server, handle = Server(), Handle()
     execution = server.begin(handle)
@@ -190,14 +345,15 @@ def test_goals_are_rejected_while_the_node_is_not_active_and_aborted_when_it_sto
 
 
 def test_the_services_of_actions_have_queues_as_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    kind = SimpleNamespace(Result=Result)
+    kind = ToPose
     types = {"ComputePathThroughPoses": kind, "ComputePathToPose": kind, "IsPathValid": None}
     for module in ("nav2_msgs", "nav2_msgs.action", "nav2_msgs.srv"):
         monkeypatch.setitem(sys.modules, module, SimpleNamespace(**types))
     made: list[dict[str, Any]] = []
     monkeypatch.setattr(nav2, "ActionServer", lambda *_, **options: made.append(options))
     node = SimpleNamespace(create_service=lambda *given, **named: None)
-    nav2.serve_nav2(cast("Any", node), bool, cast("Any", None), print)
+    planning: Any = SimpleNamespace(refusal=bool, plan=None, is_ours=bool, on_is_path_valid=print)
+    nav2.serve_nav2(cast("Any", node), planning)
     services = [f"{which}_service_qos_profile" for which in ("goal", "cancel", "result")]
     depths = [options[service].depth for options in made for service in services]
     assert depths == 6 * [SERVICE_QUALITY.depth]
@@ -212,7 +368,7 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
         executor.add_node(node)
         values[3:8, 4:26] = 100
         grid = GridMap(values > 0)
-        ends = pose(grid, (0, 5)), pose(grid, (29, 5))
+        task = Task(pose(grid, (0, 5)), [pose(grid, (29, 5))], "")
 
         def run(task: Any) -> Any:
             future = executor.create_task(task)
@@ -225,8 +381,7 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
             costs = values.copy()
             costs[dear, 10:20] = 2
             node._map._take(map_message(costs, grid, next(NUMBERS)))
-            asked = ends[0], [ends[1]], "", lambda: None
-            path, outcome = run(node._plan_for_action(*asked))
+            path, outcome = run(node._plan_for_action(task, lambda: None))
             request, validity = SimpleNamespace(path=path), SimpleNamespace()
             assert run(node._on_is_path_valid(request, validity)).is_valid
             return max(stamped.pose.position.y for stamped in path.poses) > 8, outcome.reason
@@ -245,7 +400,7 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
         node.set_parameters([Parameter("switch_threshold", value=1.0)])
         for form, is_kept in (("straight", True), ("line_of_sight", True), ("none", False)):
             node.set_parameters([Parameter("path_simplification", value=form)])
-            _, outcome = run(node._plan_for_action(ends[0], [ends[1]], "", lambda: None))
+            _, outcome = run(node._plan_for_action(task, lambda: None))
             assert (outcome.plan.extra_cost is not None) == is_kept
 
         # A path that cannot be checked is not valid, and the node lives.

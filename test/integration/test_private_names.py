@@ -40,9 +40,11 @@ def defined(tree: ast.AST) -> Iterator[str]:
             yield attribute.attr
 
 
-def test_each_private_name_is_the_packages_own() -> None:
+def test_each_private_name_in_the_nodes_is_the_packages_own() -> None:
     own = {name for tree in trees(ROOT) for name in defined(tree) if is_private(name)}
-    used = {at.attr for tree in trees(ROOT) for at in attributes(tree) if is_private(at.attr)}
+    used = {
+        at.attr for tree in trees(ROOT / "nodes") for at in attributes(tree) if is_private(at.attr)
+    }
     assert used
     assert used <= own | OF_NAMED_TUPLES
 
