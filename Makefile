@@ -1,16 +1,11 @@
 # make setup | demo | demo-driving | demo-training | test | test-fast | experiments-test | docs | lint | format | types | bench | body | faults | fuzz | load | soak | model | model-dilemma | robots
 PYTHON ?= python3
+# What pip is asked for. PyPI's builds for Linux bring CUDA. The CPU build alone:
+# make setup TORCH="torch==2.13.0 --index-url https://download.pytorch.org/whl/cpu"
 TORCH ?= torch==2.13.0
 VENV := .venv
 BIN := $(VENV)/bin
-
-# With a sourced ROS 2 Jazzy its rclpy is used, else the wheels from PyPI.
-ifeq ($(ROS_DISTRO),jazzy)
-VENV_FLAGS := --system-site-packages
-EXTRAS := bags,experiments,figures,test,train,watch
-else
-EXTRAS := bags,experiments,figures,ros,test,train,watch
-endif
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 .PHONY: setup demo demo-driving demo-training test test-fast experiments-test docs lint format types bench body faults fuzz load soak model model-dilemma robots
 .DEFAULT_GOAL := help
@@ -19,24 +14,43 @@ endif
 help:
 	@sed -n '1s/# //p' Makefile
 
-setup: $(VENV)/installed
+# The environment grows in stages, each a file in it: a demo does not wait for torch.
+setup: $(VENV)/full
+
+# To plan and to draw. A sourced ROS 2 is used, else Jazzy's wheels from PyPI.
+$(VENV)/base: setup.py tools/environment.py
+	@extras=$$($(PYTHON) tools/environment.py $(VENV)) && \
+		echo "installing $$extras into $(VENV); a new one downloads about 190 MB" && \
+		$(INSTALL) --editable ".[$$extras]"
+	@touch $@
 
 # torch by itself, so that what it names is what is installed.
-$(VENV)/installed: setup.py Makefile
-	$(PYTHON) -m venv $(VENV_FLAGS) $(VENV)
-	$(BIN)/pip install --quiet "setuptools>=64" "$(TORCH)"
-	$(BIN)/pip install --quiet --editable ".[$(EXTRAS)]"
-	touch $@
+$(VENV)/train: $(VENV)/base Makefile
+	@echo "installing $(TORCH), for training"
+	@$(INSTALL) $(TORCH)
+	@$(INSTALL) --editable ".[train]"
+	@touch $@
 
-demo: setup
+# With setuptools for the tests that build the package.
+$(VENV)/full: $(VENV)/train
+	@echo "installing what tests and experiments need"
+	@$(INSTALL) "setuptools>=64" --editable ".[bags,experiments,test,watch]"
+	@touch $@
+
+$(VENV)/docs $(VENV)/bench: $(VENV)/full
+	@echo "installing what $(@F) needs"
+	@$(INSTALL) --editable ".[$(@F)]"
+	@touch $@
+
+demo: $(VENV)/base
 	$(BIN)/python examples/demo.py
 
 # A robot learns by driving where it is slow: a film, a picture and a curve.
-demo-driving: setup
+demo-driving: $(VENV)/base
 	$(BIN)/python examples/demo_driving.py $(MISSIONS)
 
 # A robot learns to leave the dead end of the paper's map: a film.
-demo-training: setup
+demo-training: $(VENV)/train
 	$(BIN)/python examples/demo_training.py $(STEPS)
 
 # One process more than cores, as nodes wait, but four at most; each has a ROS domain of its own.
@@ -44,7 +58,7 @@ PROCESSES := $(shell cores=$$(nproc); echo $$((cores < 4 ? cores + 1 : 4)))
 PYTEST := $(BIN)/python -m pytest --numprocesses $(PROCESSES) --dist loadfile --no-loadscope-reorder
 
 # Compiled before, by two processes at once: each process of the tests would compile it all.
-$(VENV)/compiled: $(VENV)/installed $(wildcard ddqn_planner/*.py ddqn_planner/*/*.py)
+$(VENV)/compiled: $(VENV)/full $(wildcard ddqn_planner/*.py ddqn_planner/*/*.py)
 	$(BIN)/ddqn-planner warm-up & first=$$!; $(BIN)/ddqn-planner warm-up differential_robot && wait $$first
 	touch $@
 
@@ -60,8 +74,7 @@ experiments-test: $(VENV)/compiled
 	$(PYTEST) --dist worksteal experiments/tests
 
 # The site, in docs/_build/html; a warning is an error.
-docs: setup
-	$(BIN)/pip install --quiet --editable ".[$(EXTRAS),docs]"
+docs: $(VENV)/docs
 	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --fresh-env docs docs/_build/html
 
 lint: setup
@@ -75,8 +88,7 @@ format: setup
 types: setup
 	$(BIN)/mypy
 
-bench: setup
-	$(BIN)/pip install --quiet --editable ".[$(EXTRAS),bench]"
+bench: $(VENV)/bench
 	$(BIN)/python experiments/speed.py; missed=$$?; $(BIN)/python experiments/node_speed.py $(MAP) && exit $$missed
 
 # What a robot's body costs, on MAP (the office by default) and with RADIUS, metres.
@@ -99,17 +111,17 @@ soak: setup
 	$(BIN)/python experiments/soak.py $(MINUTES)
 
 # These train the shipped models from nothing: the one for any map, and the paper's network.
-model: setup
+model: $(VENV)/train
 	$(BIN)/ddqn-planner train-any-map --seed 0 --out runs/any_map
 	cp runs/any_map/model.safetensors models/any_map.safetensors
 
-model-dilemma: setup
+model-dilemma: $(VENV)/train
 	$(BIN)/ddqn-planner train dilemma --learning-rate 0.001 --seed 1 --out runs/dilemma
 	cp runs/dilemma/model.safetensors models/dilemma.safetensors
 
 ROBOT := $(BIN)/ddqn-planner train-robot --resolution 0.05 --seed 0
 
-robots: setup
+robots: $(VENV)/train
 	$(ROBOT) --motion differential --out models/differential_robot.safetensors \
 		--footprint '[[0.45, 0.3], [-0.45, 0.3], [-0.45, -0.3], [0.45, -0.3]]'
 	$(ROBOT) --motion ackermann --turning-radius 0.8 --out models/car.safetensors \
