@@ -63,7 +63,8 @@ MOVED_AWAY = [
     *(f"{action}/_action/{part}" for action in ACTIONS for part in ACTION_PARTS),
     "is_path_valid",
 ]
-OUT_OF_THE_WAY = [(name, f"planner_server/{name}") for name in MOVED_AWAY]
+MOVED_TO = "planner_server"
+OUT_OF_THE_WAY = [(name, f"{MOVED_TO}/{name}") for name in MOVED_AWAY]
 
 # Nav2's nodes in the order in which they are activated: package, executable, name, remaps.
 # planner_server runs the global costmap. bt_navigator needs the actions of the planner.
@@ -88,6 +89,7 @@ PLANNER_DEFAULTS = {
     "map_type": "costmap",
     "allow_unknown": True,  # as NavFn's default
     "start_source": "tf",  # for requests without a start
+    "other_planners": MOVED_TO,  # there Nav2's planners answer, by their own names
 }
 PLANNER_REMAPS = [
     ("map", "global_costmap/costmap"),

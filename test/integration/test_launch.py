@@ -113,6 +113,7 @@ def test_the_planner_takes_the_place_of_planner_servers_actions(workspace: Works
         "allow_unknown": True,
         "start_source": "tf",
         "robot_frame": "base_footprint",
+        "other_planners": "planner_server",
     }
 
 
