@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
-from itertools import accumulate
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -31,6 +30,8 @@ REPAIRED_SHARE = 0.02  # of the map's cells that a repair may take back
 CHANGED_SHARE = 0.02  # of the map's cells may have changed: with more, a new field is cheaper
 CACHE_BYTES = 2**23  # for a planner's Q fields: 3 of 500 x 500 cells, at 9 bytes per cell
 ALWAYS_KEPT = 3  # fields, whatever their size: to and fro, or the three of `Exploration`
+MOST_KEPT = 64  # fields, however small: a request's map is compared with that of each
+OBJECTS = 4_000  # bytes of a field, its costs and its map beside their arrays
 SAME_PLACE = 0.01  # cells that a shift may be off whole ones: messages' resolution is float32
 
 
@@ -51,6 +52,8 @@ class QField:
 
     grid: GridMap  # the last one with such cells, of a field that a planner keeps
     costs: MoveCosts | None = None
+    # The number and the bytes of arrays of its map and its costs, which others may keep, too.
+    shared: Sequence[tuple[int, int]] = ()
 
     def __init__(
         self,
@@ -85,8 +88,9 @@ class QField:
     @property
     def nbytes(self) -> int:
         """Memory of its arrays, with those that were asked for, bytes."""
-        known = vars(self).copy().values()  # other threads add to it
-        return sum(array.nbytes for array in known if isinstance(array, np.ndarray))
+        state = vars(self)  # to which other threads add
+        arrays = [state[name] for name in ("q", "legal", "value", "policy") if name in state]
+        return sum(_owner(array).nbytes for array in arrays)
 
     def unmasked(self) -> QField:
         """Return the field without action masking: a rollout is trapped by an illegal move."""
@@ -246,7 +250,9 @@ class DistanceField(QField):
     @property
     def nbytes(self) -> int:
         """Memory, bytes: 9 per cell for what is known, and that of its arrays."""
-        return 9 * self.costs.patch.size + super().nbytes
+        known: Known | None = vars(self).get("known")  # None while another thread computes it
+        opened = 0 if known is None else known.opened.nbytes
+        return 9 * self.costs.patch.size + opened + super().nbytes
 
 
 def _is_final(known: Known, number: int) -> bool:
@@ -335,6 +341,10 @@ class FieldCache:
         # may at worst forget what another has just kept.
         self._kept: list[QField] = []
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy has, also in another process: no fields."""
+        return {**vars(self), "_kept": []}
+
     def _of_rule(self, rule: MoveRule) -> list[DistanceField]:
         """Return the fields of distances that are kept for a move rule, used last first."""
         fields = [field for field in self._kept[::-1] if isinstance(field, DistanceField)]
@@ -345,6 +355,7 @@ class FieldCache:
         for field in self._kept:
             if field.goals == goals and field.move_rule is rule and grid.same_cells(field.grid):
                 field.grid = grid  # it may lie elsewhere
+                field.shared = _shared_arrays(field)
                 self._kept = [*(other for other in self._kept if other is not field), field]
                 return field
         return None
@@ -377,11 +388,46 @@ class FieldCache:
             field.grid = grid
         else:
             field = DistanceField(goals, grid, costs, rule)
-            older = (old for old in self._of_rule(rule) if old.goals == goals)
-            # The place will hardly be again what it was.
-            replaced = next((old for old in older if field.take_over(old, start)), None)
+            older = [old for old in self._of_rule(rule) if old.goals == goals]
+            # The place will hardly be again what it was. If the last ones are of other maps, so
+            # are those before them: with new expected times all are.
+            for old in older[:ALWAYS_KEPT]:
+                if field.take_over(old, start):
+                    replaced = old
+                    break
+        field.shared = _shared_arrays(field)
         kept = [*(other for other in self._kept if other is not replaced), field]
-        sizes = [each.nbytes + (each.costs.patch.nbytes if each.costs else 0) for each in kept]
-        number = sum(size <= self.nbytes for size in accumulate(reversed(sizes)))
-        self._kept = kept[-max(number, ALWAYS_KEPT) :]
+        self._kept = kept[-self._most(kept) :]
         return field
+
+    def _most(self, kept: list[QField]) -> int:
+        """Return how many of some fields may be kept, those at the end."""
+        held, counted = 0, set[int]()
+        for number, field in enumerate(reversed(kept)):
+            held += OBJECTS + field.nbytes
+            for array, size in field.shared:
+                if array not in counted:
+                    counted.add(array)
+                    held += size
+            if number >= ALWAYS_KEPT and (held > self.nbytes or number >= MOST_KEPT):
+                return number
+        return len(kept)
+
+
+def _shared_arrays(field: QField) -> list[tuple[int, int]]:
+    """Return what `QField.shared` holds."""
+    maps, hopes = [field.grid], field.grid.exploration
+    if hopes is not None:
+        maps += [hopes.bold, hopes.safe]
+    values: list[Any] = [*(field.costs or ())]
+    for grid in maps:
+        values += vars(grid).copy().values()  # other threads add to it
+    arrays = [_owner(value) for value in values if isinstance(value, np.ndarray)]
+    return [(id(array), array.nbytes) for array in arrays]
+
+
+def _owner(array: NDArray[Any]) -> NDArray[Any]:
+    """Return the array whose memory another one, a view, is of."""
+    while isinstance(array.base, np.ndarray):
+        array = array.base
+    return array

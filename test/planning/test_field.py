@@ -1,9 +1,11 @@
 import copy
 import sys
-from collections.abc import Callable
+import tracemalloc
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
+from itertools import islice
 from types import FrameType
 from typing import Any
 
@@ -417,3 +419,96 @@ def test_threads_ask_a_field_for_what_others_compute() -> None:
 
     with ThreadPoolExecutor(4) as threads:
         assert all(threads.map(ask, range(4)))
+
+
+def new_maps(side: int, kind: str) -> Iterator[GridMap]:
+    """Maps of a side: each with other obstacles, other expected times, or one more patch."""
+    random = np.random.default_rng(0)
+    grid = GridMap(random.random((side, side)) < 0.1, cost=random.integers(0, 100, (side, side)))
+    grid = grid.with_patch([[False]], 0, 0).with_patch([[False]], side - 1, side - 1)
+    while True:
+        if kind == "maps":
+            occupancy = random.random((side, side)) < 0.1
+            occupancy[0, 0] = occupancy[-1, -1] = False
+            grid = GridMap(occupancy)
+        elif kind == "times":
+            slowness = random.uniform(1, 4, (side, side)).astype(np.float32)
+            grid = grid.with_layers(slowness=slowness, seconds_per_cell=0.1)
+        else:
+            x, y = random.integers(1, side - 1, 2).tolist()
+            grid = grid.with_patch([[not grid.occupancy[y, x]]], x, y)
+        yield grid
+
+
+KINDS = pytest.mark.parametrize("kind", ["maps", "times", "patches"])
+
+
+@KINDS
+@pytest.mark.parametrize("side", [20, 40])
+def test_what_is_kept_takes_no_more_memory_than_the_bound(kind: str, side: int) -> None:
+    # Also what fields keep alive: their costs, and their maps with all layers.
+    planner, corner = new_planner(), (side - 1, side - 1)
+    planner.fields.nbytes = 500_000
+    maps = new_maps(side, kind)
+    for grid in islice(maps, 3):
+        planner.plan(grid, (0, 0), corner)
+    number = 0
+    tracemalloc.start()
+    try:
+        for grid in islice(maps, 80):
+            free = grid.free_cells()
+            planner.plan(grid, (0, 0), free[-number % len(free)])
+            number += 1
+        taken = tracemalloc.get_traced_memory()[0]
+        number = len(planner.fields._kept)
+        planner.fields._kept.clear()
+        freed = taken - tracemalloc.get_traced_memory()[0]
+    finally:
+        tracemalloc.stop()
+    assert 3 < number <= fields.MOST_KEPT
+    assert freed < 1.1 * planner.fields.nbytes
+    # And it is made use of.
+    assert number == fields.MOST_KEPT or freed > 0.5 * planner.fields.nbytes
+
+
+@KINDS
+def test_a_request_on_a_new_map_looks_at_a_bounded_number_of_others(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compared = repaired = 0
+    same_cells, take_over = GridMap.same_cells, DistanceField.take_over
+
+    def counted(self: GridMap, other: GridMap) -> bool:
+        nonlocal compared
+        compared += 1
+        return same_cells(self, other)
+
+    def tried(self: DistanceField, *arguments: Any) -> bool:
+        nonlocal repaired
+        repaired += 1
+        return take_over(self, *arguments)
+
+    planner, most = new_planner(), fields.MOST_KEPT
+    monkeypatch.setattr(GridMap, "same_cells", counted)
+    monkeypatch.setattr(DistanceField, "take_over", tried)
+    for grid in islice(new_maps(8, kind), 2 * most):
+        compared = repaired = 0
+        planner.plan(grid, (7, 7), (0, 0))
+        # Of fields toward one goal, and of all for costs.
+        assert compared <= 3 * most
+        assert repaired <= fields.ALWAYS_KEPT
+    assert len(planner.fields._kept) <= most
+
+
+def test_arrays_that_fields_share_count_once() -> None:
+    side = 50
+    planner, grid = new_planner(), GridMap(np.zeros((side, side)))
+    planner.fields.nbytes = 16 * 9 * (side + 2) ** 2 + 16 * fields.OBJECTS
+    for goal in grid.free_cells()[:30]:
+        planner.q_field(grid, goal)
+    # One map and one set of costs; by themselves they would count as much as 4 of the fields.
+    assert 14 <= len(planner.fields._kept) <= 16
+    whole = planner.q_field(grid, (0, 0))
+    before = whole.nbytes
+    assert whole.q.base is not None
+    assert whole.nbytes == before + 8 * 4 * (side + 2) ** 2  # with the border

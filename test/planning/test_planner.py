@@ -22,7 +22,7 @@ from ddqn_planner.grid import Cell, legal_moves, path_length, shortest_distances
 from ddqn_planner.grid.grid_map import Exploration
 from ddqn_planner.model import AnyMapQNetwork, ModelMetadata
 from ddqn_planner.planning import PlanMethod, Planner, PlanRequest, PlanStatus, QField, simplify
-from ddqn_planner.planning.field import DistanceField
+from ddqn_planner.planning.field import OBJECTS, DistanceField
 from ddqn_planner.planning.plan import ROUNDING
 from ddqn_planner.planning.planner import last_step
 from ddqn_planner.planning.segments import cost_along
@@ -193,7 +193,8 @@ def test_the_memory_for_fields_is_bounded_and_those_used_last_are_kept() -> None
     field = planner.q_field(grid, first)
     arrays = field.q, field.legal, field.value, field.policy
     assert field.nbytes == sum(array.nbytes for array in arrays)
-    planner.fields.nbytes = 4 * field.nbytes
+    # And what they share: the map.
+    planner.fields.nbytes = 4 * (field.nbytes + OBJECTS) + grid.occupancy.nbytes
     for goal in goals:
         planner.q_field(grid, goal)
         planner.q_field(grid, first)
