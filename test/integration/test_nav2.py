@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import nav_msgs.msg
 import numpy as np
 import pytest
 import rclpy
@@ -413,6 +414,72 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
         try_shutdown()
 
 
+def test_a_path_leads_through_its_goals_in_order_or_as_far_as_it_can() -> None:
+    """The node is asked as its actions ask it, which need nav2_msgs."""
+    rclpy.init()
+    node, executor, values = PlannerNode(), SingleThreadedExecutor(), np.zeros((10, 20), np.int8)
+    try:
+        executor.add_node(node)
+        values[:, 12] = 100  # no path leads to the right part
+        grid = GridMap(values > 0)
+        start, low, high, left, cut_off, blocked = (
+            pose(grid, cell) for cell in ((0, 0), (9, 1), (9, 8), (1, 8), (15, 5), (12, 5))
+        )
+
+        def plan(*goals: PoseStamped, via: bool = False) -> tuple[PathMessage, Outcome]:
+            node._map._take(map_message(values, grid, next(NUMBERS)))
+            task = Task(start, [*goals], "", via)
+            future = executor.create_task(node._plan_for_action(task, lambda: None))
+            executor.spin_until_future_complete(future, 60)
+            path, outcome = future.result()
+            return path, outcome
+
+        def visited(path: PathMessage, *goals: PoseStamped) -> list[int]:
+            points = np.array(points_of(path))
+            places = [(goal.pose.position.x, goal.pose.position.y) for goal in goals]
+            gaps = [np.hypot(*(points - place).T) for place in places]
+            assert all(gap.min() < 0.01 for gap in gaps)
+            return [int(gap.argmin()) for gap in gaps]
+
+        whole, outcome = plan(high, low, left)
+        order = visited(whole, start, high, low, left)
+        assert (sorted(order), order[-1]) == (order, len(whole.poses) - 1)
+        assert (outcome.status, outcome.last_reached) == ("SUCCEEDED", -1)
+        through, outcome = plan(high, low, left, via=True)
+        assert points_of(through) == points_of(whole)
+
+        # Where one pose has no path, there is none, or a partial one.
+        for is_allowed in (False, True):
+            node.set_parameters([Parameter("allow_partial_planning", value=is_allowed)])
+            for goals, reached, reason in (
+                ((high, low, cut_off, left), 1, "goal 3 of 4: no path leads"),
+                ((high, blocked), 0, "goal 2 of 2: the goal is occupied"),
+                ((cut_off, low), None, "goal 1 of 2: no path leads"),
+            ):
+                path, outcome = plan(*goals)
+                assert reason in outcome.reason
+                if not is_allowed or reached is None:
+                    assert (path.poses, outcome.last_reached) == ([], -1)
+                    assert outcome.status in ("NO_PATH", "GOAL_OCCUPIED")
+                    continue
+                assert (outcome.status, outcome.last_reached) == ("SUCCEEDED", reached)
+                order = visited(path, start, *goals[: reached + 1])
+                assert (sorted(order), order[-1]) == (order, len(path.poses) - 1)
+            # Via-points and the one goal are one path, whole or none.
+            for goals, reason in (
+                ((high, blocked, left), "via-point 2 of 2: the goal is occupied"),
+                ((high, low, cut_off), "the goal: no path leads from the start to the goal"),
+            ):
+                path, outcome = plan(*goals, via=True)
+                assert path.poses == []
+                assert outcome.reason.startswith(reason)
+            path, outcome = plan(cut_off)
+            assert (path.poses, outcome.last_reached) == ([], -1)
+    finally:
+        node.destroy_node()
+        try_shutdown()
+
+
 REASON = "nav2_msgs is not on PyPI"
 
 SUCCEEDED, CANCELED, ABORTED = 4, 5, 6  # states of action_msgs/msg/GoalStatus
@@ -443,7 +510,10 @@ class Navigator:
 
     def send(self, goal: PoseStamped | list[PoseStamped], **fields: Any) -> Any:
         if isinstance(goal, list):
-            request = self.actions.ComputePathThroughPoses.Goal(goals=goal, **fields)
+            kind = self.actions.ComputePathThroughPoses.Goal
+            is_list = kind.get_fields_and_field_types()["goals"] == "nav_msgs/Goals"
+            goals = nav_msgs.msg.Goals(goals=goal) if is_list else goal
+            request = kind(goals=goals, **fields)
             return done(self.ask(self.poses.send_goal_async, request))
         request = self.actions.ComputePathToPose.Goal(goal=goal, **fields)
         return done(self.ask(self.pose.send_goal_async, request))
@@ -498,6 +568,31 @@ def test_a_path_through_poses(navigator: Navigator) -> None:
     cells = [robot.grid.world_to_cell(*point) for point in points_of(path)]
     assert (cells[0], cells[-1]) == (START, GOAL)
     assert cells.index((5, 0)) < cells.index((0, 5))
+
+
+def test_what_newer_releases_ask_for(navigator: Navigator) -> None:
+    robot, actions = navigator.robot, navigator.actions
+    fields = {"start": robot.pose(START), "use_start": True}
+    corner, goal = robot.pose((5, 0)), robot.pose(GOAL)
+    if hasattr(actions.ComputePathToPose.Goal, "viapoints"):
+        answer = navigator.plan(goal, viapoints=[robot.pose((0, 5)), corner], **fields)
+        assert answer.status == SUCCEEDED
+        cells = [robot.grid.world_to_cell(*point) for point in points_of(answer.result.path)]
+        assert 0 < cells.index((0, 5)) < cells.index((5, 0)) < cells.index(GOAL)
+    kind = actions.ComputePathThroughPoses.Goal
+    if kind.get_fields_and_field_types()["goals"] == "nav_msgs/Goals":
+        header, goals = goal.header, [PoseStamped(pose=each.pose) for each in (corner, goal)]
+        request = kind(goals=nav_msgs.msg.Goals(header=header, goals=goals), **fields)
+        handle = done(navigator.ask(navigator.poses.send_goal_async, request))
+        assert done(navigator.ask(handle.get_result_async)).status == SUCCEEDED
+    robot.set(allow_partial_planning=True)
+    answer = navigator.plan([corner, robot.pose((1, 1))], **fields)
+    assert (answer.status, answer.result.error_code) == (SUCCEEDED, 0)
+    assert answer.result.error_msg.startswith("a partial path of ")
+    if hasattr(answer.result, "last_reached_index"):
+        assert answer.result.last_reached_index == 0
+        assert navigator.plan([corner, goal], **fields).result.last_reached_index == -1
+    robot.set(allow_partial_planning=False)
 
 
 def test_each_cause_has_its_code(navigator: Navigator) -> None:
