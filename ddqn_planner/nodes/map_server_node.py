@@ -8,6 +8,7 @@ import numpy as np
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.srv import GetMap, LoadMap
 from numpy.typing import NDArray
+from rclpy.duration import Duration
 
 from ddqn_planner.grid import OCCUPIED, Cell, GridMap, MapFile, MoveRule, read_map_file
 from ddqn_planner.grid.map_file import MapDataError, MapMetadataError, MapNotFoundError
@@ -24,6 +25,8 @@ RESULTS: dict[type[Exception], int] = {
     MapMetadataError: LoadMap.Response.RESULT_INVALID_MAP_METADATA,
 }
 
+# How long to wait for subscribers that do not answer, as a planner that is stopped by a debugger.
+DIRECTIONS_TIMEOUT = Duration(seconds=1)
 NO_MAP = "no map is loaded; call load_map first"
 PARAMETERS: Final = {
     "yaml_filename": Declared(
@@ -82,6 +85,9 @@ class MapServerNode(BaseNode):
         place = self._loaded.resolution, self._loaded.origin, self.header(self.value("frame_id"))
         self._served = occupancy_message(values, *place)
         self._directions.publish(occupancy_message(self._loaded.forbidden, *place))
+        # No planner has the new map while it has the directions of the map before.
+        with suppress(RuntimeError):  # a middleware that cannot tell
+            self._directions.wait_for_all_acked(DIRECTIONS_TIMEOUT)
         self._publisher.publish(self._served)
 
     def _on_get_map(self, request: GetMap.Request, response: GetMap.Response) -> GetMap.Response:

@@ -1,6 +1,8 @@
 """The map that the planner plans on: the last one, with updates, directions and expected times."""
 
+import math
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.qos import QoSProfile
 from rclpy.task import Future
+from rclpy.time import Time as RosTime
 from std_msgs.msg import Header, UInt8MultiArray
 
 from ddqn_planner.experience import Experience
@@ -19,16 +22,15 @@ from ddqn_planner.grid.body import Inflation
 from ddqn_planner.grid.copies import boxes_of
 from ddqn_planner.nodes import conversions
 from ddqn_planner.nodes.conversions import MAP_PARAMETERS, grid_from_message
+from ddqn_planner.nodes.directions import Directions, Forbidden
 from ddqn_planner.nodes.report import NO_REQUEST, Outcome, Report, RequestError, seconds
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
-from ddqn_planner.planning.field import offset_between, overlap
 
 try:
     from map_msgs.msg import OccupancyGridUpdate
 except ImportError:  # PyPI does not have it
     OccupancyGridUpdate = None
 
-DIRECTIONS = "map_directions"
 BODY_PARAMETERS = ("robot_radius", "clearance_weight")
 
 # Reliable, as a lost update leaves old cells; volatile, as the last one alone makes no new map.
@@ -37,9 +39,10 @@ REMEDY = "let the map's publisher send the full map"
 
 CHANGED_SHARE = 0.02  # of cells: with more, experience is spread anew over the map, slowly
 
-# A map server publishes them for each of its maps, with the map's stamp: then the next map waits
-# for its own, which may come seconds after it, or never if the map server is killed.
-Directions = tuple[Header, GridMap | None]  # of a message: without a map if it forbids nothing
+ONE_WAY_ZONES = "one-way zones"  # what is refused of directions that do not hold on a map
+
+UPDATE_WAIT = 1.0  # seconds to wait for a costmap without a known period, as Nav2's planners do
+INTERVALS = 8  # so many of the last ones tell the period of a costmap
 
 
 @dataclass(eq=False)
@@ -50,8 +53,32 @@ class Received:
     grid: GridMap
     header: Header
     came: float
-    directions: Directions | None = None  # those with which it is in use
-    forbidden: NDArray[np.uint8] | None = None  # what they forbid on it
+    forbidden: Forbidden | None = None
+
+
+class Arrivals:
+    """When maps and their updates came."""
+
+    def __init__(self) -> None:
+        self.number = 0
+        self.awaited_in_vain = -1  # the number of the last one after which none came in time
+        self._times: deque[float] = deque(maxlen=INTERVALS + 1)
+
+    def note(self) -> float:
+        """Count a map or an update that comes now; return the time."""
+        now = time.monotonic()
+        self.number += 1
+        self._times.append(now)
+        return now
+
+    @property
+    def period(self) -> float:
+        """Seconds from one to the next, the median of the last; infinite before the second."""
+        intervals = np.diff(self._times)
+        if not len(intervals):
+            return math.inf
+        # Two messages may come together, as a costmap and its first update.
+        return float(np.median(intervals) if len(intervals) > 2 else intervals.max())
 
 
 class MapSource:
@@ -62,18 +89,16 @@ class MapSource:
     ) -> None:
         self._node, self._report, self._worker, self._on_map = node, report, worker, on_map
         self.times = ExpectedTimes(node, report, worker, self.change)
-        # The map in use and the last one. If that is another one, it waits for its directions.
+        self.arrivals = Arrivals()
         self._used: Received | None = None
-        self._newest: Received | None = None
+        self._waiting: Received | None = None  # a newer one, whose directions may be under way
         self._size = ""  # of the one in use, in words
-        self._directions: Directions | None = None  # the last ones
         self._began = time.monotonic()
         self._updates = self._applied_updates = 0
         self._inflate = Inflation()
         self._ready: Future | None = None
         # Before the subscription of the map: directions that come with a map are taken first.
-        before = node.create_subscription(OccupancyGrid, DIRECTIONS, self._take_directions, LATCHED)
-        self._directions_topic = before.topic_name
+        self._directions = Directions(node, report, self._on_directions)
         self._topic = node.create_subscription(OccupancyGrid, "map", self._take, LATCHED).topic_name
         updates = f"{self._topic}_updates"
         if OccupancyGridUpdate is not None:
@@ -88,14 +113,44 @@ class MapSource:
         """The frame of the map; empty without one."""
         return self._used.header.frame_id if self._used is not None else ""
 
+    @property
+    def is_settling(self) -> bool:
+        """Whether a map waits for directions that come within moments, if at all."""
+        return self._waiting is not None and self._directions.awaited_since > -math.inf
+
+    @property
+    def retry_wait(self) -> float:
+        """For how many seconds to wait for the next costmap after a failed plan; 0 for a map."""
+        arrivals, timeout = self.arrivals, self._node.value("map_timeout")
+        is_silent = arrivals.awaited_in_vain == arrivals.number
+        if self._node.value("map_type") != "costmap" or is_silent:
+            return 0.0
+        limits = [2 * arrivals.period, timeout or math.inf]
+        return float(min(limits)) if min(limits) < math.inf else UPDATE_WAIT
+
+    def now(self) -> RosTime:
+        """Return the time of the node's clock, which stamps of maps may have."""
+        return self._node.get_clock().now()
+
+    def is_newer(self, header: Header | None, moment: RosTime) -> bool:
+        """Return whether a map was made after a moment, by its stamp and a clock like the node's.
+
+        A stamp of 0, as on the updates of Nav2's costmaps, or in the future does not tell.
+        """
+        if header is None:
+            return False
+        return moment < RosTime.from_msg(header.stamp, moment.clock_type) <= self.now()
+
     def check(self) -> Header:
         """Return the header of the map or update that is planned on, or raise a RequestError."""
+        self.look()
         refused = self._report.refused.get("map")
         because = f" ({refused})" if refused else ""
         if self._used is None:
-            missing = f"no map was received on {self._topic} yet{because}; start a map server"
-            missing = refused if refused and self._newest else missing
-            raise RequestError("NO_MAP", missing, self._began)
+            missing, since = f"no map was received on {self._topic} yet{because}", self._began
+            if refused and self._waiting is not None:
+                raise RequestError("NO_MAP", refused, max(since, self._directions.awaited_since))
+            raise RequestError("NO_MAP", f"{missing}; start a map server", since)
         timeout = self._node.value("map_timeout")
         is_costmap = self._node.value("map_type") == "costmap"
         if is_costmap and 0 < timeout < time.monotonic() - self._used.came:
@@ -139,9 +194,9 @@ class MapSource:
     def apply_parameters(self, changed: set[str]) -> None:
         """Read and prepare the map anew if one of the parameters that changed says so."""
         if changed & {*MAP_PARAMETERS, *BODY_PARAMETERS, "require_directions", "exploration"}:
-            for received in {*filter(None, (self._newest, self._used))}:
+            for received in filter(None, (self._waiting, self._used)):
                 received.grid = self._read(received.message)
-            self._choose()
+            self._on_directions()
         if "experience" in changed:
             self.times.read()
 
@@ -153,13 +208,13 @@ class MapSource:
 
     def _take(self, message: OccupancyGrid) -> None:
         try:
-            grid = self._read(message, self._newest)
+            grid = self._read(message, self._waiting or self._used)
         except (ValueError, MemoryError) as error:
             self._report.refuse("map", str(error) or repr(error))
             return
-        self._newest = Received(message, grid, message.header, time.monotonic())
+        self._waiting = Received(message, grid, message.header, self.arrivals.note())
         self._report.accept("map_updates")
-        self._use(self._newest)
+        self.look()
 
     def _read(self, message: OccupancyGrid, last: Received | None = None) -> GridMap:
         """Return the map of a message: the last one with other cells, if they have one place."""
@@ -177,7 +232,7 @@ class MapSource:
 
     def _take_update(self, update: Any) -> None:
         """Plan on the map with other values in a box from now on, or refuse the update."""
-        newest, self._updates = self._newest, self._updates + 1
+        newest, self._updates = self._waiting or self._used, self._updates + 1
         with self._report.taking("map_updates", often=True):
             if newest is None:
                 raise ValueError(f"an update came before a map; {REMEDY}")
@@ -186,82 +241,51 @@ class MapSource:
             # In place, for the day when a parameter changes and the map is read anew.
             whole, (height, width) = _values(newest.message), values.shape
             whole[update.y : update.y + height, update.x : update.x + width] = values
-            newest.header, newest.came = update.header, time.monotonic()
+            newest.header, newest.came = update.header, self.arrivals.note()
             self._applied_updates += 1
             if newest is self._used:
                 self.change()
 
-    def _take_directions(self, message: OccupancyGrid) -> None:
-        with self._report.taking(DIRECTIONS):
-            grid = None
-            if message.info.width or message.info.height or message.data:
-                grid = grid_from_message(message)
-                grid = grid.with_layers(forbidden=_values(message).view(np.uint8))
-            self._directions = message.header, grid
-            self._choose()
-
-    def _choose(self) -> None:
-        """Plan on the newest map if its directions have come, else on the one in use."""
-        for received in filter(None, (self._newest, self._used)):
-            if self._use(received):
-                break
-
-    def _use(self, received: Received) -> bool:
-        """Plan on a map from now on; return whether its directions let it."""
+    def look(self) -> None:
+        """Plan on a map that has come, unless it has to wait for directions."""
+        received = self._waiting
+        if received is None:
+            return
+        missing = self._directions.missing or self._direct(received)
+        if missing:
+            if missing != self._report.refused.get("map"):
+                self._report.refuse("map", missing, log=False)
+            return
+        self._used, self._waiting = received, None
         grid = received.grid
-        try:
-            self._direct(received)
-        except ValueError as error:
-            if self._used is not None and self._used.directions is None:
-                self._used = None  # there are directions now
-            if received is self._newest:  # without a log: they may be on their way
-                self._report.refuse("map", str(error), log=False)
-            return False
-        self._used = received
         size = f"{grid.width} x {grid.height} cells of {grid.resolution:.6g} m"
         before, self._size = self._size, f"{size} in frame {self.frame!r}"
         if self._size != before:
             self._node.get_logger().info(f"map of {self._size}")
-        if received is self._newest:
-            self._report.accept("map")
+        self._report.accept("map")
         self.change()
-        return True
 
-    def _direct(self, received: Received) -> None:
-        """Give a map its own directions, or the last ones; a ValueError says that it waits."""
-        grid, header = received.grid, received.message.header
-        # A map server creates this publisher first: whoever receives its map sees it already.
-        published = self._node.count_publishers(self._directions_topic) > 0
+    def _on_directions(self) -> None:
+        """Obey other directions on the map in use, or plan on it no more if some are required."""
         used = self._used
-        before = used.directions if used is not None else None
-        known = [each for each in (self._directions, before) if each is not None]
-        own = [each for each in known if each[0].stamp == header.stamp]
-        late = f"were not received on {self._directions_topic} yet"
-        if not known:
-            if published or self._node.value("require_directions"):
-                remedy = "let a map server publish them, or set require_directions to false"
-                raise ValueError(f"the map's directions {late}; {remedy}")
-            return
-        is_paired = used and before and used.message.header.stamp == before[0].stamp
-        if is_paired and published and not own:
-            what = f"the map's directions, with its stamp, {seconds(header.stamp)}"
-            raise ValueError(f"{what}, {late}; if they do not come, load the map again")
-        its, directions = found = (own or known)[0]
-        forbidden: NDArray[np.uint8] | None = None
-        if directions is not None and directions.forbidden is not None:
-            offset = offset_between(directions, grid)
-            if its.frame_id != header.frame_id or offset is None:
-                raise ValueError(
-                    f"the directions on {self._directions_topic} are not for this map: they have "
-                    f"the frame {its.frame_id!r} and {directions.resolution:.6g} m per cell, the "
-                    f"map {header.frame_id!r} and {grid.resolution:.6g} m; give both one frame, "
-                    "and cells that lie on each other"
-                )
-            theirs, ours = overlap(directions, grid, offset)
-            forbidden = np.zeros(grid.occupancy.shape, dtype=np.uint8)
-            forbidden[ours] = directions.forbidden[theirs]
-            forbidden = forbidden if forbidden.any() else None
-        received.directions, received.forbidden = found, forbidden
+        if used is not None and (self._directions.required or self._direct(used)):
+            self._waiting, self._used = self._waiting or used, None
+        elif used is not None:
+            self.change()
+        self.look()
+
+    def _direct(self, received: Received) -> str:
+        """Let the directions hold on a map; return why the map cannot be used, if it cannot."""
+        try:
+            received.forbidden = self._directions.on(received.grid, received.header.frame_id)
+        except ValueError as error:
+            received.forbidden = None
+            if self._node.value("require_directions"):
+                return f"{error}, or set require_directions to false"
+            self._report.refuse(ONE_WAY_ZONES, str(error))
+        else:
+            self._report.accept(ONE_WAY_ZONES)
+        return ""
 
 
 def _place(message: OccupancyGrid) -> tuple[Any, ...]:

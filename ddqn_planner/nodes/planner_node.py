@@ -70,7 +70,7 @@ class PlannerNode(ManagedNode):
         # In a group of its own: triggers that come while it plans make it plan once more after.
         group = MutuallyExclusiveCallbackGroup()
         self._replan = self.create_guard_condition(self._plan_for_active_goal, group)
-        self._map = MapSource(self, self._report, self._map_worker, self._replan.trigger)
+        self._map = MapSource(self, self._report, self._map_worker, self._on_map)
         self._places = Places(self, self._report, lambda: self._map.frame, self._on_start)
         inputs = self._map, self._places, self._model
         self._requests = Requests(self._settings, *inputs, self._worker, self._look_soon)
@@ -165,6 +165,10 @@ class PlannerNode(ManagedNode):
 
     # Map, start and goal
 
+    def _on_map(self) -> None:
+        self._requests.look_again()
+        self._replan.trigger()
+
     def _on_start(self) -> None:
         self._plan_for(self._active.poses, self._active.followed)
 
@@ -201,7 +205,7 @@ class PlannerNode(ManagedNode):
         active, goals = self._active, self._active.poses
         if not goals:
             return
-        outcome = await self._answer(goals, self._requests.plan(None, goals, active=active))
+        outcome = await self._answer(goals, self._requests.plan_for(active))
         if outcome.status in (UNCHANGED.status, NOT_ACTIVE.status):
             return
         self._publish(outcome, active)
@@ -318,8 +322,10 @@ class PlannerNode(ManagedNode):
     def _on_look(self) -> None:
         active, missing = self._active, [self._refusal.reason if self._refusal else ""]
         is_frequent = bool(active.poses) and self._settings.replan_period < IDLE_PERIOD
-        self._look_soon(is_frequent or active.lacks_pose)
-        if is_configured := self.state in CONFIGURED:
+        is_configured = self.state in CONFIGURED
+        is_settling = is_configured and self._map.is_settling
+        self._look_soon(is_frequent or active.lacks_pose or is_settling)
+        if is_configured:
             self._requests.look_again()
             self._places.transform_start()
             missing.append(self._map.missing)

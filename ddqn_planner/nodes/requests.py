@@ -33,6 +33,7 @@ from ddqn_planner.nodes.report import (
     reached,
     reason_of,
 )
+from ddqn_planner.nodes.retries import FAILURES, Retries
 from ddqn_planner.nodes.runtime import BaseNode, Worker
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus
 from ddqn_planner.planning.field import shift_between
@@ -219,6 +220,7 @@ class Requests:
     worker: Worker
     look_soon: Callable[[], None]
     next_look: Future = field(default_factory=Future)
+    retries: Retries = field(default_factory=Retries)
 
     def look_again(self) -> None:
         """Let who waits for a map or a pose look whether it has come."""
@@ -226,6 +228,59 @@ class Requests:
         came.set_result(None)
 
     async def plan(
+        self,
+        start: PoseStamped | None,
+        goals: list[PoseStamped],
+        *options: Any,
+        **named_options: Any,
+    ) -> Outcome:
+        """Do what `plan_now` does; after a failed plan for the same goal, on the next costmap.
+
+        Who clears a costmap after a failure, as Nav2's behavior trees do, asks again before the
+        cleared costmap has come. So a plan that fails again waits for it.
+        """
+        asked, deadline = self.map.now(), math.inf
+        while True:
+            costmap = self.map.arrivals.number
+            outcome = await self.plan_now(start, goals, *options, **named_options)
+            if outcome.status not in FAILURES or outcome.request is None:
+                break
+            if deadline == math.inf:
+                resolution = outcome.request.grid.resolution
+                if not self.retries.is_retry(goals, costmap, resolution):
+                    break
+                deadline = time.monotonic() + self.map.retry_wait
+            elif time.monotonic() >= deadline:
+                break
+            if self.map.is_newer(outcome.map_header, asked):
+                break
+            if not await self._wait_for_costmap(costmap, deadline):
+                break
+        self.retries.note(goals, costmap, outcome)
+        return outcome
+
+    async def _wait_for_costmap(self, last: int, deadline: float) -> bool:
+        """Return whether a costmap or an update came after the one of a number, or has come."""
+        arrivals = self.map.arrivals
+        while arrivals.number == last:
+            if time.monotonic() >= deadline:
+                arrivals.awaited_in_vain = last
+                return False
+            self.look_soon()
+            await self.next_look
+        return True
+
+    async def plan_for(self, active: ActiveGoal) -> Outcome:
+        """Plan to the active goal, or to the nearest of several.
+
+        It is planned for again on the next costmap anyway, so it does not wait for that.
+        """
+        costmap, goals = self.map.arrivals.number, [*active.poses]
+        outcome = await self.plan_now(None, goals, active=active)
+        self.retries.note(goals, costmap, outcome)
+        return outcome
+
+    async def plan_now(
         self,
         start: PoseStamped | None,
         goals: list[PoseStamped],

@@ -15,7 +15,7 @@ from types import SimpleNamespace, coroutine
 from typing import Any, NamedTuple
 
 import rclpy
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import OccupancyGrid, Odometry
 from rcl_interfaces import msg, srv
 from rclpy.clock import Clock, JumpThreshold, TimeJump
 from rclpy.clock_type import ClockType
@@ -48,6 +48,12 @@ SERVICE_QUALITY = QoSProfile(depth=5000)
 OVERRIDABLE = [QoSPolicyKind[name] for name in ("HISTORY", "DEPTH", "DURABILITY", "RELIABILITY")]
 # What of a publisher's quality is less than what a subscription may ask for.
 MISFITS = ("durability", "volatile", "transient_local"), ("reliability", "best_effort", "reliable")
+
+# What happens on topics of a type that only one node should publish.
+EFFECTS_OF_SEVERAL_PUBLISHERS = {
+    Odometry: "the robot's place may jump from one's to the other's",
+    OccupancyGrid: "each message replaces the last one of the other",
+}
 
 
 class Declared(NamedTuple):
@@ -216,11 +222,12 @@ class BaseNode(Node):
                 (f"{each.node_namespace.rstrip('/')}/{each.node_name}", each.qos_profile)
                 for each in self.get_publishers_info_by_topic(topic)
             ]
-            if subscription.msg_type is Odometry and len(publishers) > 1:
+            effect = EFFECTS_OF_SEVERAL_PUBLISHERS.get(subscription.msg_type)
+            if effect and len(publishers) > 1:
                 names = ", ".join(sorted(name for name, _ in publishers))
                 yield (
-                    f"{topic} has {len(publishers)} publishers ({names}), so the robot's place may "
-                    "jump from one's to the other's; let one publish, or remap the others"
+                    f"{topic} has {len(publishers)} publishers ({names}), so {effect}; let one "
+                    "publish, or remap the others"
                 )
             for (name, offered), (policy, *misfit) in product(publishers, MISFITS):
                 both = offered, subscription.qos_profile

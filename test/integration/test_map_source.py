@@ -87,7 +87,7 @@ class Source(MapSource):
         return self.used()
 
     def on_directions(self, stamp: int, value: int | None = EAST) -> tuple[int, Any]:
-        self._take_directions(directions_of(stamp, value))
+        self._directions.take(directions_of(stamp, value))
         return self.used()
 
 
@@ -120,9 +120,11 @@ def published(node: BaseNode) -> Iterator[None]:
     wait_for("end of the publisher", lambda: node.count_publishers("map_directions") == 0)
 
 
-def map_of(stamp: int, frame: str = "map", x: float = 0.0, resolution: float = 0.5) -> Any:
+def map_of(
+    stamp: int, frame: str = "map", x: float = 0.0, resolution: float = 0.5, yaw: float = 0.0
+) -> Any:
     header = Header(frame_id=frame, stamp=Time(sec=stamp))
-    return occupancy_message(np.zeros((4, 5), np.int8), resolution, (x, 0.0, 0.0), header)
+    return occupancy_message(np.zeros((4, 5), np.int8), resolution, (x, 0.0, yaw), header)
 
 
 def directions_of(stamp: int, value: int | None = EAST) -> Any:
@@ -235,15 +237,12 @@ def test_refused_updates_are_counted_and_change_nothing(source: Source) -> None:
     assert source.heard == 2
 
 
-def test_an_update_of_a_map_that_waits_changes_that_map_alone(source: Source) -> None:
-    source.on_directions(1)
+@pytest.mark.usefixtures("published")
+def test_an_update_of_a_map_that_waits_changes_that_map(source: Source) -> None:
     source._take(map_of(5))
-    before = source.grid()
-    source._take(map_of(5, resolution=1.0))
     source._take_update(update(data=array.array("b", [100] * 6)))
-    assert source.grid() is before
-    assert source.check() == map_of(5).header
-    source._take_directions(directions_of(1, None))
+    assert source.used() == NOTHING
+    source._directions.take(directions_of(1, None))
     assert source.grid().occupancy.tolist() == 3 * [[0, 1, 1, 0, 0]] + [[0] * 5]
     assert source.check() == update().header
 
@@ -284,86 +283,133 @@ def test_a_costmap_is_planned_on_for_map_timeout_after_its_last_message(
 
 
 @pytest.mark.usefixtures("published")
-def test_a_servers_map_waits_for_directions(source: Source, set_parameters: SetParameters) -> None:
+def test_the_first_map_waits_for_directions_that_are_published(source: Source) -> None:
     assert source.on_map(1) == NOTHING
-    assert "directions were not received on /map_directions yet; let a map server" in source.missing
+    assert "directions were not received on /map_directions yet" in source.missing
     assert not source.heard
     assert source.on_directions(1) == (1, EAST)
     assert source.heard == 1
-    # A map comes before its directions, or without them: its map server was killed.
-    assert source.on_map(2) == (1, EAST)
-    assert "directions, with its stamp, 2.000000000, were not" in source.report.refused["map"]
-    set_parameters(use_map_costs=True)
-    assert source.used() == (1, EAST)
-    assert source.grid().cost is not None  # it is read anew
-    assert source.on_directions(2, WEST) == (2, WEST)
     assert not source.report.refused
-    # The directions come first, or alone.
-    assert source.on_directions(3, None) == (2, WEST)
-    set_parameters(use_map_costs=False)
-    assert source.used() == (2, WEST)
-    # Of those of two maps, each time one was lost.
-    assert source.on_map(4) == (2, WEST)
-    assert source.on_directions(5) == (2, WEST)
-    assert source.on_map(5) == (5, EAST)
 
 
 @pytest.mark.usefixtures("published")
+def test_a_map_waits_a_second_for_a_publisher_that_sends_nothing(
+    source: Source, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [100.0]
+    clock = SimpleNamespace(monotonic=lambda: now[0])
+    monkeypatch.setattr("ddqn_planner.nodes.directions.time", clock)
+    for stamp, age in ((1, 0.0), (2, 0.5), (3, 0.49)):  # a live map
+        now[0] += age
+        assert source.on_map(stamp) == NOTHING
+        assert source.is_settling
+    now[0] += 0.02
+    source.look()
+    assert source.used() == (3, None)
+    assert not source.is_settling
+    assert source.on_map(4) == (4, None)  # it does not wait again
+
+
+def test_the_map_of_another_map_server_waits_for_its_directions(
+    node: BaseNode, source: Source
+) -> None:
+    source.on_directions(1)
+    assert source.on_map(1) == (1, EAST)
+    publisher = node.create_publisher(OccupancyGrid, "map_directions", LATCHED)
+    try:
+        wait_for("publisher", lambda: node.count_publishers("map_directions") > 0)
+        assert source.on_map(2) == (1, EAST)
+        assert source.report.refused["map"]
+        set_before = source.heard
+        source.apply_parameters({"robot_radius"})  # the map in use stays
+        assert source.used() == (1, EAST)
+        assert source.heard > set_before
+        assert source.on_directions(2, WEST) == (2, WEST)
+        assert not source.report.refused
+    finally:
+        node.destroy_publisher(publisher)
+        wait_for("end of the publisher", lambda: node.count_publishers("map_directions") == 0)
+    assert source.on_map(3) == (3, WEST)  # those of a map server that ended stay
+
+
 @pytest.mark.parametrize("map_type", ["map", "costmap"])
-def test_directions_hold_for_their_region(
+def test_directions_hold_where_they_overlap_a_map_whatever_the_stamps(
     source: Source, set_parameters: SetParameters, map_type: str
 ) -> None:
     set_parameters(map_type=map_type)
     source.on_directions(1)
     assert source.on_map(7, x=1.0) == (7, [EAST] * 3 + [0] * 2)
     assert source.on_map(8, x=-1.5) == (8, [0] * 3 + [EAST] * 2)
-    assert source.on_map(9, x=50.0) == (9, None)
+    assert source.on_map(8, x=-1.3) == (8, [0] * 3 + [EAST] * 2)  # by the cells' centres
+    assert source.on_map(9, resolution=0.25) == (9, EAST)
+    source._take(map_of(9, resolution=1.0))
+    assert source.grid().forbidden.tolist() == 2 * [[EAST] * 3 + [0] * 2] + 2 * [[0] * 5]
+    for x in (50.0, 1e30, -1e30, 1e308, -1e308):
+        assert source.on_map(9, x=x) == (9, None)
     source.on_map(10)
     source.heard = 0
     for stamp, value in ((3, WEST), (20, None), (4, WEST), (21, 0)):  # also older than the map
         assert source.on_directions(stamp, value) == (10, value or None)
     assert source.heard == 4
+    assert not source.report.refused
 
 
-def test_only_required_directions_are_awaited_without_a_publisher(
-    source: Source, set_parameters: SetParameters
-) -> None:
+def test_directions_are_required_once(source: Source, set_parameters: SetParameters) -> None:
     set_parameters(require_directions=True)
     assert source.on_map(1) == NOTHING
     assert "or set require_directions to false" in source.missing
     for required, used in ((False, (1, None)), (True, NOTHING)):
         set_parameters(require_directions=required)
         assert source.used() == used
-    assert source.on_directions(1) == (1, EAST)
-    assert source.on_map(2) == (2, EAST)  # once
-
-
-OTHERS = [{"frame": "odom"}, {"x": 0.2}, {"x": 1e308}, {"x": 1e30}, {"resolution": 0.25}]
-
-
-@pytest.mark.parametrize("changes", OTHERS)
-def test_directions_of_other_cells_are_not_used(source: Source, changes: dict[str, Any]) -> None:
-    assert source.on_map(2, **changes) == (2, None)
-    # What was planned on without directions is not once there are some.
-    assert source.on_directions(1) == NOTHING
-    assert source.missing.startswith("the directions on /map_directions are not for this map")
+    assert source.on_map(2) == NOTHING
+    assert source.on_directions(1) == (2, EAST)
     assert source.on_map(3) == (3, EAST)
-    assert "map" not in source.report.refused
-    # The map before it stays, until directions come for the one that waits.
-    assert source.on_map(2, **changes) == (3, EAST)
-    assert "not for this map" in source.report.refused["map"]
-    assert source.on_directions(4, None) == (2, None)
-    assert "map" not in source.report.refused
-    # So it does if the directions of the next map come first.
-    assert source.on_directions(5) == (2, None)
 
 
-@pytest.mark.usefixtures("published")
+OTHERS = [({"frame": "odom"}, "frame is 'map', the map's is 'odom'"), ({"yaw": 0.1}, "one yaw")]
+
+
+@pytest.mark.parametrize(("changes", "reason"), OTHERS)
+def test_directions_that_cannot_hold_are_named_or_their_map_is_refused(
+    source: Source, set_parameters: SetParameters, changes: dict[str, Any], reason: str
+) -> None:
+    assert source.on_map(2, **changes) == (2, None)
+    assert source.on_directions(1) == (2, None)
+    assert reason in source.report.refused["one-way zones"]
+    set_parameters(require_directions=True)
+    assert source.used() == NOTHING
+    assert reason in source.missing
+    assert source.on_map(3) == (3, EAST)
+    assert not source.report.refused
+    assert source.on_map(4, **changes) == (3, EAST)
+    assert reason in source.report.refused["map"]
+    assert source.on_directions(4, None) == (4, None)
+    assert not source.report.refused
+    source.on_directions(5)
+    set_parameters(require_directions=False)
+    assert source.used() == (4, None)
+    assert reason in source.report.refused["one-way zones"]
+    assert source.on_map(5) == (5, EAST)
+    assert not source.report.refused
+
+
+def test_maps_with_equal_zones_are_compared_by_their_patches(source: Source) -> None:
+    source.on_directions(1)
+    source.on_map(1)
+    before = source.grid()
+    changed = map_of(2)
+    changed.data[0] = 100
+    source._take(changed)
+    patches = source.grid().patches_since(before)
+    assert patches
+    assert len(patches) == 1
+
+
 def test_malformed_directions_leave_those_before_them(source: Source) -> None:
     source.on_directions(1)
     broken = directions_of(2)
     broken.data = broken.data[:-1]
-    source._take_directions(broken)
+    source._directions.take(broken)
     assert "20" in source.report.refused["map_directions"]
     assert source.on_map(1) == (1, EAST)
     source.on_directions(1)

@@ -1,0 +1,67 @@
+"""Which requests are retries of failed ones, for which a newer costmap may have a path."""
+
+import math
+import time
+from collections import deque
+from typing import NamedTuple
+
+from geometry_msgs.msg import PoseStamped
+
+from ddqn_planner.nodes.report import Outcome
+from ddqn_planner.planning import PlanStatus
+
+# What another costmap of the same place may change.
+FAILURES = {
+    status.name
+    for status in (
+        PlanStatus.START_OCCUPIED,
+        PlanStatus.GOAL_OCCUPIED,
+        PlanStatus.NO_PATH,
+        PlanStatus.ROLLOUT_TRAPPED,
+    )
+}
+RETRY_WITHIN = 2.0  # seconds after a failure; later if no newer costmap came
+MOST_FAILURES = 16
+
+
+class Failure(NamedTuple):
+    """A failed request; a retry may come from another place, or through fewer of its goals."""
+
+    last_goal: PoseStamped  # as the request gave it
+    costmap: int  # the number of the one that it failed on
+    seconds: float  # when, by the steady clock
+
+
+class Retries:
+    """The last requests that failed."""
+
+    def __init__(self) -> None:
+        self._failures: deque[Failure] = deque(maxlen=MOST_FAILURES)
+
+    def is_retry(self, goals: list[PoseStamped], costmap: int, resolution: float) -> bool:
+        """Return whether a request for the same last goal failed just now, or on this costmap."""
+        for failure in self._failures:
+            is_recent = time.monotonic() - failure.seconds < RETRY_WITHIN
+            may_have_been_cleared = failure.costmap == costmap or is_recent
+            is_near = _distance(failure.last_goal, goals[-1]) <= resolution
+            if may_have_been_cleared and is_near:
+                return True
+        return False
+
+    def note(self, goals: list[PoseStamped], costmap: int, outcome: Outcome) -> None:
+        """Remember a request that failed, or forget its goal if it did not."""
+        if outcome.request is None:
+            return
+        resolution = outcome.request.grid.resolution
+        others = [it for it in self._failures if _distance(it.last_goal, goals[-1]) > resolution]
+        self._failures = deque(others, MOST_FAILURES)
+        if outcome.status in FAILURES:
+            self._failures.append(Failure(goals[-1], costmap, time.monotonic()))
+
+
+def _distance(goal: PoseStamped, other: PoseStamped) -> float:
+    """Return the metres from one goal to another; infinite in different frames."""
+    if goal.header.frame_id != other.header.frame_id:
+        return math.inf
+    place, other_place = goal.pose.position, other.pose.position
+    return math.hypot(place.x - other_place.x, place.y - other_place.y)

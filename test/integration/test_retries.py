@@ -1,0 +1,217 @@
+"""A request that comes again after a clear waits for the cleared costmap."""
+
+import math
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from clears import GOAL, START, Costmap, Navigator
+from client import map_message, pose, wait_for
+from geometry_msgs.msg import PoseStamped
+from integration.robot import NUMBERS
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rclpy.utilities import try_shutdown
+
+from ddqn_planner.grid import GridMap
+from ddqn_planner.nodes.map_source import Arrivals
+from ddqn_planner.nodes.nav2 import CANCELED
+from ddqn_planner.nodes.planner_node import PlannerNode
+from ddqn_planner.nodes.report import NOT_ACTIVE, Outcome
+from ddqn_planner.nodes.retries import Retries
+from ddqn_planner.planning import Plan, PlanRequest, PlanStatus
+
+CLEARS = 8
+FREQUENCY = 10.0  # Hz
+
+
+def test_each_retry_right_after_a_clear_has_a_path(run_robot: Any) -> None:
+    random = np.random.default_rng(0)
+    with run_robot("/clears", {"map_type": "costmap"}) as robot:
+        costmap = Costmap(robot.client, FREQUENCY)
+        navigator = Navigator(robot.client, costmap)
+        wait_for("path", navigator.plan)
+        for _ in range(CLEARS):
+            has_path, _ = navigator.retry_after_clear(random.uniform(0, costmap.period))
+            assert has_path
+        costmap.close()
+
+
+FREE, RING = np.zeros((2, 60, 60), np.int8)
+GRID = GridMap(FREE, 0.1)
+RING[27:34, 7:14] = 100
+RING[28:33, 8:13] = 0
+
+
+class Asked:
+    """A planner in this process, whose costmaps come when the test sends them."""
+
+    def __init__(self) -> None:
+        self.columns = iter(range(0, 60, 2))  # of goals that nobody asked for
+        self.node, self.executor = PlannerNode(), SingleThreadedExecutor()
+        self.executor.add_node(self.node)
+
+    def send(self, values: np.ndarray, is_stamped: bool = False) -> None:
+        message = map_message(values, GRID, next(NUMBERS))
+        if is_stamped:
+            message.header.stamp = self.node.get_clock().now().to_msg()
+        self.node._map._take(message)
+
+    def set_period(self, seconds: float) -> None:
+        """Let the last costmaps have come so far apart."""
+        times = self.node._map.arrivals._times
+        times.clear()
+        times.extend([0.0, seconds])
+
+    def set(self, **values: Any) -> None:
+        results = self.node.set_parameters(
+            [Parameter(name, value=it) for name, it in values.items()]
+        )
+        assert all(result.successful for result in results)
+
+    def ask(self, goal: tuple[int, int] = GOAL, given_up: Callable[[], Any] = lambda: None) -> Any:
+        """Return the future of an answer, asked for as an action asks."""
+        ends = pose(GRID, START), [pose(GRID, goal)]
+        return self.executor.create_task(self.node._plan_for_action, *ends, "", given_up)
+
+    def answer(self, task: Any) -> str:
+        """Return the status of an answer."""
+        self.executor.spin_until_future_complete(task, 60)
+        _, outcome = task.result()
+        return str(outcome.status)
+
+    def is_waiting(self, task: Any) -> bool:
+        """Return whether there is no answer yet, after other requests were answered."""
+        for _ in range(2):
+            assert self.answer(self.ask((next(self.columns), 50))) == "NO_PATH"
+        return not task.done()
+
+
+@pytest.fixture
+def asked() -> Iterator[Asked]:
+    rclpy.init(args=["--ros-args", "-p", "map_type:=costmap", "-p", "map_timeout:=3600.0"])
+    asked = Asked()
+    yield asked
+    asked.node.destroy_node()
+    asked.executor.shutdown()
+    try_shutdown()
+
+
+def failed_before(asked: Asked) -> None:
+    """Let the request for the goal fail on a costmap that comes each 1,000 s."""
+    asked.send(RING)
+    asked.set_period(1000.0)
+    assert asked.answer(asked.ask()) == "NO_PATH"
+
+
+def test_a_retry_waits_for_the_cleared_costmap_and_no_other_request_does(asked: Asked) -> None:
+    failed_before(asked)
+    retry = asked.ask()
+    assert asked.is_waiting(retry)
+    asked.send(RING)  # on its way before the clear
+    assert asked.is_waiting(retry)
+    asked.send(FREE)
+    assert asked.answer(retry) == "SUCCEEDED"
+    # After a successful plan a failure is answered at once, and on a newer costmap as well.
+    asked.send(RING)
+    assert asked.answer(asked.ask()) == "NO_PATH"
+    retry = asked.ask()
+    assert asked.is_waiting(retry)
+    asked.send(RING, is_stamped=True)
+    assert asked.answer(retry) == "NO_PATH"
+
+
+def test_a_retry_that_waits_is_canceled_or_answered_when_the_node_stops(asked: Asked) -> None:
+    failed_before(asked)
+    reasons = list[Outcome]()
+    retry = asked.ask(given_up=lambda: reasons[0] if reasons else None)
+    assert asked.is_waiting(retry)
+    reasons.append(CANCELED)
+    assert asked.answer(retry) == CANCELED.status
+    retry = asked.ask()
+    assert asked.is_waiting(retry)
+    asked.node._refusal = NOT_ACTIVE
+    assert asked.answer(retry) == NOT_ACTIVE.status
+
+
+def test_a_costmap_that_stays_away_is_awaited_once(asked: Asked) -> None:
+    failed_before(asked)
+    asked.set_period(0.05)
+    wait = asked.node._map.retry_wait
+    assert wait == pytest.approx(0.1)
+    assert asked.answer(asked.ask()) == "NO_PATH"
+    assert asked.node._map.retry_wait == 0
+    asked.send(RING)
+    assert asked.node._map.retry_wait > 0
+
+
+def test_how_long_a_retry_waits(asked: Asked) -> None:
+    map_source = asked.node._map
+    asked.send(RING)
+    assert map_source.retry_wait == 3600  # one costmap has no period
+    asked.set(map_timeout=0.0)
+    assert map_source.retry_wait == 1
+    asked.set_period(0.2)
+    assert map_source.retry_wait == pytest.approx(0.4)
+    asked.set(map_timeout=0.3)
+    assert map_source.retry_wait == pytest.approx(0.3)
+    asked.set(map_type="map")
+    assert map_source.retry_wait == 0
+    # A map that failed is not awaited.
+    asked.set_period(1000.0)
+    assert [asked.answer(asked.ask()) for _ in range(2)] == ["NO_PATH", "NO_PATH"]
+
+
+def test_the_period_is_that_of_the_last_arrivals(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    clock = SimpleNamespace(monotonic=lambda: now[0])
+    monkeypatch.setattr("ddqn_planner.nodes.map_source.time", clock)
+    arrivals, periods = Arrivals(), []
+    for seconds in (0.0, 0.01, 0.5, 0.5, 60.0, 0.5, *8 * [0.2]):
+        now[0] += seconds
+        assert arrivals.note() == now[0]
+        periods.append(arrivals.period)
+    expected = [math.inf, 0.01, 0.5, 0.5, 0.5, 0.5, *3 * [0.35], *5 * [0.2]]
+    assert periods[:6] == pytest.approx(expected[:6])
+    assert periods[-4:] == pytest.approx(expected[-4:])
+    assert arrivals.number == 14
+
+
+def test_a_retry_has_the_goal_of_a_recent_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    clock = SimpleNamespace(monotonic=lambda: now[0])
+    monkeypatch.setattr("ddqn_planner.nodes.retries.time", clock)
+    request = PlanRequest(GRID, START, (GOAL,), "robot_safe")  # type: ignore[arg-type]
+
+    def outcome(status: str) -> Outcome:
+        return Outcome(status, "", None, request, Plan(PlanStatus.NO_PATH))
+
+    def at(x: float, frame: str = "map") -> PoseStamped:
+        stamped = pose(GRID, (0, 0))
+        stamped.pose.position.x, stamped.header.frame_id = x, frame
+        return stamped
+
+    retries, resolution = Retries(), 0.1
+    retries.note([at(9.0), at(1.0)], 7, outcome("NO_PATH"))
+    for goals, costmap, is_retry in (
+        ([at(1.0)], 7, True),
+        ([at(1.09)], 8, True),  # as TF moves a goal
+        ([at(1.11)], 7, False),
+        ([at(9.0)], 7, False),
+        ([at(1.0, "odom")], 7, False),
+    ):
+        assert retries.is_retry(goals, costmap, resolution) is is_retry
+    now[0] += 2.5
+    assert not retries.is_retry([at(1.0)], 8, resolution)
+    assert retries.is_retry([at(1.0)], 7, resolution)  # no newer costmap came
+    for status in ("SUCCEEDED", "GOAL_OUTSIDE_MAP"):
+        retries.note([at(1.0)], 7, outcome("GOAL_OCCUPIED"))
+        assert retries.is_retry([at(1.0)], 7, resolution)
+        retries.note([at(1.0)], 7, outcome(status))
+        assert not retries.is_retry([at(1.0)], 7, resolution)
+    for number in range(40):
+        retries.note([at(float(number))], 7, outcome("NO_PATH"))
+    assert len(retries._failures) == 16
