@@ -145,15 +145,16 @@ def _show(
 
     ms = plan.field_ms + plan.rollout_ms
     if options.json:
-        said = {"status": plan.status.name, "reason": plan.status.value, **answer}
+        said = {"status": plan.status.name, "reason": plan.reason, **answer}
         print(json.dumps({**said, "planning_seconds": ms / 1e3}))
     elif plan.cells:
         if grid.width <= MAX_TEXT_WIDTH or sys.stdout.isatty():
             print(draw_text(grid, plan.cells))
         print(*lines, sep="\n", end=f", planned in {ms:.1f} ms\n")
     else:
-        hint = " for the body; --picture shows it" if "body" in drawn else ""
-        print(f"no path: {plan.status.value}{hint}", file=sys.stderr)
+        is_plain = plan.reason == plan.status.value
+        hint = " for the body; --picture shows it" if "body" in drawn and is_plain else ""
+        print(f"no path: {plan.reason}{hint}", file=sys.stderr)
     if options.csv:
         write_csv(options.csv, *table)
     if options.picture:

@@ -73,7 +73,23 @@ def inflate(grid: GridMap, robot_radius: float, clearance_weight: float = 0.0) -
         if grid.cost is not None:
             cost = np.where(grid.cost == UNKNOWN, UNKNOWN, np.maximum(cost, grid.cost))
     cost = None if cost is None else cost * ~occupancy
-    return grid.with_layers(occupancy=occupancy, cost=cost, obstacles=grid.occupancy)
+    layers = {"occupancy": occupancy, "cost": cost, "obstacles": grid.occupancy}
+    return grid.with_layers(**layers, body_radius=robot_radius)
+
+
+def with_unknown_free(grid: GridMap) -> GridMap:
+    """Return a map as it might be if its unknown cells were free; its costs mean nothing."""
+    if grid.unknown is None:
+        return grid
+    occupancy, obstacles = grid.occupancy & ~grid.unknown, None
+    if grid.obstacles is not None:
+        obstacles = grid.obstacles & ~grid.unknown
+        if grid.body_radius > 0:  # cells that were too near to unknown ones are free, too
+            metres = clearance(obstacles) * grid.resolution
+            occupancy = obstacles | (metres < grid.body_radius * (1 - ROUNDING))
+    cost = None if grid.cost is None else grid.cost * ~occupancy
+    layers = {"occupancy": occupancy, "cost": cost, "obstacles": obstacles}
+    return grid.with_layers(**layers, unknown=None)
 
 
 class Inflation:
@@ -106,11 +122,12 @@ def _inflate_near(
         near, window = wider(box, cells, shape), wider(box, 2 * cells, shape)
         given = None if grid.cost is None else grid.cost[window]
         part = inflate(GridMap(grid.occupancy[window], grid.resolution, cost=given), *body)
+        unknown = None if grid.unknown is None else grid.unknown[near]
         in_part = within(near, window)
         cost = None if part.cost is None else part.cost[in_part]
         corner = near[1].start, near[0].start
         inflated = inflated.with_patch(
-            part.occupancy[in_part], *corner, cost, obstacles=grid.occupancy[near]
+            part.occupancy[in_part], *corner, cost, grid.occupancy[near], unknown
         )
     return inflated
 

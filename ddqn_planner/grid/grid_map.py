@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import sys
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -20,7 +21,7 @@ MAX_COST_MULTIPLIER = 5.0
 """That of a cell of value 100 or unknown; as in Nav2's NavFn planner: 50 if free, at most 253."""
 
 LAYERS = "occupancy", "cost", "forbidden", "slowness", "uphill"  # what its moves depend on
-PATCHED = {"occupancy", "cost", "obstacles"}  # layers of which patches change some cells
+PATCHED = {"occupancy", "cost", "obstacles", "unknown"}  # layers of which patches change some cells
 MAX_PATCHES = 512  # so many are known of a map, one after the other
 
 # Directions, costs, slowness and climbs of maps without. Not to be written to, as those of maps.
@@ -63,6 +64,11 @@ class GridMap:
     uphill : (H, W) array of whole numbers 0..255, optional
         Where driving in one direction takes longer: from a cell with 8 s + a, action a has the cost
         of others times exp(0.15 s), and those beside it times exp(0.15 s cos(angle between them)).
+    unknown : (H, W) bool, optional
+        Which occupied cells are occupied only because nothing is known of them, by default none.
+        Where they are the reason that a plan has no path, its reason says so.
+    body_radius : float
+        Metres: cells nearer than this to an obstacle are occupied, too; see `inflate`.
     """
 
     occupancy: Occupancy
@@ -74,6 +80,8 @@ class GridMap:
     slowness: NDArray[np.float32] | None = None
     seconds_per_cell: float | None = None
     uphill: NDArray[np.uint8] | None = None
+    unknown: Occupancy | None = None
+    body_radius: float = 0.0
 
     def __post_init__(self) -> None:
         occupancy = arguments.as_mask("occupancy", self.occupancy)
@@ -102,6 +110,13 @@ class GridMap:
         if (seconds := self.seconds_per_cell) is not None:
             seconds = as_number("seconds_per_cell", seconds, *POSITIVE, "more than 0")
             self._set(seconds_per_cell=seconds)
+        if self.unknown is not None:
+            unknown = arguments.as_mask("unknown", self.unknown, shape)
+            if (unknown & ~occupancy).any():
+                raise ValueError("unknown cells are free; give some within the occupied cells")
+            self._set(unknown=unknown if unknown.any() else None)
+        metres = 0, sys.float_info.max, "metres, finite and 0 or more"
+        self._set(body_radius=as_number("body_radius", self.body_radius, *metres))
 
     def _set(self, **layers: Any) -> None:
         for value in layers.values():
@@ -144,12 +159,14 @@ class GridMap:
         if array.dtype.kind == "f":  # these may be probabilities, 1.0 for occupied
             raise ValueError(f"the values are of type {array.dtype}; give integers, percent")
         array = array.astype(np.int8, copy=False)
-        occupied = array >= occupied_threshold
+        occupied, unknown = array >= occupied_threshold, None
         if not arguments.as_flag("allow_unknown", allow_unknown):
-            occupied |= array < 0
+            unknown = array < 0
+            occupied |= unknown
         with_costs = arguments.as_flag("use_map_costs", use_map_costs)
         cost = np.maximum(array, UNKNOWN) if with_costs else None
-        return cls(occupied, resolution, origin, cost, forbidden=forbidden)  # type: ignore[arg-type]
+        layers: Any = {"forbidden": forbidden, "unknown": unknown}
+        return cls(occupied, resolution, origin, cost, **layers)
 
     def with_patch(
         self,
@@ -158,6 +175,7 @@ class GridMap:
         y: int,
         cost: ArrayLike | None = None,
         obstacles: ArrayLike | None = None,
+        unknown: ArrayLike | None = None,
     ) -> GridMap:
         """Return the same map with other cells from (x, y) on; patch a map before you inflate it.
 
@@ -173,6 +191,8 @@ class GridMap:
         obstacles : (h, w) bool, optional
             Which of the new occupied cells are obstacles, as for `GridMap`; by default all. On a
             map without obstacles of its own they are ignored.
+        unknown : (h, w) bool, optional
+            Which of the new occupied cells are unknown, as for `GridMap`; by default none.
         """
         patch = arguments.as_mask("occupancy", occupancy)
         left, bottom = arguments.as_cell((x, y), "the first cell of the patch")
@@ -193,6 +213,7 @@ class GridMap:
             occupancy=replaced(self.occupancy, box, patch),
             cost=costs,
             obstacles=replaced(self.obstacles, box, closed),
+            unknown=self._unknown_with(patch, box, unknown),
         )
         # To look once at a map of which most is new takes less time than to look at the patch.
         if (costs is None) == (self.cost is None) and 2 * patch.size <= self.occupancy.size:
@@ -200,6 +221,21 @@ class GridMap:
             versions = *last_versions, (object(), box)
             patched._set(_history=History(self._history.lineage, versions))
         return patched
+
+    def _unknown_with(
+        self, patch: Occupancy, box: Box, unknown: ArrayLike | None
+    ) -> Occupancy | None:
+        """Return the unknown cells after a patch of some cells."""
+        new = np.zeros(patch.shape, dtype=np.bool_)
+        if unknown is not None:
+            new = patch & arguments.as_mask("unknown", unknown, patch.shape)
+        before = self.unknown
+        if before is None:
+            if not new.any():
+                return None
+            before = np.zeros(self.occupancy.shape, dtype=np.bool_)
+        after: Occupancy = replaced(before, box, new)
+        return after
 
     def patches_since(self, older: GridMap) -> list[Box] | None:
         """Return the boxes, rows and columns, that `with_patch` replaced since an older map."""

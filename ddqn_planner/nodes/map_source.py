@@ -228,7 +228,7 @@ class MapSource:
     def _patched(self, grid: GridMap, values: NDArray[np.int8], x: int, y: int) -> GridMap:
         rules = map(self._node.value, MAP_PARAMETERS)
         patch = conversions.grid_from_values(values, 1.0, (0.0, 0.0, 0.0), *rules)
-        return grid.with_patch(patch.occupancy, x, y, patch.cost, patch.obstacles)
+        return grid.with_patch(patch.occupancy, x, y, patch.cost, patch.obstacles, patch.unknown)
 
     def _take_update(self, update: Any) -> None:
         """Plan on the map with other values in a box from now on, or refuse the update."""

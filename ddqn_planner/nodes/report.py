@@ -14,7 +14,7 @@ from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell
 from ddqn_planner.nodes.runtime import BaseNode
-from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus
+from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus, unknown_space
 from ddqn_planner.planning.plan import PosePlan
 from ddqn_planner.planning.pose_planner import PoseRequest
 
@@ -75,7 +75,10 @@ def reason_of(
     cleared = f"{clearing * grid.resolution:.3g} m"
     if plan.status is not PlanStatus.SUCCEEDED:
         status, remedy = plan.status.value, REMEDIES[plan.status]
-        if has_body:
+        is_unknown = plan.reason.endswith(unknown_space.REMEDY)
+        if is_unknown:
+            status, _, remedy = plan.reason.partition("; ")
+        elif has_body:
             remedy = remedy.removesuffix(", or a greater start_clearing_radius")
             remedy = remedy.replace("on a free cell", "where the robot's body has room")
         to = f"goal: {_place(goal, goals[0])}"
@@ -86,7 +89,8 @@ def reason_of(
         of_map = f"map: {grid.width} x {grid.height} cells"
         reason = f"{status} (start: {_place(start, begin)}; {to}; {of_map})"
         on_map = filter(grid.contains, goals)
-        if plan.status is PlanStatus.GOAL_OCCUPIED and not all(map(grid.is_obstacle, on_map)):
+        is_goal = plan.status is PlanStatus.GOAL_OCCUPIED and not is_unknown
+        if is_goal and not all(map(grid.is_obstacle, on_map)):
             near = f"robot_radius, {robot_radius:g} m" if robot_radius else "the costmap allows"
             near = "the robot's body allows" if has_body else near
             reason += f", nearer to an obstacle than {near}"

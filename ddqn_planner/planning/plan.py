@@ -93,6 +93,9 @@ class Plan:
         to which it moved. None for a rollout, or if no Q field was needed.
     extra_cost : float, optional
         The share by which the rest of the path under way costs more than a new one, if it is kept.
+    reason : str
+        The status in words. Without a path it names unknown space, where that is the reason, and
+        what to do.
     field_ms, rollout_ms : float
         How long it took a planner to get the Q field, and the path from it, in milliseconds.
     """
@@ -106,6 +109,7 @@ class Plan:
     extra_cost: float | None = None
     field_ms: float = 0.0
     rollout_ms: float = 0.0
+    reason: str = ""
 
     def __post_init__(self) -> None:
         path = self.path
@@ -119,6 +123,8 @@ class Plan:
         for name, kind in (("status", PlanStatus), ("method", PlanMethod), ("move_rule", MoveRule)):
             if type(value := getattr(self, name)) is not kind:
                 object.__setattr__(self, name, kind(value))
+        if not self.reason:
+            object.__setattr__(self, "reason", self.status.value)
 
     def __setstate__(self, state: dict[str, object]) -> None:
         """Take what was pickled or copied: NumPy forgets that arrays are read-only."""

@@ -15,6 +15,7 @@ from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import Cells, as_cell, as_flag, as_number, as_pose, listed
 from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model
+from ddqn_planner.planning import unknown_space
 from ddqn_planner.planning.field import DistanceField, FieldCache, Goals, QField
 from ddqn_planner.planning.paths import keep_or_switch, search, way_and_ends
 from ddqn_planner.planning.plan import (
@@ -173,10 +174,12 @@ class Planner:
         """
         plans: list[Plan] = []
         how = move_rule, method, tolerance, simplified, start_clearing_radius
-        for goal in _cells_of_goals(goals):
+        cells = _cells_of_goals(goals)
+        for number, goal in enumerate(cells, 1):
+            name = f"goal {number} of {len(cells)}: " if len(cells) > 1 else ""
             plan = self.plan(grid, start, goal, *how)
             if plan.status is not PlanStatus.SUCCEEDED or plan.goal is None:
-                return replace(plan, goal=goal)
+                return replace(plan, goal=goal, reason=f"{name}{plan.reason}")
             plans.append(plan)
             start = plan.goal
         return joined(plans)
@@ -265,13 +268,21 @@ class Planner:
     def steps(self, request: PlanRequest) -> Iterator[Plan | None]:
         """Yield None before each slow step (a part of a field, a search), and last the plan."""
         ms, began = 0.0, time.perf_counter()
-        find = self._explore if request.grid.exploration else self._find
-        for plan in _with_plan_last(find(request)):
+        for plan in _with_plan_last(self._explain(request)):
             ms += 1e3 * (time.perf_counter() - began)
             if plan is not None:
                 vars(plan)["field_ms"] = ms - plan.rollout_ms  # frozen, but nobody else has it yet
             yield plan
             began = time.perf_counter()
+
+    def _explain(self, request: PlanRequest) -> Generator[None, None, Plan]:
+        """Return a plan; without a path, its reason names unknown space where that closes it."""
+        find = self._explore if request.grid.exploration else self._find
+        plan = yield from find(request)
+        if unknown_space.may_be_the_reason(request.grid, plan):
+            yield
+            plan = replace(plan, reason=unknown_space.reason_of(request, plan))
+        return plan
 
     def _explore(self, request: PlanRequest) -> Generator[None, None, Plan]:
         """Do the work of `_find` on a map with hopes: a bold plan if it keeps the share."""

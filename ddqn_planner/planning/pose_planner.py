@@ -15,8 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap
+from ddqn_planner.grid.body import with_unknown_free
 from ddqn_planner.grid.motions import HEADINGS, turn_between
 from ddqn_planner.planning import pose_paths as paths
+from ddqn_planner.planning import unknown_space
 from ddqn_planner.planning.plan import ROUNDING, PlanStatus, PosePlan
 from ddqn_planner.planning.pose_field import PoseField
 from ddqn_planner.planning.pose_world import State, World, body_of, differences, standing, world_of
@@ -25,6 +27,9 @@ from ddqn_planner.planning.segments import SAME_COST
 Pose: TypeAlias = tuple[float, float, float]  # metres, metres, radians; in the map frame
 
 VISITS = 2**16  # states that a field visits in one step of a plan: some 30 ms
+# Whether a path leads through unknown space is looked for in so many such steps, some 2 s, within
+# a bound that hardly takes longer than any path.
+MOST_STEPS_OF_REASON, BOUND_OF_REASON = 64, 10.0
 KEPT: Final = 3  # fields, those used last
 SAME_END = 1.0, 0.5  # cells and radians: no yaw is farther from the two headings nearest to it
 # So near to its path, a robot keeps it even if there is none from the state nearest to its pose:
@@ -91,6 +96,10 @@ class PosePlanner:
             plan = self._rest_of_path(request)
         if plan is None:
             plan = yield from self._find(request)
+            if unknown_space.may_be_the_reason(request.grid, plan):
+                yield
+                reason = yield from self._reason(request, plan)
+                plan = replace(plan, reason=reason)
         is_outside = plan.status in (PlanStatus.START_OUTSIDE_MAP, PlanStatus.GOAL_OUTSIDE_MAP)
         has_path = len(request.under_way) > 0 and not is_outside
         yield self._keep_or_switch(request, plan) if has_path else plan
@@ -124,6 +133,49 @@ class PosePlanner:
             if plan.poses.size:
                 break
         return plan
+
+    def _reason(self, request: PoseRequest, plan: PosePlan) -> Generator[None, None, str]:
+        """Return why there is no path, after None before each slow step."""
+        status, grid = plan.status.value, with_unknown_free(request.grid)
+        world = world_of(grid, self.body)
+        starts = self._at(grid, request.start, world)
+        start_cell, *cells = request.cells
+        if not len(starts):
+            return status
+        if plan.status is PlanStatus.START_OCCUPIED:
+            return f"the start {self._place(request, start_cell)}; {unknown_space.REMEDY}"
+        inside = [goal for goal in request.goals if grid.contains(grid.world_to_cell(*goal[:2]))]
+        if plan.status is PlanStatus.GOAL_OCCUPIED:
+            has_room = [
+                goal in inside and len(self._at(grid, goal, world)) for goal in request.goals
+            ]
+            if any(has_room):
+                both = zip(cells, has_room, strict=True)
+                places = [self._place(request, cell) if room else "" for cell, room in both]
+                return f"{unknown_space.goals_in_words(places)}; {unknown_space.REMEDY}"
+        start: State = tuple(starts[0].tolist())
+        states = np.concatenate([self._at(grid, goal, world) for goal in inside])
+        if any(request.tolerance):
+            states = self._around(replace(request, grid=grid), start, world)
+        if not len(states):
+            return status
+        field = PoseField(states, grid, world)
+        words = unknown_space.MAYBE_THROUGH_UNKNOWN_SPACE
+        for _ in range(MOST_STEPS_OF_REASON):
+            bound = field.reach(start, BOUND_OF_REASON, VISITS)
+            if bound is not None:
+                words = unknown_space.THROUGH_UNKNOWN_SPACE
+                break
+            yield
+        return status if bound == math.inf else f"{status}, {words}; {unknown_space.REMEDY}"
+
+    def _place(self, request: PoseRequest, cell: Cell) -> str:
+        """Return how a pose lies in whose cell the body touches unknown space."""
+        x, y = cell
+        unknown = request.grid.unknown
+        if unknown is not None and unknown[y, x]:
+            return unknown_space.IN_UNKNOWN_SPACE
+        return "is so near to unknown space that the robot's body touches it"
 
     def rest_of(
         self, way: Any, robot: Any, grid: GridMap, reach: tuple[float, float] = paths.REACH
