@@ -31,7 +31,7 @@ class Costmap:
     """Publishes a costmap: free, or with a ring of obstacles around the start."""
 
     def __init__(self, client: Client, frequency: float, topic: str = "map") -> None:
-        self.period, self.grid = 1 / frequency, GridMap(np.zeros((SIZE, SIZE)), 0.1)
+        self.period, self.grid = 1 / frequency, GridMap(np.zeros((SIZE, SIZE), np.bool_), 0.1)
         self.has_ring = False
         self._client, self._topic = client, topic
         self._timer = client.node.create_timer(self.period, self._publish)

@@ -115,8 +115,8 @@ class GridMap:
             if (unknown & ~occupancy).any():
                 raise ValueError("unknown cells are free; give some within the occupied cells")
             self._set(unknown=unknown if unknown.any() else None)
-        metres = 0, sys.float_info.max, "metres, finite and 0 or more"
-        self._set(body_radius=as_number("body_radius", self.body_radius, *metres))
+        limits = 0, sys.float_info.max, "metres, finite and 0 or more"
+        self._set(body_radius=as_number("body_radius", self.body_radius, *limits))
 
     def _set(self, **layers: Any) -> None:
         for value in layers.values():

@@ -97,7 +97,7 @@ class PosePlanner:
         if plan is None:
             plan = yield from self._find(request)
             if unknown_space.may_be_the_reason(request.grid, plan):
-                yield
+                yield None
                 reason = yield from self._reason(request, plan)
                 plan = replace(plan, reason=reason)
         is_outside = plan.status in (PlanStatus.START_OUTSIDE_MAP, PlanStatus.GOAL_OUTSIDE_MAP)
@@ -136,7 +136,8 @@ class PosePlanner:
 
     def _reason(self, request: PoseRequest, plan: PosePlan) -> Generator[None, None, str]:
         """Return why there is no path, after None before each slow step."""
-        status, grid = plan.status.value, with_unknown_free(request.grid)
+        status: str = plan.status.value
+        grid = with_unknown_free(request.grid)
         world = world_of(grid, self.body)
         starts = self._at(grid, request.start, world)
         start_cell, *cells = request.cells

@@ -29,21 +29,22 @@ def may_be_the_reason(grid: GridMap, plan: Plan) -> bool:
 def reason_of(request: PlanRequest, plan: Plan) -> str:
     """Return why a plan has no path: the status in words, or unknown space and what to do."""
     grid = request.grid
+    status: str = plan.status.value
     if plan.status is PlanStatus.START_OCCUPIED:
         place = place_in_words(grid, request.start)
-        return f"the start {place}; {REMEDY}" if place else plan.status.value
+        return f"the start {place}; {REMEDY}" if place else status
     if plan.status is PlanStatus.GOAL_OCCUPIED:
         places = [place_in_words(grid, goal) for goal in request.goals]
         if any(places):
             return f"{goals_in_words(places)}; {REMEDY}"
         if request.reach < 1:
-            return plan.status.value
+            return status
     for possible in _grids_without_unknown(grid):
         goals = tuple(sorted({goal for goal in request.goals if possible.is_free(goal)}))
         found = way_and_ends(replace(request, grid=possible), goals)
         if isinstance(found, PlanStatus):
-            return plan.status.value
-    return f"{plan.status.value}, {THROUGH_UNKNOWN_SPACE}; {REMEDY}"
+            return status
+    return f"{status}, {THROUGH_UNKNOWN_SPACE}; {REMEDY}"
 
 
 def place_in_words(grid: GridMap, cell: Cell) -> str:

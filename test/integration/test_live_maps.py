@@ -20,7 +20,7 @@ from ddqn_planner.nodes.runtime import LATCHED
 EAST, WEST = 0b00111000, 0b10000011  # what lanes to the east and to the west forbid
 SHAPE = 3, 9
 LIVE_SHAPE = 5, 22
-GRID = GridMap(np.zeros(SHAPE), 0.5)
+GRID = GridMap(np.zeros(SHAPE, np.bool_), 0.5)
 ENDS = (0, 1), (8, 1)
 
 
@@ -40,7 +40,7 @@ class Slam:
 
     def __init__(self, client: Client) -> None:
         self.client = client
-        self.grid = GridMap(np.zeros(LIVE_SHAPE), 0.25, (-0.35, 0.05, 0.0))
+        self.grid = GridMap(np.zeros(LIVE_SHAPE, np.bool_), 0.25, (-0.35, 0.05, 0.0))
         self.diagnostics = client.subscribe(DiagnosticArray, "/diagnostics")
 
     def publish(self) -> None:

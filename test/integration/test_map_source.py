@@ -343,7 +343,8 @@ def test_directions_hold_where_they_overlap_a_map_whatever_the_stamps(
     assert source.on_map(8, x=-1.3) == (8, [0] * 3 + [EAST] * 2)  # by the cells' centres
     assert source.on_map(9, resolution=0.25) == (9, EAST)
     source._take(map_of(9, resolution=1.0))
-    assert source.grid().forbidden.tolist() == 2 * [[EAST] * 3 + [0] * 2] + 2 * [[0] * 5]
+    forbidden: Any = source.grid().forbidden
+    assert forbidden.tolist() == 2 * [[EAST] * 3 + [0] * 2] + 2 * [[0] * 5]
     for x in (50.0, 1e30, -1e30, 1e308, -1e308):
         assert source.on_map(9, x=x) == (9, None)
     source.on_map(10)

@@ -101,6 +101,23 @@ def test_a_start_on_an_obstacle_or_deep_in_one_is_told(robot: Robot, hall: np.nd
         robot.wait_for_reason(reason)
 
 
+def test_unknown_space_is_named_where_it_is_the_reason(robot: Robot, hall: np.ndarray) -> None:
+    across, around = hall.copy(), hall.copy()
+    across[9:, 10] = -1
+    around[2, 15] = -1
+    remedy = "; set allow_unknown, or map it$"
+    for values, goal, radius, reason in (
+        (around, (15, 2), 0.0, r"the goal lies in unknown space \(.*\)"),
+        (around, (15, 3), 0.6, r"the goal is nearer to unknown space than .* allows \(.*\)"),
+        (across, (15, 2), 0.0, r"no path leads .*, but a path leads through unknown space \(.*\)"),
+    ):
+        robot.reset(robot_radius=radius)
+        robot.set_map(robot.stamped_map(values))
+        robot.clear()
+        assert robot.get_plan(robot.pose((2, 2)), robot.pose(goal)).poses == []
+        robot.wait_for_reason(f"^{reason}{remedy}")
+
+
 def test_a_goal_moves_within_the_tolerance_of_the_request(robot: Robot) -> None:
     def get_cells(tolerance: float, goal: Cell = (10, 2)) -> list[Cell]:
         request = GetPlan.Request(start=robot.pose((0, 2)), tolerance=tolerance)

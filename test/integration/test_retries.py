@@ -18,7 +18,7 @@ from rclpy.utilities import try_shutdown
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.map_source import Arrivals
-from ddqn_planner.nodes.nav2 import CANCELED
+from ddqn_planner.nodes.nav2 import CANCELED, Task
 from ddqn_planner.nodes.planner_node import PlannerNode
 from ddqn_planner.nodes.report import NOT_ACTIVE, Outcome
 from ddqn_planner.nodes.retries import Retries
@@ -41,7 +41,7 @@ def test_each_retry_right_after_a_clear_has_a_path(run_robot: Any) -> None:
 
 
 FREE, RING = np.zeros((2, 60, 60), np.int8)
-GRID = GridMap(FREE, 0.1)
+GRID = GridMap(FREE > 0, 0.1)
 RING[27:34, 7:14] = 100
 RING[28:33, 8:13] = 0
 
@@ -74,8 +74,8 @@ class Asked:
 
     def ask(self, goal: tuple[int, int] = GOAL, given_up: Callable[[], Any] = lambda: None) -> Any:
         """Return the future of an answer, asked for as an action asks."""
-        ends = pose(GRID, START), [pose(GRID, goal)]
-        return self.executor.create_task(self.node._plan_for_action, *ends, "", given_up)
+        task = Task(pose(GRID, START), [pose(GRID, goal)], "")
+        return self.executor.create_task(self.node._plan_for_action, task, given_up)
 
     def answer(self, task: Any) -> str:
         """Return the status of an answer."""
