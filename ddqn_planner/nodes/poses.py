@@ -16,10 +16,11 @@ from rclpy.time import Time
 
 from ddqn_planner.grid.rotations import Rotation
 from ddqn_planner.nodes.conversions import check_pose, quaternion, rotation, with_unit_quaternion
-from ddqn_planner.nodes.report import PATIENCE, Refusals, RequestError
+from ddqn_planner.nodes.report import Refusals, RequestError
 from ddqn_planner.nodes.runtime import STEADY, BaseNode
 
 READ_PERIOD, TF_DEPTH = 0.5, 1000  # seconds between two reads, and messages that come meanwhile
+AGE_OF_FIRST_POSE = 1.0  # seconds that a pose may be older than the first transform heard
 SILENCE = 2.0  # seconds after which odometry that comes no more does not tell where the robot is
 REMEDY = "; or install tf2_ros (apt install ros-jazzy-tf2-ros-py), which transforms it"
 NEWEST = Time()
@@ -86,7 +87,7 @@ class Frames:
             if stamp.nanoseconds:
                 newest = self._lookup(target, source)
                 later = (Time.from_msg(newest.header.stamp) - stamp).nanoseconds / 1e9
-                if 0 < later <= PATIENCE:  # the pose is from before the node listened
+                if 0 < later <= AGE_OF_FIRST_POSE:  # the pose is from before the node listened
                     return newest
             why = str(error)
         raise ValueError(f"no transform leads from {source!r} to {target!r} ({why}); publish one")

@@ -20,7 +20,7 @@ from ddqn_planner.planning.pose_planner import PoseRequest
 
 Request = PlanRequest | PoseRequest
 
-PATIENCE = 1.0  # seconds within which a new listener hears a first map, odometry or TF
+PATIENCE = 5.0  # seconds in which a new listener hears a first map, odometry or TF, at a load of 20
 PERIOD = 0.9  # seconds until diagnostics are due when nothing changes: at the next look
 
 TOLERANCE = ", or a greater tolerance"  # does not help with several goals: none of them moves

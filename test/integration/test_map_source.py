@@ -602,3 +602,11 @@ def test_the_plan_goes_round_and_its_time_is_told(times: ExpectedTimes) -> None:
     for grid in (of_old_map, GRID):  # the second one is from before the drives
         outcome = Outcome("SUCCEEDED", "", planner, replace(request, grid=grid), plan)
         assert times.describe(outcome) == {}
+
+
+def test_a_first_map_is_waited_for_as_long_as_it_takes_on_a_loaded_machine() -> None:
+    def may_come(seconds: float) -> bool:
+        return RequestError("NO_MAP", "none", time.monotonic() - seconds).may_come
+
+    assert may_come(3.0)  # as long as it took beside 14 busy processes on two cores
+    assert not may_come(10.0)
