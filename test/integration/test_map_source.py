@@ -141,6 +141,11 @@ def update(**fields: Any) -> SimpleNamespace:
     return SimpleNamespace(**{**usual, **fields})
 
 
+def unknown_of(grid: GridMap) -> Any:
+    """Return which cells are unknown, (H, W) bool."""
+    return np.zeros(grid.occupancy.shape, np.bool_) if grid.unknown is None else grid.unknown
+
+
 PLACES, SIZES = st.integers(-8, 8), st.integers(0, 7) | st.just(2**32 - 1)
 
 
@@ -203,6 +208,7 @@ def test_after_updates_the_map_is_as_if_it_came_whole(
             assert found.fingerprint == expected.fingerprint
             assert found.origin == expected.origin
             np.testing.assert_array_equal(found.obstacles, expected.obstacles)
+            np.testing.assert_array_equal(unknown_of(found), unknown_of(expected))
         assert before is None or found.patches_since(before)  # only where cells changed
         assert source.check() == header
         set_parameters(allow_unknown=parameters.get("allow_unknown", False))  # it reads anew

@@ -1,5 +1,6 @@
 """A request that comes again after a clear waits for the cleared costmap."""
 
+import array
 import math
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
@@ -12,9 +13,11 @@ from clears import GOAL, START, Costmap, Navigator
 from client import map_message, pose, wait_for
 from geometry_msgs.msg import PoseStamped
 from integration.robot import NUMBERS
+from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.utilities import try_shutdown
+from std_msgs.msg import Header
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.map_source import Arrivals
@@ -54,11 +57,20 @@ class Asked:
         self.node, self.executor = PlannerNode(), SingleThreadedExecutor()
         self.executor.add_node(self.node)
 
-    def send(self, values: np.ndarray, is_stamped: bool = False) -> None:
+    def send(self, values: np.ndarray, seconds_ahead: float | None = None) -> None:
+        """Send a costmap, with a stamp of long ago or one by the node's clock."""
         message = map_message(values, GRID, next(NUMBERS))
-        if is_stamped:
-            message.header.stamp = self.node.get_clock().now().to_msg()
+        if seconds_ahead is not None:
+            stamp = self.node.get_clock().now() + Duration(seconds=seconds_ahead)
+            message.header.stamp = stamp.to_msg()
         self.node._map._take(message)
+
+    def send_update(self, values: np.ndarray) -> None:
+        """Send all cells as an update, which has no stamp, as Nav2's costmaps do."""
+        height, width = values.shape
+        box = {"x": 0, "y": 0, "width": width, "height": height}
+        header, data = Header(frame_id="map"), array.array("b", values.tobytes())
+        self.node._map._take_update(SimpleNamespace(header=header, data=data, **box))
 
     def set_period(self, seconds: float) -> None:
         """Let the last costmaps have come so far apart."""
@@ -113,14 +125,18 @@ def test_a_retry_waits_for_the_cleared_costmap_and_no_other_request_does(asked: 
     assert asked.is_waiting(retry)
     asked.send(RING)  # on its way before the clear
     assert asked.is_waiting(retry)
-    asked.send(FREE)
+    asked.send(RING, seconds_ahead=1000)  # by another clock
+    assert asked.is_waiting(retry)
+    asked.send_update(RING)
+    assert asked.is_waiting(retry)
+    asked.send_update(FREE)
     assert asked.answer(retry) == "SUCCEEDED"
     # After a successful plan a failure is answered at once, and on a newer costmap as well.
     asked.send(RING)
     assert asked.answer(asked.ask()) == "NO_PATH"
     retry = asked.ask()
     assert asked.is_waiting(retry)
-    asked.send(RING, is_stamped=True)
+    asked.send(RING, seconds_ahead=0)
     assert asked.answer(retry) == "NO_PATH"
 
 

@@ -169,6 +169,27 @@ def test_unknown_space_is_named_exactly_if_there_is_a_path_without_it(
         assert not is_named
 
 
+def test_a_map_knows_its_unknown_cells() -> None:
+    values = hall(across=UNKNOWN, goal=WALL)
+    grid = GridMap.from_occupancy_values(values)
+    np.testing.assert_array_equal(grid.unknown, values == UNKNOWN)  # type: ignore[arg-type]
+    assert GridMap.from_occupancy_values(values, allow_unknown=True).unknown is None
+    assert GridMap.from_occupancy_values(hall()).unknown is None
+    mapped = grid.with_patch(np.zeros((11, 1), np.bool_), 15, 0)
+    assert mapped.unknown is not None
+    assert not mapped.unknown.any()
+    patch = np.ones((1, 2), np.bool_)
+    patched = GridMap.from_occupancy_values(hall()).with_patch(patch, 3, 2, unknown=[[True, False]])
+    assert patched.unknown is not None
+    assert np.argwhere(patched.unknown).tolist() == [[2, 3]]
+    free = np.zeros((2, 2), np.bool_)
+    with pytest.raises(ValueError, match="unknown cells are free"):
+        GridMap(free, unknown=~free)
+    for radius in (-0.1, np.nan, np.inf):
+        with pytest.raises(ValueError, match="body_radius"):
+            GridMap(free, body_radius=radius)
+
+
 # Bodies
 
 
