@@ -10,7 +10,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from rclpy.timer import Timer
 
-from ddqn_planner.nodes.runtime import STEADY, BaseNode, Parameters
+from ddqn_planner.nodes.runtime import STEADY, BaseNode, Parameters, apt_install
 
 BEAT_PERIOD, BEAT_TIMEOUT = 0.5, 4.0  # seconds; the timeout as Nav2's lifecycle manager has it
 
@@ -225,7 +225,7 @@ class ManagedNode(BaseNode):
         try:
             from bond.msg import Status
         except ImportError:
-            remedy = "apt install ros-jazzy-bond, or set bond_timeout to 0.0 in its manager"
+            remedy = f"{apt_install('bond')}, or set bond_timeout to 0.0 in its manager"
             self.get_logger().info(f"no bond: bond is not installed; {remedy}")
             return
         # As bondpy does, but deaf: the topic has the bonds of all nodes, each ten times a second.

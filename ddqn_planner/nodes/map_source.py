@@ -24,7 +24,7 @@ from ddqn_planner.nodes import conversions
 from ddqn_planner.nodes.conversions import MAP_PARAMETERS, grid_from_message
 from ddqn_planner.nodes.directions import Directions, Forbidden
 from ddqn_planner.nodes.report import NO_REQUEST, Outcome, Report, RequestError, seconds
-from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
+from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker, apt_install
 
 try:
     from map_msgs.msg import OccupancyGridUpdate
@@ -104,7 +104,8 @@ class MapSource:
         if OccupancyGridUpdate is not None:
             node.create_subscription(OccupancyGridUpdate, updates, self._take_update, UPDATES)
         else:
-            missing = "is not read: map_msgs is not installed; apt install ros-jazzy-map-msgs, or"
+            install = apt_install("map-msgs")
+            missing = f"is not read: map_msgs is not installed; {install}, or"
             node.get_logger().info(f"{updates} {missing} {REMEDY}")
         node.get_logger().info(f"waiting for a map on {self._topic}")
 

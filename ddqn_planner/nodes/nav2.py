@@ -20,7 +20,7 @@ from ddqn_planner.nodes.other_planners import (
     action_name,
 )
 from ddqn_planner.nodes.report import ALL_GOALS, Outcome
-from ddqn_planner.nodes.runtime import BaseNode
+from ddqn_planner.nodes.runtime import BaseNode, apt_install
 from ddqn_planner.planning import PlanStatus
 
 # Returns the answer of another planner to a goal's handle, or the outcome if there is none.
@@ -182,7 +182,7 @@ def serve_nav2(node: BaseNode, planning: Planning, other_planners: str = "") -> 
         from nav2_msgs.action import ComputePathThroughPoses, ComputePathToPose
         from nav2_msgs.srv import IsPathValid
     except ImportError as error:
-        node.get_logger().info(f"no actions for Nav2 ({error}); apt install ros-jazzy-nav2-msgs")
+        node.get_logger().info(f"no actions for Nav2 ({error}); {apt_install('nav2-msgs')}")
         return
     # Reentrant: the newest goal must be able to preempt another one.
     group = ReentrantCallbackGroup()

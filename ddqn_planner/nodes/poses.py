@@ -17,12 +17,12 @@ from rclpy.time import Time
 from ddqn_planner.grid.rotations import Rotation
 from ddqn_planner.nodes.conversions import check_pose, quaternion, rotation, with_unit_quaternion
 from ddqn_planner.nodes.report import Refusals, RequestError
-from ddqn_planner.nodes.runtime import STEADY, BaseNode
+from ddqn_planner.nodes.runtime import STEADY, BaseNode, apt_install
 
 READ_PERIOD, TF_DEPTH = 0.5, 1000  # seconds between two reads, and messages that come meanwhile
 AGE_OF_FIRST_POSE = 1.0  # seconds that a pose may be older than the first transform heard
 SILENCE = 2.0  # seconds after which odometry that comes no more does not tell where the robot is
-REMEDY = "; or install tf2_ros (apt install ros-jazzy-tf2-ros-py), which transforms it"
+REMEDY = f"; or install tf2_ros ({apt_install('tf2-ros-py')}), which transforms it"
 NEWEST = Time()
 TYPES = {"odom": Odometry, "initialpose": PoseWithCovarianceStamped, "goal_pose": PoseStamped}
 
@@ -35,7 +35,7 @@ def has_tf() -> bool:
 def check_source(parameter: str, value: str, others: str) -> None:
     """Raise a RuntimeError with the remedy if a parameter asks for TF without tf2_ros."""
     if value == "tf" and not has_tf():
-        missing = "needs tf2_ros, and that is not installed: apt install ros-jazzy-tf2-ros-py"
+        missing = f"needs tf2_ros, and that is not installed: {apt_install('tf2-ros-py')}"
         raise RuntimeError(f"{parameter} is 'tf', which {missing}, or set {parameter} to {others}")
 
 

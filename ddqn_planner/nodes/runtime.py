@@ -99,6 +99,11 @@ class Declared(NamedTuple):
 Parameters = Mapping[str, Declared]
 
 
+def apt_install(package: str) -> str:
+    """Return how to install a package of ROS, by the release that is sourced."""
+    return f"apt install ros-{os.environ.get('ROS_DISTRO', 'jazzy')}-{package}"
+
+
 class BaseNode(Node):
     """Node with checked parameters and requests that are not lost; it says what it cannot hear."""
 

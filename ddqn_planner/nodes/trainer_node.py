@@ -70,6 +70,7 @@ class TrainerNode(BaseNode):
     """Trains on the last ``map`` from the last ``initialpose`` to the last ``goal_pose``."""
 
     def __init__(self) -> None:
+        self._has_begun = False
         super().__init__("trainer", PARAMETERS)
         self.map: MapInFrame | None = None
         self.refusals = Refusals(self)
@@ -102,6 +103,7 @@ class TrainerNode(BaseNode):
         for name, handler in services.items():
             self.create_trigger(f"~/{name}", handler, callback_group=group)
         self.create_timer(1.0, self._on_look, clock=STEADY)
+        self._has_begun = True
 
     @property
     def folder(self) -> FilePath:
@@ -233,8 +235,10 @@ class TrainerNode(BaseNode):
 
     def destroy_node(self) -> None:
         """Save what was learned, and destroy the node."""
-        self._learner.stop()
-        self.worker.close()  # torch, half imported, may fail when the process ends
+        if self._has_begun:  # newer releases destroy a node that cannot start, and some twice
+            self._has_begun = False
+            self._learner.stop()
+            self.worker.close()  # torch, half imported, may fail when the process ends
         super().destroy_node()
 
     # A training in simulation: what `Driving` has, too

@@ -29,6 +29,7 @@ from rclpy.utilities import try_shutdown
 
 from ddqn_planner.nodes.planner_node import PlannerNode
 from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.nodes.trainer_node import TrainerNode
 
 LABELS = ("configure", "activate", "deactivate", "cleanup", "shutdown")
 OF_CONFIGURED = {"planner/get_plan", "planner/reload_model", "plan", "map", "goal_pose"}
@@ -307,6 +308,19 @@ def test_a_node_can_be_destroyed_after_the_shutdown_and_twice(state: str, model:
     rclpy.shutdown()
     node.destroy_node()
     node.destroy_node()
+
+
+def test_a_trainer_can_be_destroyed_twice_and_if_it_cannot_start(tmp_path: Path) -> None:
+    arguments = ["--ros-args", "-p", f"output_folder:={tmp_path}", "-p", "learn_from:=driving"]
+    rclpy.init(args=arguments)
+    node = TrainerNode()
+    node.destroy_node()
+    rclpy.shutdown()
+    node.destroy_node()
+    rclpy.init(args=[*arguments, "-p", "pose_source:=no_such"])
+    with pytest.raises(ValueError, match="pose_source is 'no_such'"):
+        TrainerNode()
+    rclpy.shutdown()  # newer releases destroy what there is of the node
 
 
 @pytest.mark.parametrize("case", ["good", "broken", "replaced"])
