@@ -27,9 +27,9 @@ from ddqn_planner.planning.segments import SAME_COST
 Pose: TypeAlias = tuple[float, float, float]  # metres, metres, radians; in the map frame
 
 VISITS = 2**16  # states that a field visits in one step of a plan: some 30 ms
-# Whether a path leads through unknown space is looked for in so many such steps, some 2 s, within
+# Whether a path leads through unknown space is looked for in so many such steps, some 0.5 s, within
 # a bound that hardly takes longer than any path.
-MOST_STEPS_OF_REASON, BOUND_OF_REASON = 64, 10.0
+MOST_STEPS_OF_REASON, BOUND_OF_REASON = 16, 10.0
 KEPT: Final = 3  # fields, those used last
 SAME_END = 1.0, 0.5  # cells and radians: no yaw is farther from the two headings nearest to it
 # So near to its path, a robot keeps it even if there is none from the state nearest to its pose:
@@ -96,13 +96,15 @@ class PosePlanner:
             plan = self._rest_of_path(request)
         if plan is None:
             plan = yield from self._find(request)
-            if unknown_space.may_be_the_reason(request.grid, plan):
-                yield None
-                reason = yield from self._reason(request, plan)
-                plan = replace(plan, reason=reason)
         is_outside = plan.status in (PlanStatus.START_OUTSIDE_MAP, PlanStatus.GOAL_OUTSIDE_MAP)
         has_path = len(request.under_way) > 0 and not is_outside
-        yield self._keep_or_switch(request, plan) if has_path else plan
+        if has_path:
+            plan = self._keep_or_switch(request, plan)
+        if unknown_space.may_be_the_reason(request.grid, plan):
+            yield None
+            reason = yield from self._reason(request, plan)
+            plan = replace(plan, reason=reason)
+        yield plan
 
     def _find(self, request: PoseRequest) -> Generator[None, None, PosePlan]:
         """Return a new plan, after None before each slow step."""
