@@ -127,9 +127,8 @@ class Driving:
         self._is_disk_full = False
         self._shown: GridMap | None = None
         self._slowness = node.create_publisher(OccupancyGrid, "~/slowness", LATCHED)
-        frames, names = Frames(node), node.value("robots") or [""]
-        robots = dict.fromkeys(names)  # one that is named twice drives once
-        self._robots = [DrivingRobot(node, frames, name, self._on_drive) for name in robots]
+        frames, names = Frames(node), node.value("robots")
+        self._robots = [DrivingRobot(node, frames, name, self._on_drive) for name in names]
         self._places_of_prior, self._is_speed_wrong = 0, False
         group = MutuallyExclusiveCallbackGroup()  # it awaits the worker
         self._learning = node.create_timer(1.0, self._learn_prior, group, clock=STEADY)

@@ -10,7 +10,8 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from rclpy.timer import Timer
 
-from ddqn_planner.nodes.runtime import STEADY, BaseNode, Parameters, apt_install
+from ddqn_planner.nodes.declared import Parameters
+from ddqn_planner.nodes.runtime import STEADY, BaseNode, apt_install
 
 BEAT_PERIOD, BEAT_TIMEOUT = 0.5, 4.0  # seconds; the timeout as Nav2's lifecycle manager has it
 
@@ -121,6 +122,8 @@ class ManagedNode(BaseNode):
         for start, goal in ((change.start, change.during), (change.during, change.goal)):
             event = TransitionEvent(start_state=_state(start), goal_state=_state(goal))
             self._events.publish(event)
+        if label == "configure":
+            super().tell_unread_qualities()
 
     def _changes(self) -> list[Change]:
         """Return the transitions that the state has."""
@@ -137,6 +140,9 @@ class ManagedNode(BaseNode):
         if self.context.ok():
             self.shutdown()
         super().destroy_node()
+
+    def tell_unread_qualities(self) -> None:
+        """Log them as soon as the node is configured: before, it has no subscriptions."""
 
     async def prepare(self, transition: str) -> bool:
         """Do what takes long before a transition that was asked for; False to refuse it."""

@@ -15,7 +15,8 @@ from ddqn_planner.grid.map_file import MapDataError, MapMetadataError, MapNotFou
 from ddqn_planner.grid.moves import shortest_path
 from ddqn_planner.grid.noise import scatter_obstacles
 from ddqn_planner.nodes.conversions import MIN_RESOLUTION, occupancy_message
-from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Declared, spin_until_shutdown
+from ddqn_planner.nodes.declared import Declared
+from ddqn_planner.nodes.runtime import LATCHED, BaseNode, spin_until_shutdown
 from ddqn_planner.resources import PACKAGE, find_map
 
 RESULTS: dict[type[Exception], int] = {
@@ -30,7 +31,9 @@ DIRECTIONS_TIMEOUT = Duration(seconds=1)
 NO_MAP = "no map is loaded; call load_map first"
 PARAMETERS: Final = {
     "yaml_filename": Declared(
-        "dilemma.yaml", "Path or URL of a map file, or a shipped map's name", read_only=True
+        "dilemma.yaml",
+        "Path or URL of a map file, or a shipped map's name; '': none",
+        read_only=True,
     ),
     "topic_name": Declared("map", "Topic of the map", read_only=True),
     "frame_id": Declared("map", "The map's frame", "not empty", read_only=True),
@@ -50,7 +53,10 @@ class MapServerNode(BaseNode):
         # First, so that whoever receives a map knows that its directions come too.
         self._directions = self.create_publisher(OccupancyGrid, f"{topic}_directions", LATCHED)
         self._publisher = self.create_publisher(OccupancyGrid, topic, LATCHED)
-        self._load(self.value("yaml_filename"))
+        if name := self.value("yaml_filename"):
+            self._load(name)
+        else:
+            self.get_logger().info(f"yaml_filename is '': {NO_MAP}")
         self.create_service(GetMap, "~/map", self._on_get_map)
         self.create_service(LoadMap, "~/load_map", self._on_load_map)
         with suppress(ImportError):

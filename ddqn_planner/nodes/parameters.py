@@ -3,7 +3,7 @@
 from typing import Final
 
 from ddqn_planner.grid import MoveRule
-from ddqn_planner.nodes.runtime import Declared
+from ddqn_planner.nodes.declared import Declared
 from ddqn_planner.planning import PlanMethod
 from ddqn_planner.planning.field import CACHE_BYTES
 

@@ -6,13 +6,13 @@ import queue
 import signal
 import sys
 import threading
-from collections.abc import Callable, Coroutine, Generator, Iterator, Mapping
+from collections.abc import Callable, Coroutine, Generator, Iterator, Sequence
 from contextlib import suppress
 from copy import copy
 from itertools import product
 from pathlib import Path
 from types import SimpleNamespace, coroutine
-from typing import Any, NamedTuple
+from typing import Any
 
 import rclpy
 from nav_msgs.msg import OccupancyGrid, Odometry
@@ -33,8 +33,18 @@ from rclpy.service import Service
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from rclpy.task import Task
+from rclpy.utilities import remove_ros_args
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
+
+from ddqn_planner.nodes.declared import Parameters, read_all
+from ddqn_planner.nodes.overrides import (
+    QOS,
+    nearest,
+    unread_names,
+    unread_qualities,
+    unread_sections,
+)
 
 # Late subscribers receive the last message too: for maps, plans, saved models.
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -56,49 +66,6 @@ EFFECTS_OF_SEVERAL_PUBLISHERS = {
 }
 
 
-class Declared(NamedTuple):
-    """What a user reads of a parameter; a number has a range, a text choices, or words for them."""
-
-    default: Any
-    description: str
-    allowed: tuple[float, float] | list[str] | str = ""
-    read_only: bool = False
-
-    @property
-    def limits(self) -> str:
-        """Which values are allowed, in words."""
-        if isinstance(self.allowed, tuple):
-            form = "{} to {}" if isinstance(self.default, int) else "{:g} to {:g}"
-            return form.format(*self.allowed)
-        return self.allowed if isinstance(self.allowed, str) else f"one of {self.allowed}"
-
-    def descriptor(self) -> msg.ParameterDescriptor:
-        """Return what ROS stores of it, and checks: a number's type and range."""
-        descriptor = msg.ParameterDescriptor(description=self.description, read_only=self.read_only)
-        if not isinstance(self.allowed, tuple):
-            descriptor.additional_constraints = self.limits
-            return descriptor
-        low, high = map(type(self.default), self.allowed)
-        ends = {"from_value": low, "to_value": high}
-        if isinstance(self.default, int):
-            descriptor.integer_range = [msg.IntegerRange(**ends)]
-        else:
-            descriptor.floating_point_range = [msg.FloatingPointRange(**ends)]
-        return descriptor
-
-    def check(self, name: str, value: Any) -> None:
-        """Check what ROS does not; ValueError if it is not one of the choices, or empty."""
-        if isinstance(self.allowed, list) and value not in self.allowed:
-            choices = ", ".join(choice or "''" for choice in self.allowed)
-            raise ValueError(f"{name} is {value!r}; give one of {choices}")
-        if self.allowed == "not empty" and not value:
-            what = self.description[0].lower() + self.description[1:]
-            raise ValueError(f"{name} is ''; name {what}")
-
-
-Parameters = Mapping[str, Declared]
-
-
 def apt_install(package: str) -> str:
     """Return how to install a package of ROS, by the release that is sourced."""
     return f"apt install ros-{os.environ.get('ROS_DISTRO', 'jazzy')}-{package}"
@@ -116,12 +83,34 @@ class BaseNode(Node):
         back = JumpThreshold(min_forward=None, min_backward=Duration(seconds=-1))
         self._jumps = self.get_clock().create_jump_callback(back, post_callback=self._on_jump)
         self._declared = parameters
-        for parameter, declared in parameters.items():
-            self.declare_parameter(parameter, declared.default, declared.descriptor())
+        self._declare(parameters)
         self.check_parameters({name: self.value(name) for name in parameters})
         self.add_on_set_parameters_callback(self._check)
         for service in (srv.SetParameters, srv.SetParametersAtomically):
             self.answer_with(service, self._on_set_parameters)
+
+    def _declare(self, parameters: Parameters) -> None:
+        """Declare parameters with what the command line and its files say; warn of the rest."""
+        overrides = {p.name: p.value for p in self.handle.get_parameters(Parameter).values()}
+        known = {*parameters, *self.list_parameters([], 0).names}
+        node = self.get_fully_qualified_name()
+        unread = [unread_names(overrides, known, node), *unread_sections(sys.argv, known, node)]
+        for warning in filter(None, unread):
+            self.get_logger().warning(warning)
+        self._qualities = [name for name in overrides if name.startswith(QOS)]
+        given = {name: overrides[name] for name in parameters if name in overrides}
+        values = read_all(parameters, given)
+        for name, declared in parameters.items():
+            value = values.get(name, declared.default)
+            # With the override itself, rclpy ends with its own error for a whole number.
+            self.declare_parameter(name, value, declared.descriptor(), ignore_override=True)
+
+    def tell_unread_qualities(self) -> None:
+        """Log once which qualities of service are for no subscription, when all are there."""
+        names, self._qualities = self._qualities, []
+        known = self.list_parameters([], 0).names
+        for warning in unread_qualities(names, known, self.get_fully_qualified_name()):
+            self.get_logger().warning(warning)
 
     def _on_jump(self, jump: TimeJump) -> None:
         seconds = jump.delta.nanoseconds / 1e9
@@ -139,9 +128,7 @@ class BaseNode(Node):
 
     def check_parameters(self, new: dict[str, Any]) -> None:
         """Check new values beyond their types and ranges; an error refuses them all."""
-        for name, value in new.items():
-            if name in self._declared:
-                self._declared[name].check(name, value)
+        read_all(self._declared, {n: value for n, value in new.items() if n in self._declared})
 
     def value(self, name: str) -> Any:
         """Return the value of a parameter."""
@@ -163,13 +150,27 @@ class BaseNode(Node):
         reason = "a parameter has no name; give one"
         try:
             if all(each.name for each in messages):
-                parameters = [Parameter.from_parameter_msg(each) for each in messages]
-                return self.set_parameters_atomically(parameters)
+                return self.set_parameters_atomically(self._meant(messages))
         except ParameterException as error:  # it is not declared
-            reason = str(error)
+            names = [nearest(each.name, self._declared) for each in messages]
+            similar = ", ".join(filter(None, names))
+            reason = f"{error}; the nearest is {similar}" if similar else str(error)
         except ValueError as error:
-            reason = f"{error}; give one of rcl_interfaces/msg/ParameterType"
+            reason = str(error)
         return msg.SetParametersResult(successful=False, reason=reason)
+
+    def _meant(self, messages: Sequence[msg.Parameter]) -> list[Parameter]:
+        """Return parameters with what their values mean."""
+        try:
+            parameters = [Parameter.from_parameter_msg(each) for each in messages]
+        except ValueError as error:
+            raise ValueError(f"{error}; give one of rcl_interfaces/msg/ParameterType") from None
+        given = {each.name: each.value for each in parameters if each.name in self._declared}
+        values = read_all(self._declared, given)
+        return [
+            Parameter(each.name, value=values[each.name]) if each.name in values else each
+            for each in parameters
+        ]
 
     def answer_with(self, service_type: Any, callback: Callable[..., Any]) -> None:
         """Answer the service of a type, which rclpy has created, with another callback."""
@@ -325,7 +326,13 @@ def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | 
         executor = SingleThreadedExecutor()
         # A task, not a flag: the executor wakes and returns.
         _at_signals(lambda: executor.create_task(stopping.set))
+        unread = remove_ros_args(sys.argv)[1:]
+        if parameters and unread:
+            remedy = "give settings after --ros-args, as in --ros-args -p robot_radius:=0.3"
+            get_logger("ddqn_planner").warning(f"{' '.join(unread)} is not read; {remedy}")
         node = make_node()
+        if isinstance(node, BaseNode):
+            node.tell_unread_qualities()
     except (NameValidationException, ParameterException, RuntimeError, ValueError) as error:
         get_logger("ddqn_planner").fatal(f"cannot start: {error}")
         rclpy.try_shutdown()

@@ -21,11 +21,12 @@ from std_msgs.msg import Float32, Header, String, UInt8MultiArray
 from ddqn_planner.files import as_path
 from ddqn_planner.grid import Cell, MoveRule, read_map_file
 from ddqn_planner.nodes import conversions, runtime
+from ddqn_planner.nodes.declared import NAMESPACES, Declared
 from ddqn_planner.nodes.driving import NO_MAP, Driving, Float64, MapInFrame, explained
 from ddqn_planner.nodes.parameters import MOVE_RULES, OF_MAPS
 from ddqn_planner.nodes.poses import check_source, listen
 from ddqn_planner.nodes.report import Refusals
-from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Declared, Worker
+from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Worker
 from ddqn_planner.resources import find_map
 from ddqn_planner.training.episodes import read_cells
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -57,7 +58,9 @@ PARAMETERS: Final = {
         "odometry", "Driving: odom, or a transform", ["odometry", "tf"], read_only=True
     ),
     "robot_frame": Declared("base_link", "Driving: the robot's frame, for tf", "not empty"),
-    "robots": Declared([""], "Driving: namespaces of robots; '': its own", read_only=True),
+    "robots": Declared(
+        [""], "Driving: namespaces of robots; []: its own", NAMESPACES, read_only=True
+    ),
     "nominal_speed": Declared(0.5, "Driving: m/s where nothing slows it down", (0.01, 100.0)),
     "robot_width": Declared(0.5, "Driving: metres; places are squares of half of it", (0.05, 10.0)),
     "experience": Declared("", "Driving: older experience with which a new folder begins"),

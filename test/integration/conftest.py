@@ -82,6 +82,7 @@ def run_node(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Any]:
         remaps: Sequence[str] = (),
         namespace: str = "",
         exit_code: int = 0,
+        settings: Sequence[str] = (),
         **modules: str,
     ) -> Iterator[NodeProcess]:
         """The node finds some modules before installed ones: ``sitecustomize`` runs first."""
@@ -94,6 +95,7 @@ def run_node(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Any]:
         arguments = ["--ros-args", *(["--params-file", str(file)] if parameters else [])]
         for remap in [*remaps, *([f"__ns:={namespace}"] if namespace else [])]:
             arguments += ["-r", remap]
+        arguments += settings
         path = filter(None, [str(folder), os.environ.get("PYTHONPATH")])
         # In a folder of its own, as no node depends on another's.
         options: Any = {"cwd": folder, "stderr": subprocess.STDOUT}

@@ -195,13 +195,17 @@ NEEDS_TF = "is 'tf', which needs tf2_ros, and that is not installed: apt install
         ("map_server", {}, ["--enclave", "/a"], SECURITY, "SECURITY|security|keystore|enclave"),
         ("map_server", {"frame_id": ""}, [], {}, "name the map's frame"),
         ("map_server", {"topic_name": "a b"}, [], {}, "topic name"),
-        ("map_server", {"seed": -1}, [], {}, "seed out of range"),
+        ("map_server", {"seed": -1}, [], {}, "seed is -1; give 0 to 9223372036854775807"),
         ("planner", FLIGHTY, [], {}, r"cannot subscribe to /map \(.*`flighty`"),
         ("planner", {"start_source": "tf"}, [], {}, NEEDS_TF),
         ("trainer", BY_TF, [], {}, NEEDS_TF),
         ("trainer", {"network": "perceptron"}, [], {}, "'perceptron'; give one of paper, prop"),
         ("trainer", {"environments": 8, "replay_capacity": 4}, [], {}, "is 8; .* at most .* 4"),
         ("trainer", {"map_file": "no_such_map.yaml"}, [], {}, "no_such_map"),
+        ("trainer", {"robots": ["r 1"]}, [], {}, "robots holds 'r 1', which is no namespace; give"),
+        ("trainer", {"output_folder": "~nobody_there/x"}, [], {}, "no home folder of a user 'nob"),
+        ("planner", {"robot_radius": "0.3", "mode": 1}, [], {}, "is '0.3', a text .* / mode is 1,"),
+        ("planner", {"use_sim_time": "true"}, [], {}, "use_sim_time"),
     ],
 )
 def test_what_a_node_cannot_start_with_is_said_and_ends_with_1(

@@ -180,7 +180,9 @@ def test_a_bad_parameter_is_refused_and_a_good_one_holds(robot: Robot, tmp_path:
     broken, missing = tmp_path / "broken.safetensors", tmp_path / "missing.safetensors"
     broken.write_bytes(b"a model")
     for name, bad, reason in (
-        *(("clearance_weight", 1.5, "out of range"), ("tolerance", math.nan, "out of range")),
+        ("clearance_weight", 1.5, "clearance_weight is 1.5; give 0 to 1"),
+        ("tolerance", math.nan, "tolerance is nan; give 0 to 1000"),
+        ("robot_radius", "0.3", "robot_radius is '0.3', a text (a number"),
         ("mode", "best", "mode is 'best'; give one of greedy, astar_fallback"),
         ("start_source", "gps", "start_source is 'gps'; give one of"),
         *(("robot_frame", "", "robot_frame is ''; name"), ("follow_trainer", False, "read-only")),

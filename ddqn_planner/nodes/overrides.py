@@ -1,0 +1,149 @@
+"""What the command line and its parameter files set, and what of it nobody reads."""
+
+import difflib
+import re
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import yaml
+
+PARAMETERS: Final = "ros__parameters"
+QOS: Final = "qos_overrides."
+TOPICS_OF_ROS: Final = ("/clock", "/parameter_events", "/rosout", "/tf", "/tf_static")
+SIMILAR: Final = 0.6  # of two names: the cutoff of difflib
+MOST_NAMES: Final = 5  # of sections that a warning lists
+
+
+class Section(NamedTuple):
+    """The parameters of the nodes whose full name a pattern matches."""
+
+    name: str
+    parameters: list[str]
+
+    @property
+    def last(self) -> str:
+        """The part that is the node's own name."""
+        return self.name.rpartition("/")[2]
+
+    def is_for(self, node: str) -> bool:
+        """Return whether it is for a node, by its full name."""
+        wildcards = {"**": "(/[^/]+)*", "*": "/[^/]+"}
+        tokens = filter(None, self.name.split("/"))
+        pattern = "".join(wildcards.get(token, "/" + re.escape(token)) for token in tokens)
+        return re.fullmatch(pattern, node) is not None
+
+
+def nearest(name: str, names: Iterable[str]) -> str:
+    """Return which of some names is most like another one; empty if none is."""
+    by_lower = {other.casefold(): other for other in names}
+    similar = difflib.get_close_matches(name.casefold(), by_lower, 1, SIMILAR)
+    return by_lower[similar[0]] if similar else ""
+
+
+def unread_names(names: Iterable[str], known: Collection[str], node: str) -> str:
+    """Return which parameters a node does not have; empty if it has all."""
+    unknown = [name for name in names if name not in known and not name.startswith(QOS)]
+    if not unknown:
+        return ""
+    similar = [nearest(name, known) for name in unknown]
+    told = ", ".join(
+        f"{name} (the nearest is {other})" if other else name
+        for name, other in zip(unknown, similar, strict=True)
+    )
+    return f"{node} does not know, and does not read: {told}; --help lists what it knows"
+
+
+def unread_qualities(names: Iterable[str], known: Collection[str], node: str) -> list[str]:
+    """Return which qualities of service are for topics that a node does not read."""
+    told = []
+    for name in names:
+        topic = name.removeprefix(QOS).partition(".")[0]
+        if not name.startswith(QOS) or name in known or topic in TOPICS_OF_ROS:
+            continue
+        other = nearest(name, [each for each in known if each.startswith(QOS)])
+        remedy = f"the nearest is {other}" if other else "it reads no such topic"
+        told.append(f"{node} has no subscription for {name} now; {remedy}")
+    return told
+
+
+def unread_sections(arguments: Sequence[str], known: Collection[str], node: str) -> list[str]:
+    """Return which parameter files, and settings of -p, are for other nodes alone."""
+    told = []
+    for source, sections in _sources(arguments):
+        if not sections:
+            continue
+        own = [section for section in sections if section.is_for(node)]
+        if not own:
+            told.append(f"{source} sets nothing of {node}: {_remedy(sections, node)}")
+        elif all(section.last == "**" for section in own):
+            told += [
+                f"{source}: the section {other.name} is not for {node}; {_rename(other, node)}"
+                for other in sections
+                if other not in own and _is_meant(other, known, node)
+            ]
+    return told
+
+
+def _is_meant(section: Section, known: Collection[str], node: str) -> bool:
+    """Return whether a section for no other node than this one may have been meant for it."""
+    has_namespace = section.name.count("/") > 1
+    is_similar = nearest(section.last, [node.rpartition("/")[2]]) != ""
+    return not has_namespace and is_similar and any(name in known for name in section.parameters)
+
+
+def _remedy(sections: Sequence[Section], node: str) -> str:
+    names = [section.name for section in sections]
+    shown = ", ".join(names[:MOST_NAMES]) + ", ..." * (len(names) > MOST_NAMES)
+    name = node.rpartition("/")[2]
+    other = nearest(name, [section.last for section in sections])
+    remedy = f"add a section {node}: or /**:"
+    if other:
+        remedy = _rename(next(section for section in sections if section.last == other), node)
+    return f"it is for {shown}; {remedy}"
+
+
+def _rename(section: Section, node: str) -> str:
+    name = node.rpartition("/")[2]
+    if section.last == name:  # in another namespace
+        return f"write {node}: or /**/{name}: instead of {section.name}:"
+    return f"write {node.removeprefix('/')}: instead of {section.name.removeprefix('/')}:"
+
+
+def _sources(arguments: Sequence[str]) -> Iterator[tuple[str, list[Section]]]:
+    """Yield each parameter file, and each -p with a node's name, and its sections."""
+    is_for_ros, rest = False, iter(arguments)
+    for argument in rest:
+        if argument in ("--ros-args", "--"):
+            is_for_ros = argument == "--ros-args"
+        elif is_for_ros and argument == "--params-file":
+            file = next(rest, "")
+            # ROS has read it before, or has said what is wrong with it.
+            with suppress(OSError, ValueError, yaml.YAMLError, RecursionError):
+                document = yaml.load(Path(file).read_bytes(), Loader=yaml.BaseLoader)
+                yield file, [*_sections(document)]
+        elif is_for_ros and argument in ("-p", "--param"):
+            rule = next(rest, "")
+            target, _, _ = rule.partition(":=")
+            node, colon, parameter = target.rpartition(":")
+            if colon:
+                yield f"-p {rule}", [Section("/" + node.lstrip("/"), [parameter])]
+
+
+def _sections(tree: Any, name: str = "") -> Iterator[Section]:
+    if not isinstance(tree, dict):
+        return
+    for key, below in tree.items():
+        if key == PARAMETERS:
+            yield Section(name, [*_parameters(below)])
+        else:
+            yield from _sections(below, f"{name}/{key.strip('/')}")
+
+
+def _parameters(tree: Any, prefix: str = "") -> Iterator[str]:
+    for key, below in tree.items() if isinstance(tree, dict) else ():
+        if isinstance(below, dict):
+            yield from _parameters(below, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}"

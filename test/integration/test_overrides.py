@@ -1,0 +1,280 @@
+"""What users set at the start, in their own way, for another node, or for none."""
+
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from client import wait_for
+from hypothesis import given
+from hypothesis import strategies as st
+from nav_msgs.srv import GetMap, LoadMap
+
+from ddqn_planner.nodes import map_server_node, trainer_node
+from ddqn_planner.nodes.declared import Declared, read_all
+from ddqn_planner.nodes.overrides import nearest, unread_names, unread_sections
+from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
+
+ROBOTS = trainer_node.PARAMETERS["robots"]
+PARAMETERS = trainer_node.PARAMETERS | map_server_node.PARAMETERS | PLANNER_PARAMETERS
+
+MEANT = [
+    ("robot_radius", 1, 1.0),
+    ("robot_radius", 100, 100.0),
+    ("clearance_weight", 1.0000005, 1.0),
+    ("occupied_threshold", 65.0, 65),
+    ("mode", " Greedy ", "greedy"),
+    ("map_type", "COSTMAP", "costmap"),
+    ("move_rule", " ", ""),
+    ("model", "~/My Model", "~/My Model"),
+    ("robots", [], [""]),
+    ("robots", None, [""]),  # what ROS makes of []
+    ("robots", b"", [""]),
+    ("robots", "", [""]),
+    ("robots", ["", " ", "/"], [""]),
+    ("robots", ["/r1", "r2/"], ["r1", "r2"]),
+    ("robots", ["r1", "/r1", "/fleet/r1/"], ["r1", "fleet/r1"]),
+    ("robots", "r1", ["r1"]),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "meaning"), MEANT)
+def test_a_value_in_another_form_means_the_same(name: str, value: Any, meaning: Any) -> None:
+    read = PARAMETERS[name].read(name, value)
+    assert (type(read), read) == (type(meaning), meaning)
+
+
+WRONG = [
+    ("robot_radius", "0.3", "is '0.3', a text .*no quotes.*; give a number, 0 to 100"),
+    ("robot_radius", True, "is True, a truth value; give a number, 0 to 100"),
+    ("robot_radius", [0.3], r"is \[0.3\], a list; give a number"),
+    ("robot_radius", None, "is an empty list; give a number"),
+    ("robot_radius", -0.1, "is -0.1; give 0 to 100"),
+    ("clearance_weight", 1.1, "is 1.1; give 0 to 1"),
+    ("map_timeout", math.inf, "is inf; give 0 to 3600"),
+    ("map_timeout", math.nan, "is nan; give 0 to 3600"),
+    ("occupied_threshold", 65.5, "is 65.5, a number; give a whole number, 1 to 100"),
+    ("occupied_threshold", math.inf, "is inf, a number; give a whole number"),
+    ("occupied_threshold", 0, "is 0; give 1 to 100"),
+    ("allow_unknown", 1, "is 1, a whole number; give true or false"),
+    ("allow_unknown", "true", "is 'true', a text .*no quotes.*; give true or false"),
+    ("model", 5, "is 5, a whole number .with quotes, '5', it is a text.; give a text"),
+    ("planner_id", True, "is True, a truth value .with quotes"),
+    ("mode", "best", "is 'best'; give one of greedy, astar_fallback"),
+    ("robot_frame", " ", "is ' '; name the robot's frame"),
+    ("robots", [1, 2], r"is \[1, 2\], a list; give a list of namespaces"),
+    ("robots", 3, "is 3, a whole number; give a list of namespaces"),
+    *(
+        ("robots", [bad], f"holds '{bad}', which is no name")
+        for bad in ("r 1", "1r", "a//b", "~", "ü")
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "reason"), WRONG)
+def test_a_wrong_value_is_named_with_a_remedy(name: str, value: Any, reason: str) -> None:
+    with pytest.raises(ValueError, match=f"^{name} {reason}"):
+        PARAMETERS[name].read(name, value)
+
+
+def test_all_wrong_values_are_named_at_once() -> None:
+    with pytest.raises(ValueError, match=r"^robot_radius is -1.0; .* / mode is 'x'; give"):
+        read_all(PARAMETERS, {"robot_radius": -1, "tolerance": 1, "mode": "x"})
+
+
+SCALARS = st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.binary()
+VALUES = SCALARS | st.lists(st.integers()) | st.lists(st.text()) | st.lists(st.floats())
+
+
+@given(st.sampled_from(sorted(PARAMETERS)), VALUES)
+def test_any_value_is_one_of_the_type_and_range_or_refused(name: str, value: Any) -> None:
+    declared: Declared = PARAMETERS[name]
+    try:
+        read = declared.read(name, value)
+    except ValueError as error:
+        assert re.search(r"; (give|name) ", str(error))  # noqa: PT017
+        return
+    assert type(read) is type(declared.default)
+    assert declared.read(name, read) == read
+    if isinstance(declared.allowed, tuple):
+        assert declared.allowed[0] <= read <= declared.allowed[1]
+
+
+def test_each_default_is_what_it_says() -> None:
+    for name, declared in PARAMETERS.items():
+        assert declared.read(name, declared.default) == declared.default
+
+
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [
+        ("robot_raduis", "robot_radius"),
+        ("Robot_Radius", "robot_radius"),
+        ("robot-radius", "robot_radius"),
+        ("robotRadius", "robot_radius"),
+        ("GridBased.tolerance", "tolerance"),
+        ("xyz", ""),
+    ],
+)
+def test_the_nearest_name_is_found(name: str, found: str) -> None:
+    assert nearest(name, PLANNER_PARAMETERS) == found
+    told = unread_names([name, "tolerance", "qos_overrides./map"], PLANNER_PARAMETERS, "/planner")
+    assert told.startswith(f"/planner does not know, and does not read: {name}")
+    assert (f"(the nearest is {found})" in told) == bool(found)
+
+
+RADIUS = {"ros__parameters": {"robot_radius": 0.3}}
+NAV2 = {"ros__parameters": {"planner_plugins": ["GridBased"], "GridBased": {"tolerance": 0.5}}}
+CLOCK = {"ros__parameters": {"use_sim_time": True}}
+SECTIONS: list[tuple[Any, str, str]] = [
+    ({"planner": RADIUS}, "/planner", ""),
+    ({"/planner": RADIUS}, "/planner", ""),
+    ({"/**": RADIUS}, "/r1/planner", ""),
+    ({"/*/planner": RADIUS}, "/r1/planner", ""),
+    ({"/**/planner": RADIUS}, "/planner", ""),
+    ({"/**/planner": RADIUS}, "/a/b/planner", ""),
+    ({"/r1/**": RADIUS}, "/r1/planner", ""),
+    ({"r1": {"planner": RADIUS}}, "/r1/planner", ""),
+    ({"/r1": {"planner": RADIUS}}, "/r1/planner", ""),
+    ({"planner": RADIUS, "planner_server": NAV2, "amcl": CLOCK}, "/planner", ""),
+    ({"/**": CLOCK, "planner_server": NAV2, "/r1/planner": RADIUS}, "/planner", ""),
+    ({}, "/planner", ""),
+    (
+        {"planner_node": RADIUS},
+        "/planner",
+        "sets nothing of /planner: it is for /planner_node; write planner: instead of plan",
+    ),
+    (
+        {"amcl": CLOCK, "planner_server": NAV2},
+        "/planner",
+        "it is for /amcl, /planner_server; write planner: instead of planner_server:",
+    ),
+    (
+        {"planner": RADIUS},
+        "/r1/planner",
+        "write /r1/planner: or /[*][*]/planner: instead of /planner:",
+    ),
+    ({"/*/planner": RADIUS}, "/planner", "instead of /[*]/planner:"),
+    ({"/r2/planner": RADIUS}, "/r1/planner", "it is for /r2/planner"),
+    ({"plannerx": RADIUS}, "/planner", "instead of plannerx:"),
+    ({"xplanner": RADIUS}, "/planner", "instead of xplanner:"),
+    ({"amcl": CLOCK}, "/planner", "it is for /amcl; add a section /planner: or /[*][*]:"),
+    ({f"n{i}": CLOCK for i in range(9)}, "/planner", "it is for /n0, /n1, /n2, /n3, /n4, ...; add"),
+    (
+        {"/**": CLOCK, "planner_node": RADIUS},
+        "/planner",
+        "the section /planner_node is not for /planner; write planner:",
+    ),
+    (
+        {"/**": CLOCK, "planner": RADIUS},
+        "/r1/planner",
+        "the section /planner is not for /r1/planner; write /r1/planner: or",
+    ),
+]
+
+
+@pytest.mark.parametrize(("sections", "node", "warning"), SECTIONS)
+def test_a_file_for_other_nodes_alone_is_told(
+    sections: Any, node: str, warning: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "parameters.yaml"
+    file.write_text(yaml.safe_dump(sections, sort_keys=False))
+    told = unread_sections(["node", "--ros-args", "--params-file", str(file)], PARAMETERS, node)
+    assert len(told) == bool(warning)
+    assert all(re.search(warning, each) and str(file) in each for each in told)
+    # What is no argument of ROS is not read by ROS.
+    assert unread_sections(["node", "--params-file", str(file)], PARAMETERS, node) == []
+
+
+@pytest.mark.parametrize(
+    ("rule", "warning"),
+    [
+        ("robot_radius:=0.3", ""),
+        ("planner:robot_radius:=0.3", ""),
+        ("model:='planner_node:x'", ""),
+        ("planner_node:robot_radius:=0.3", "-p planner_node:robot_radius:=0.3 sets nothing of /pl"),
+    ],
+)
+@pytest.mark.parametrize("option", ["-p", "--param"])
+def test_a_setting_for_another_node_is_told(option: str, rule: str, warning: str) -> None:
+    arguments = ["node", "--ros-args", option, rule, "-r", "__ns:=/", "--"]
+    told = unread_sections(arguments, PARAMETERS, "/planner")
+    assert len(told) == bool(warning)
+    assert all(warning in each for each in told)
+
+
+@given(st.recursive(SCALARS, lambda tree: st.dictionaries(st.text(), tree), max_leaves=9))
+def test_any_file_is_read_or_left_out(tmp_path_factory: Any, tree: Any) -> None:
+    file = tmp_path_factory.mktemp("any") / "any.yaml"
+    file.write_text(yaml.safe_dump(tree))
+    unread_sections(["--ros-args", "--params-file", str(file)], PARAMETERS, "/planner")
+
+
+def test_a_planner_tells_what_it_does_not_read_and_takes_what_is_meant(
+    run_node: Any, make_client: Any, tmp_path: Path
+) -> None:
+    file = tmp_path / "wrong.yaml"
+    file.write_text(yaml.safe_dump({"planner_node": RADIUS}))
+    quality = "qos_overrides./told/{}.subscription.durability:=volatile"
+    settings = ["--params-file", str(file), "-p", "robot_raduis:=0.3"]
+    settings += ["-p", quality.format("mpa"), "-p", quality.format("map"), "--", "tolerance:=3"]
+    parameters = {"robot_radius": 1, "mode": " Greedy", "use_sim_time": False}
+    with run_node("planner_node", parameters, namespace="/told", settings=settings) as node:
+        client = make_client("/told")
+        client.get_parameter("planner", "mode")
+        for warning in (
+            "does not read: robot_raduis .the nearest is robot_radius.; --help",
+            "wrong.yaml sets nothing of /told/planner: it is for /planner_node; write told/pl",
+            f"no subscription for {quality.format('mpa').partition(':')[0]} now; the nearest is "
+            f"{quality.format('map').partition(':')[0]}",
+            "tolerance:=3 is not read; give settings after --ros-args",
+        ):
+            node.wait_for_log(warning)
+        assert client.get_parameter("planner", "robot_radius") == 1.0
+        assert client.get_parameter("planner", "mode") == "greedy"
+        for name, value, meaning in (("robot_radius", 2, 2.0), ("occupied_threshold", 50.0, 50)):
+            (result,) = client.set_parameters("planner", **{name: value})
+            assert result.successful
+            assert client.get_parameter("planner", name) == meaning
+        for name, value, reason in (
+            ("robot_raduis", 0.1, "the nearest is robot_radius"),
+            ("robot_radius", "0.1", "a number and a truth value have no quotes"),
+            ("model", 3, "with quotes"),
+        ):
+            (result,) = client.set_parameters("planner", **{name: value})
+            assert not result.successful
+            assert reason in result.reason
+        assert client.get_parameter("planner", "robot_radius") == 2.0
+        assert len(re.findall("WARN", node.log)) == 4
+
+
+def test_a_map_server_without_a_map_waits_for_one(run_node: Any, make_client: Any) -> None:
+    with run_node("map_server_node", {"yaml_filename": ""}, namespace="/none") as node:
+        client = make_client("/none")
+        assert not client.call(GetMap, "map_server/map").map.data
+        node.wait_for_log("yaml_filename is '': no map is loaded; call load_map first")
+        answer = client.call(LoadMap, "map_server/load_map", LoadMap.Request(map_url=""))
+        assert answer.result == LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
+        node.wait_for_log("cannot load '', no map is served: the map is ''; give a path")
+        answer = client.call(LoadMap, "map_server/load_map", LoadMap.Request(map_url="dilemma"))
+        assert answer.result == LoadMap.Response.RESULT_SUCCESS
+        assert node.log.count("ERROR") == 1
+
+
+@pytest.mark.parametrize(("robots", "spaces"), [([], [""]), (["/r1", "r2/", "r1"], ["r1/", "r2/"])])
+def test_robots_are_heard_in_their_namespaces(
+    robots: list[str], spaces: list[str], run_node: Any, make_client: Any, tmp_path: Path
+) -> None:
+    parameters = {"learn_from": "driving", "robots": robots, "output_folder": str(tmp_path / "d")}
+    space = f"/fleet_of_{len(robots)}"
+    with run_node("trainer_node", parameters, namespace=space):
+        client = make_client(space)
+        expected = {f"{robot}odom" for robot in spaces}
+
+        def heard() -> set[str]:
+            entities = client.entities("trainer")
+            return {name for _, name, _ in entities if name.endswith("odom")}
+
+        wait_for("topics of robots", lambda: heard() == expected)
