@@ -44,7 +44,17 @@ setup(
     ],
     extras_require={
         "train": ["gymnasium>=1.1", "torch>=2.1"],
-        "ros": ["ros-jazzy-rclpy[fastrtps]>=7.1.5,<8", "ros-jazzy-common-interfaces>=5.3,<6"],
+        # Of these, the tests alone need test_msgs, for its action.
+        "ros": [
+            "ros-jazzy-rclpy[fastrtps]>=7.1.5,<8",
+            "ros-jazzy-common-interfaces>=5.3,<6",
+            "ros-jazzy-test-msgs>=2,<3",
+        ],
+        "ros-kilted": [
+            "ros-kilted-rclpy[fastrtps]>=9,<10",
+            "ros-kilted-common-interfaces>=5.5,<6",
+            "ros-kilted-test-msgs>=2.3,<3",
+        ],
         "figures": ["matplotlib>=3.6"],
         "experiments": ["joblib>=1.3", "matplotlib>=3.6"],
         "bags": ["mcap-ros2-support>=0.5"],
