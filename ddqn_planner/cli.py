@@ -15,7 +15,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import ddqn_planner as api
-from ddqn_planner.files import WorkFolder, as_path, differences, write_atomically, write_csv
+from ddqn_planner.files import (
+    WorkFolder,
+    as_path,
+    check_writable,
+    differences,
+    write_atomically,
+    write_csv,
+)
 from ddqn_planner.resources import find_map, with_remedy
 
 # A command imports what it needs, and no other command's libraries: the names of `api` do so, too.
@@ -67,6 +74,9 @@ def plan(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     pair: Any = {"type": float, "nargs": 2, "metavar": ("START", "GOAL")}
     parser.add_argument("--yaws", default=(0, 0), help=words, **pair)
     options = parser.parse_args(arguments)
+    for option in ("csv", "picture"):
+        if file := getattr(options, option):
+            check_writable(file, f"--{option}")
     map_file, start, goal = _read_map(options)
     planner = api.Planner.load(options.model)
     has_body = planner.pose_planner is not None
@@ -257,6 +267,8 @@ def train_robot(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> in
         ("steps", int, ROBOT.steps, "transitions after which to give up"),
     )
     options = parser.parse_args(arguments)
+    out = as_path(options.out, "--out")
+    check_writable(out, "--out")
     how = options.turning_radius, options.resolution, options.lattice, options.seed, options.padding
     trainer = RobotTrainer(options.footprint, options.motion, *how)
     with tqdm(total=options.steps, disable=None) as bar:
@@ -265,7 +277,7 @@ def train_robot(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> in
             bar.set_postfix(weak=certificate.weak, forbidden=certificate.forbidden, refresh=False)
     print(f"{trainer.steps:,} transitions: {certificate}")
     if certificate.proved:
-        save_model(options.out, trainer.network, trainer.metadata())
+        save_model(out, trainer.network, trainer.metadata())
     else:
         print("not saved; give more --steps, or another --seed or --resolution", file=sys.stderr)
     return int(not certificate.proved)
@@ -282,6 +294,10 @@ def _add_training_options(parser: argparse.ArgumentParser, out: str, parameters:
 
 def _run_training(options: Any, scenarios: Callable[[], Sequence[Scenario]]) -> TrainingRun:
     """Train into ``--out`` until ``--steps`` or a signal to stop; return the closed run."""
+    from ddqn_planner.grid.arguments import as_seed
+
+    as_seed(options.seed)
+    check_writable(options.out / "model.safetensors", "--out")
     import torch  # before the scenarios are made, which may take seconds
     from tqdm import tqdm
 
@@ -346,6 +362,9 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
         ("robot-frame", str, "", "MCAP: by default any that ends in base_link"),
     )
     options = parser.parse_args(arguments)
+    first = options.drives[0]
+    out = options.out or (first if first.is_dir() else first.parent) / EXPERIENCE
+    check_writable(out, "--out")
     grid = api.load_map(find_map(options.map))
     of_robot = {"nominal_speed": options.nominal_speed, "robot_width": options.robot_width}
     given = {name: value for name, value in of_robot.items() if value is not None}
@@ -364,16 +383,16 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
             name, found = read_recording(source, grid, *how)
             print(f"{source}: {name}")
             drives += found
-        for drive in drives:
-            drive.teach(experience, grid)
+        for number, drive in enumerate(drives, 1):
+            learned = drive.teach(experience, grid)
+            if not learned:
+                print(f"drive {number} taught nothing: {learned.reason}")
         try:
             from ddqn_planner.training.prior import prior_of
 
             experience.prior = prior_of(grid, experience.evidence.table, experience.prior)
         except ImportError as error:
             print(f"the map's prior is not trained: {with_remedy(error)}")
-        first = options.drives[0]
-        out = options.out or (first if first.is_dir() else first.parent) / EXPERIENCE
         write_atomically(out, experience.to_bytes())  # not `save`, which adds to an older file
     minutes = sum(drive.seconds[-1] - drive.seconds[0] for drive in drives) / 60
     print(f"{len(drives)} drives, {sum(d.metres for d in drives):.0f} m, {minutes:.1f} min")

@@ -96,6 +96,22 @@ def write_atomically(path: Path, content: bytes) -> None:
         raise
 
 
+def check_writable(path: Path, option: str) -> None:
+    """Raise a ValueError, before hours of work, if a file could not be written afterwards."""
+    remedy = f"give another {option}"
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path} is no regular file; {remedy}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        probe = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
+        probe.open("xb").close()
+        probe.unlink()
+    except OSError as error:
+        raise ValueError(f"{path} cannot be written ({error.strerror}); {remedy}") from None
+    except ValueError as error:  # "." has no name, and none has the character of code 0
+        raise ValueError(f"{str(path)!r} is no file's name ({error}); {remedy}") from None
+
+
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
     """Wait until no other process holds the lock of a file, and hold it; folders are made."""

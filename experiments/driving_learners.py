@@ -12,6 +12,7 @@ from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import cg
 
 from ddqn_planner import Experience, GridMap
+from ddqn_planner.experience import Learned
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
 from ddqn_planner.training.prior import prior_of
 
@@ -158,13 +159,14 @@ class TaughtExperience(Experience):
         super().__init__(SPEED)
         self.grid, self.places = grid, 0
 
-    def record(self, seconds: Any, positions: Any) -> None:
+    def record(self, seconds: Any, positions: Any) -> Learned:
         """Learn from a drive."""
-        super().record(seconds, positions)
+        learned = super().record(seconds, positions)
         places = len(self.evidence.table)
         if places > self.places and places >= MORE_PLACES * self.places:
             self.places = places
             self.prior = prior_of(self.grid, self.evidence.table, self.prior)
+        return learned
 
 
 LEARNERS: Final[dict[str, Callable[[GridMap], Any]]] = {

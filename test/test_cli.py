@@ -153,3 +153,27 @@ def test_an_interrupted_training_is_saved_and_resumed(small_map: str, tmp_path: 
         assert "run the same command to resume" in printed
         before, steps = steps, load_model(tmp_path / "run" / "model.safetensors")[1].steps
         assert steps > before
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["train dilemma", "train-any-map", "train-robot --footprint 0.2 --motion differential"],
+)
+def test_a_place_that_cannot_be_written_is_named_before_a_training(
+    console: Any, tmp_path: Path, command: str
+) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    for out in (file / "below", "/proc/none"):
+        error = console(command, "--out", out, status=2).err
+        assert re.search("cannot be written .*; give another --out", error)
+    wrong = console(command, "--seed", "-1", "--out", tmp_path / "x", status=2).err
+    assert "the seed is -1; give a whole number" in wrong
+
+
+def test_files_that_cannot_be_written_are_named_before_a_plan(console: Any, tmp_path: Path) -> None:
+    for option in ("--csv", "--picture"):
+        for wrong in (tmp_path, "/dev/null", "/proc/none/x.png"):
+            error = console("plan dilemma", option, wrong, status=2).err
+            assert re.search(f"(no regular file|cannot be written).*; give another {option}", error)
+    assert not any(tmp_path.iterdir())

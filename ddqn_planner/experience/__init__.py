@@ -1,3 +1,8 @@
 """What driving has shown about places: how long they take, and how often moves fail there."""
 
-from ddqn_planner.experience.experience import ExpectedTime, Experience, ExperienceFileError
+from ddqn_planner.experience.experience import (
+    ExpectedTime,
+    Experience,
+    ExperienceFileError,
+    Learned,
+)

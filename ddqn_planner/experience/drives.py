@@ -19,6 +19,7 @@ from ddqn_planner.experience.experience import (
     LATEST,
     STAND_DISTANCE,
     Experience,
+    Learned,
     averaged,
     ways,
 )
@@ -84,13 +85,15 @@ class Drive(NamedTuple):
         way = [self.positions[:1], means[ways(means, STEP)], self.positions[-1:]]
         return float(np.hypot(*np.diff(np.concatenate(way), axis=0).T).sum())
 
-    def teach(self, experience: Experience, grid: GridMap | None = None) -> None:
+    def teach(self, experience: Experience, grid: GridMap | None = None) -> Learned:
         """Let experience learn from it; where the robot gave up, moves fail."""
         if grid is not None:  # its time, compared with the expected one, tells how sure that is
             experience.apply(grid)
-        experience.record(self.seconds, self.positions)
+        learned = experience.record(self.seconds, self.positions)
         if self.outcome is DriveEnd.ABORTED:
             experience.record_failure(self.positions[-1])
+            learned = learned._replace(places=learned.places + 1, reason="")
+        return learned
 
     def row(self, number: int) -> bytes:
         """Return its row of ``episodes.csv``; the first one has the number 1."""

@@ -55,6 +55,17 @@ class ExpectedTime(NamedTuple):
     high: float
 
 
+class Learned(NamedTuple):
+    """What a drive taught; False if it taught nothing."""
+
+    places: int  # that were passed, or waited at
+    seconds: float  # that were spent there
+    reason: str = ""  # why nothing was learned, and what to do
+
+    def __bool__(self) -> bool:
+        return self.places > 0
+
+
 class Experience:
     """How long driving takes at places of the world, learned from poses of a robot.
 
@@ -104,7 +115,7 @@ class Experience:
         """Forget all."""
         self._learn(Evidence.forget)
 
-    def record(self, seconds: ArrayLike, positions: ArrayLike) -> None:
+    def record(self, seconds: ArrayLike, positions: ArrayLike) -> Learned:
         """Learn from a drive, or a part of one.
 
         Parameters
@@ -113,6 +124,11 @@ class Experience:
             The time of each pose, of any clock.
         positions : (N, 2) array
             In metres, in the frame of the map.
+
+        Returns
+        -------
+        Learned
+            False if the drive taught nothing: its `reason` says why.
 
         Raises
         ------
@@ -126,9 +142,33 @@ class Experience:
         possible = (np.abs(time) < LATEST) & (np.abs(position) < FARTHEST).all(axis=1)
         time, position = time[possible], position[possible]
         fresh = np.diff(time, prepend=np.nan) != 0  # a repeated time adds nothing
-        if fresh.any():
-            visits = self._measured(time[fresh], position[fresh])
+        time, position = time[fresh], position[fresh]
+        if len(time) >= 2:
+            visits = self._measured(time, position)
             self._learn(partial(Evidence.add, visits=visits))
+            if places := len(visits.seconds) + len(visits.waits):
+                return Learned(places, float(visits.seconds.sum() + visits.waits[:, 2].sum()))
+        return Learned(0, 0.0, self._why_nothing(time, position, count))
+
+    def _why_nothing(self, time: Float64, position: Float64, count: int) -> str:
+        """Return why poses (N,) that are possible, of so many, are no drive."""
+        if len(time) < 2:
+            given = f"{len(time)} of {count} poses are possible and differ in their time"
+            limits = f"finite seconds, and metres up to {FARTHEST:g}"
+            return f"{given}; give two or more, in {limits}"
+        elapsed, metres = np.diff(time), np.hypot(*np.diff(position, axis=0).T)
+        if (elapsed < 0).any():
+            return f"{np.count_nonzero(elapsed < 0)} times are earlier than those before; sort them"
+        if (elapsed > self.max_pause).any():
+            return (
+                f"the times are up to {elapsed.max():.3g} s apart; give at most {self.max_pause:g}"
+            )
+        fastest = float((metres / elapsed).max())
+        if fastest > self.max_speed:
+            slowest = f"the robot moves at {fastest:.3g} m/s"
+            return f"{slowest}; give metres and seconds, or a greater nominal_speed"
+        extent = float(np.hypot(*(position - position[0]).T).max())
+        return f"the robot comes no farther than {extent:.2g} m; give a longer drive"
 
     def _measured(self, time: Float64, position: Float64) -> Visits:
         """Return the visits of a drive."""
@@ -137,7 +177,7 @@ class Experience:
         seconds, at = averaged(time, position, window)
         speeds = np.hypot(*np.diff(at, axis=0).T) / np.abs(np.diff(seconds))
         usual = float(np.median(speeds)) if len(speeds) else 0.0
-        max_speed, step = 3 * max(self.nominal_speed, speed, usual), max(side, WINDOW) / 2
+        max_speed, step = max(self.max_speed, 3 * usual), max(side, WINDOW) / 2
         steps, waits = [np.zeros((0, 5))], [np.zeros((0, 3))]
         for part in _believed_parts(time, position, max_speed, self.max_pause):
             seconds, at = averaged(time[part], position[part], window)
@@ -186,6 +226,11 @@ class Experience:
     def _check_kind(self, other: Experience) -> None:
         if changed := differences(other.options, self.options):
             raise ValueError(f"the other experience has {changed}; give those of one kind of robot")
+
+    @property
+    def max_speed(self) -> float:
+        """Metres per second up to which a robot is believed, unless it usually drives faster."""
+        return 3 * max(self.nominal_speed, self.learned_speed)
 
     @property
     def learned_speed(self) -> float:

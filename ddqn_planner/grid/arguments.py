@@ -7,7 +7,7 @@ import reprlib
 import sys
 from collections.abc import Sequence
 from enum import Enum
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -63,12 +63,12 @@ def cells_inside(cells: Any, shape: tuple[int, ...]) -> NDArray[np.int64]:
     return np.array(cells, dtype=np.int64).reshape(-1, 2)
 
 
-def listed(values: Any, name: str) -> list[Any]:
+def listed(values: Any, name: str, remedy: str = "give a list") -> list[Any]:
     """Return the elements of what has some."""
     try:
         return list(values)
     except TypeError:
-        raise ValueError(f"{name} is {values!r}; give a list") from None
+        raise ValueError(f"{name} is {values!r}; {remedy}") from None
 
 
 def real(value: Any) -> float:
@@ -84,6 +84,14 @@ def as_number(name: str, value: Any, lowest: float, highest: float, remedy: str 
     if lowest <= (number := real(value)) <= highest:
         return number
     raise ValueError(f"{name} is {value!r}; give {remedy or f'{lowest:g} to {highest:g}'}")
+
+
+def as_seed(seed: Any) -> int:
+    """Return a whole number of any type, 0 to 2^63 - 1, as a Python int."""
+    is_whole = isinstance(seed, Integral) and not isinstance(seed, bool)
+    if is_whole and 0 <= seed < 2**63:
+        return int(seed)
+    raise ValueError(f"the seed is {seed!r}; give a whole number, 0 to {2**63 - 1}")
 
 
 def as_flag(name: str, value: Any) -> bool:

@@ -322,6 +322,9 @@ class GridMap:
     ) -> NDArray[np.bool_]:
         """Return (H, W) bool: where paths from some free cells (N, 2) lead, or backward, begin."""
         array = arguments.cells_inside(cells, self.occupancy.shape)
+        occupied = array[self.occupancy[array[:, 1], array[:, 0]]].tolist()
+        if occupied:
+            raise ValueError(f"the cell {tuple(occupied[0])} is occupied; give free cells")
         backward = arguments.as_flag("backward", backward)
         reached = np.zeros(self.occupancy.shape, dtype=np.bool_)
         reached[array[:, 1], array[:, 0]] = True

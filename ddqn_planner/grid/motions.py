@@ -93,10 +93,13 @@ def read_lattice(file: str | Path) -> Motions:
     try:
         lattice = json.loads(file.read_text())
         about = lattice["lattice_metadata"]
-        cell, angles = float(about["grid_resolution"]), np.array(about["heading_angles"], float)
+        cell = as_number("grid_resolution", about["grid_resolution"], *POSITIVE, "metres, > 0")
+        angles = np.array(about["heading_angles"], float)
+        if angles.shape != (HEADINGS,) or not np.isfinite(angles).all():
+            raise ValueError(f"it has {angles.size} headings; give {HEADINGS}")
         found = []
         for primitive in lattice["primitives"]:
-            start, end = (int(primitive[f"{name}_angle_index"]) for name in ("start", "end"))
+            start, end = (_heading_in(primitive, name) for name in ("start", "end"))
             length = float(primitive["trajectory_length"]) / cell
             poses = np.array(primitive["poses"], np.float64).reshape(-1, 3) / (cell, cell, 1)
             poses[-1, 2] = angles[end]
@@ -109,13 +112,20 @@ def read_lattice(file: str | Path) -> Motions:
             found.append((start, end, poses, cost))
         motions = _motions(cell, angles, found)
         misses = max(np.abs(one[-1, :2] - np.rint(one[-1, :2])).max() for one in motions.poses)
-    except (OSError, LookupError, TypeError, ValueError) as error:
-        problem = f"{file}: cannot be read as a lattice ({error!r})"
+    except (OSError, LookupError, TypeError, ValueError, RecursionError) as error:
+        reason = error if type(error) is ValueError else repr(error)
+        problem = f"{file}: cannot be read as a lattice ({reason})"
         raise ValueError(f"{problem}; give a file of Nav2's lattice generator") from None
-    if angles.shape != (HEADINGS,) or misses > 0.01:
-        found_there = f"{angles.size} headings, ends {misses:.2g} cells off the cells' centres"
-        raise ValueError(f"{file}: has {found_there}; give {HEADINGS} headings and whole cells")
+    if not misses <= 0.01:
+        problem = f"a primitive ends {misses:.2g} cells off the centres of cells"
+        raise ValueError(f"{file}: {problem}; give a file of the same grid_resolution")
     return motions
+
+
+def _heading_in(primitive: Any, name: str) -> int:
+    """Return the number of the heading with which a lattice's primitive starts or ends."""
+    key = f"{name}_angle_index"
+    return int(as_number(key, primitive[key], 0, HEADINGS - 1))
 
 
 def closer(poses: Array, spacing: float, lever: float) -> Array:

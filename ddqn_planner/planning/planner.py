@@ -32,6 +32,7 @@ from ddqn_planner.planning.segments import SAME_COST, cost_along, straightened
 
 AnyPlan = TypeVar("AnyPlan", bound=Plan)
 
+HAS_BODY = "the model plans poses of a body"
 VISITS = 2**18  # about how many cells a field visits in one step of a plan: some 30 ms
 
 
@@ -72,6 +73,8 @@ class Planner:
         """
         check_grid(grid)
         goal, rule = as_cell(goal, "the goal"), self._rule(move_rule)
+        if self.pose_planner is not None:
+            raise ValueError(f"{HAS_BODY}: there is no Q field of cells; use plan_poses")
         if not grid.is_free(goal):
             raise ValueError(f"the goal {goal} is not a free cell of the map; give another")
         if not self.network.supports((grid.height, grid.width)):
@@ -222,11 +225,9 @@ class Planner:
             If the model knows no body, the map's resolution is another, or an argument is wrong.
         """
         check_grid(grid)
-        several = [goal] if np.ndim(goal) == 1 else goal
-        goals = tuple(as_pose("the goal", one) for one in several)
-        limits = 0, math.inf, "two numbers, metres and radians, 0 or more"
-        metres, radians = (as_number("the tolerance", one, *limits) for one in tolerance)
+        metres, radians = _tolerance_of_poses(tolerance)
         least = as_number("the bound", bound, 1, math.inf, "1 or more")
+        goals = _poses_of_goals(goal)
         request = PoseRequest(grid, as_pose("the start", start), goals, (metres, radians), least)
         return last_step(self.pose_steps(request))
 
@@ -251,7 +252,7 @@ class Planner:
         move_rule, method, tolerance, simplified, radius = how
         check_grid(grid)
         if self.pose_planner is not None:
-            raise ValueError("the model plans poses of a body; use plan_poses, or a planner_node")
+            raise ValueError(f"{HAS_BODY}; use plan_poses, or a planner_node")
         limits = 0, math.inf, "0 cells or more"
         request = PlanRequest(
             grid,
@@ -397,6 +398,23 @@ def last_step(steps: Iterator[AnyPlan | None]) -> AnyPlan:
     *_, plan = steps
     assert plan is not None
     return plan
+
+
+def _tolerance_of_poses(tolerance: Any) -> tuple[float, float]:
+    remedy = "give two numbers (metres, radians), each 0 or more"
+    if isinstance(tolerance, str) or len(values := listed(tolerance, "the tolerance", remedy)) != 2:
+        raise ValueError(f"the tolerance is {tolerance!r}; {remedy}")
+    metres, radians = (as_number("the tolerance", one, 0, math.inf, remedy[5:]) for one in values)
+    return metres, radians
+
+
+def _poses_of_goals(goal: Any) -> tuple[Pose, ...]:
+    """Return the poses of one goal, or of several."""
+    values = listed(goal, "the goal", "give a pose (x, y, yaw), or several")
+    if not values:
+        raise ValueError("there is no goal; give at least one pose (x, y, yaw)")
+    is_one = not any(isinstance(value, (Sequence, np.ndarray)) for value in values)
+    return tuple(as_pose("the goal", pose) for pose in ([values] if is_one else values))
 
 
 def _cells_of_goals(goals: Sequence[Cell]) -> list[Cell]:

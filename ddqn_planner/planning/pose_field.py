@@ -21,6 +21,7 @@ LOST = 1 / 2  # of the cost of the last start; if a repair takes more back, a ne
 UNGUIDED = 2**14  # states that are visited before a look at the map pays
 FINEST = 1  # the shift of the smallest tiles that it looks at
 NOWHERE = Aim(0, 0, -1, 1.0, np.empty((0, 0), np.float32), SHIFT + 1)
+ANY_PATH = 1e6  # a bound that each path keeps: a greater one would make the weight infinite
 GREEDY = 1.5  # the first round's weight is the bound to the power of this: mostly that will do
 
 
@@ -63,7 +64,7 @@ class PoseField:
 
         Return the bound that is proved, or None if more states than the limit must be visited.
         """
-        number = int(kernels.number_of(*start, self.world))
+        number, bound = int(kernels.number_of(*start, self.world)), min(bound, ANY_PATH)
         if number != self._aim.number:
             known = self._aim if start[:2] == self._aim[:2] else NOWHERE
             self._aim = known._replace(x=start[0], y=start[1], number=number)

@@ -5,6 +5,7 @@ from typing import Final
 import numpy as np
 
 from ddqn_planner.grid import GridMap
+from ddqn_planner.grid.arguments import as_seed
 from ddqn_planner.grid.noise import random_costs, random_requests, unknown_costs
 from ddqn_planner.model.certificate import MOVE_RULES
 from ddqn_planner.training.environment import Scenario
@@ -36,7 +37,7 @@ MAPS: Final = 512
 
 def random_scenarios(seed: int, maps: int = MAPS) -> list[Scenario]:
     """Draw maps to train on, half for each move rule; a path connects each start with its goal."""
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(as_seed(seed))
     scenarios = []
     for number in range(maps):
         rule = MOVE_RULES[number % len(MOVE_RULES)]

@@ -2,13 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from numbers import Integral
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, neighbours, read_map_file
+from ddqn_planner.grid.arguments import as_cell, numbers
+from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.model.networks import FREE, GOAL, OBSTACLE, ROBOT, observation_background
 from ddqn_planner.resources import find_resource
 from ddqn_planner.training.exploring_starts import initial_cells
@@ -20,7 +24,7 @@ Observations = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Scenario:
-    """One path planning problem; a ValueError unless start and goal are two free cells."""
+    """One path planning problem; a ValueError unless a path leads from its start to its goal."""
 
     grid: GridMap
     start: Cell
@@ -28,11 +32,26 @@ class Scenario:
     move_rule: MoveRule = MoveRule.CORNER_CUTTING  # the paper's, likely
 
     def __post_init__(self) -> None:
-        for name, cell in (("start", self.start), ("goal", self.goal)):
+        check_grid(self.grid)
+        start, goal = as_cell(self.start, "the start"), as_cell(self.goal, "the goal")
+        vars(self).update(
+            start=start, goal=goal, move_rule=MoveRule(self.move_rule)
+        )  # it is frozen
+        for name, cell in (("start", start), ("goal", goal)):
             if not self.grid.is_free(cell):
                 raise ValueError(f"the {name} {cell} is not a free cell of the map; give another")
-        if self.start == self.goal:
-            raise ValueError(f"start and goal are both {self.start}; give two different cells")
+        if start == goal:
+            raise ValueError(f"start and goal are both {start}; give two different cells")
+        if not self._leads_to_goal(self.move_rule):
+            others = [rule.value for rule in MoveRule if self._leads_to_goal(rule)]
+            remedy = f"give the move rule {others[0]}" if others else "open the map"
+            problem = f"no path leads from the start {start} to the goal {goal}"
+            rule = f"under the move rule {self.move_rule.value}"
+            raise ValueError(f"{problem} {rule}; give other cells, or {remedy}")
+
+    def _leads_to_goal(self, move_rule: MoveRule) -> bool:
+        reached = self.grid.reachable([self.start], move_rule)
+        return bool(reached[self.goal[1], self.goal[0]])
 
 
 def paper_scenario() -> Scenario:
@@ -55,6 +74,10 @@ class GridVectorEnvironment:
         parameters: HyperParameters,
         random: np.random.Generator | None = None,
     ) -> None:
+        if not scenarios or not all(isinstance(one, Scenario) for one in scenarios):
+            raise ValueError(f"the scenarios are {scenarios!r}; give at least one Scenario")
+        if not isinstance(parameters, HyperParameters):
+            raise ValueError(f"the parameters are {parameters!r}; give HyperParameters")
         shapes = {scenario.grid.occupancy.shape for scenario in scenarios}
         if len(shapes) != 1:
             raise ValueError(f"the maps have the sizes {sorted(shapes)}; give maps of one size")
@@ -95,9 +118,13 @@ class GridVectorEnvironment:
         self.cell[mask] = initial_cells(start, *free, p_r, self.random)
         self.visited[mask, 0] = self.cell[mask]
         self.steps[mask], self.total_reward[mask] = 0, 0.0
+        self.terminated[mask] = self.truncated[mask] = False
 
     def move(self, actions: NDArray[np.int64]) -> tuple[NDArray[Any], ...]:
         """Move each robot once, (N,) actions; return reward, terminated, truncated: (N,) each."""
+        actions = numbers("the actions", actions, self.cell.shape, "iu", (0, len(MOVES) - 1))
+        if (self.terminated | self.truncated).any():
+            raise ResetNeeded("an episode has ended; call reset before the next step")
         lookup = (self.scenario, actions, self.cell)
         legal, reward = self.legal[lookup], self.rewards[lookup]
         self.cell[:] = np.where(legal, self.next_cell[actions, self.cell], self.cell)
@@ -123,8 +150,13 @@ class GridEnvironment(gymnasium.Env[Observations, np.int64]):
     def __init__(
         self, scenario: Scenario | None = None, parameters: HyperParameters | None = None
     ) -> None:
-        parameters = replace(parameters or HyperParameters(), environments=1)
-        self.vector = GridVectorEnvironment([scenario or paper_scenario()], parameters)
+        if parameters is None:
+            parameters = HyperParameters()
+        if isinstance(parameters, HyperParameters):
+            parameters = replace(parameters, environments=1)
+        scenario = paper_scenario() if scenario is None else scenario
+        self.vector = GridVectorEnvironment([scenario], parameters)
+        self._is_begun = False
         self.action_space = gymnasium.spaces.Discrete(len(MOVES))
         self.observation_space = gymnasium.spaces.Box(
             OBSTACLE, max(GOAL, ROBOT), self.vector.shape, np.float32
@@ -137,11 +169,30 @@ class GridEnvironment(gymnasium.Env[Observations, np.int64]):
         super().reset(seed=seed)
         self.vector.random = self.np_random
         self.vector.reset()
+        self._is_begun = True
         return self._observe(), {}
 
     def step(self, action: np.int64) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
-        """Move the robot once."""
-        (reward,), (terminated,), (truncated,) = self.vector.move(np.array([action]))
+        """Move the robot once.
+
+        Raises
+        ------
+        ValueError
+            If the action is no whole number from 0 to 7.
+        gymnasium.error.ResetNeeded
+            Before the first `reset`, and after an episode has ended.
+        """
+        is_whole = isinstance(action, Integral) and not isinstance(action, bool)
+        is_array = (
+            isinstance(action, np.ndarray) and action.shape == () and action.dtype.kind in "iu"
+        )
+        if not (is_whole or is_array) or not 0 <= action < len(MOVES):
+            raise ValueError(
+                f"the action is {action!r}; give a whole number, 0 to {len(MOVES) - 1}"
+            )
+        if not self._is_begun:
+            raise ResetNeeded("no episode has begun; call reset before the first step")
+        (reward,), (terminated,), (truncated,) = self.vector.move(np.array([int(action)]))
         return self._observe(), float(reward), bool(terminated), bool(truncated), {}
 
     def _observe(self) -> Observations:

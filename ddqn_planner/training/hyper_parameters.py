@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+from ddqn_planner.grid.arguments import real
+
 
 def _number(default: Any, source: str, low: float, high: float) -> Any:
     return field(default=default, metadata={"source": source, "range": (low, high)})
@@ -50,11 +52,18 @@ class HyperParameters:
     def __post_init__(self) -> None:
         for entry in fields(self):
             value, choices = getattr(self, entry.name), entry.metadata.get("choices")
-            if choices is not None and value not in choices:
-                raise ValueError(f"{entry.name} is {value!r}; give one of {', '.join(choices)}")
-            low, high = entry.metadata.get("range", (value, value))
-            if not low <= value <= high:
-                raise ValueError(f"{entry.name} is {value}; it must lie in {low} to {high}")
+            if choices is not None:
+                if not isinstance(value, str) or value not in choices:
+                    raise ValueError(f"{entry.name} is {value!r}; give one of {', '.join(choices)}")
+                continue
+            is_whole, number = entry.type in (int, "int"), real(value)
+            low, high = entry.metadata["range"]
+            if isinstance(value, bool) or not low <= number <= high:
+                raise ValueError(f"{entry.name} is {value!r}; it must lie in {low} to {high}")
+            if is_whole and not number.is_integer():
+                raise ValueError(f"{entry.name} is {value!r}; give a whole number")
+            # Of any type, and the dataclass is frozen.
+            vars(self)[entry.name] = int(value) if is_whole else number
         count, most = self.environments, self.replay_capacity
         if count > most:
             raise ValueError(f"environments is {count}; give at most replay_capacity, {most}")

@@ -9,6 +9,7 @@ from torch import nn
 from ddqn_planner.experience.posterior import cells_of
 from ddqn_planner.experience.prior import FEATURES, UNUSUAL, Float32, Prior, map_features
 from ddqn_planner.grid import GridMap
+from ddqn_planner.grid.arguments import as_seed
 
 UNITS = 16
 RIDGE = 10.0  # the weight of so many places speaks against each linear prediction
@@ -44,7 +45,7 @@ def train_prior(new: Float32, older: Prior | None = None, seed: int = 0) -> Prio
     On a new map an older prior stays as long as it foretells these places better. Later its places
     are replayed, so that what it knew of other maps is not forgotten.
     """
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(as_seed(seed))
     old = new[:0] if older is None else older.replay
     known = {row.tobytes() for row in new[:, :-2]}  # a later drive tells of them anew
     old = old[[row.tobytes() not in known for row in old[:, :-2]]]

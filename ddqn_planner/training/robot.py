@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import GridMap, MoveRule
+from ddqn_planner.grid.arguments import as_seed
 from ddqn_planner.grid.footprint import read_footprint
 from ddqn_planner.grid.motions import HEADINGS, make_motions, read_lattice
 from ddqn_planner.model import ModelMetadata, RobotNetwork, package_version
@@ -63,7 +64,7 @@ class RobotTrainer:
         else:
             raise ValueError(f"motion is {motion}, lattice is {lattice}; give one of the two")
         self.network = RobotNetwork.untrained(read_footprint(footprint, padding), motions)
-        self.seed = seed
+        self.seed = seed = as_seed(seed)
         tensors, units = self.network.tensors, self.network.sizes["units"]
         counts = {name: min(4096, units * getattr(ROBOT, name)) for name in PER_UNIT}
         self.parameters = replace(ROBOT, **counts)

@@ -18,6 +18,7 @@ from safetensors import safe_open
 
 from ddqn_planner.files import as_path, differences, write_atomically
 from ddqn_planner.grid import MOVES
+from ddqn_planner.grid.arguments import as_seed, listed
 from ddqn_planner.model import (
     NETWORKS,
     ModelMetadata,
@@ -46,9 +47,9 @@ class Trainer:
     def __init__(
         self, scenarios: Sequence[Scenario], parameters: HyperParameters, seed: int
     ) -> None:
-        self.scenarios = tuple(scenarios)
+        self.scenarios = tuple(listed(scenarios, "the scenarios"))
         self.parameters = parameters
-        self.seed = seed
+        self.seed = seed = as_seed(seed)
         self.steps = self.updates = self.episodes = 0
 
         weights, *others = np.random.SeedSequence(seed).spawn(4)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import pickle
+import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -349,3 +351,43 @@ def test_a_file_of_an_older_version_is_read(path: Path) -> None:
     )
     np.savez(path, **{**old, "version": 1})
     assert at(HALL, Experience.load(path).slowness(HALL), 7, 5) == pytest.approx(3, rel=0.15)
+
+
+LINE = np.column_stack([np.linspace(0, 10, 41), np.zeros(41)])
+TIMES = np.linspace(0, 20, 41)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "positions", "reason"),
+    [
+        ([], np.zeros((0, 2)), "0 of 0 poses are possible .* give two or more"),
+        (TIMES[:1], LINE[:1], "1 of 1 poses"),
+        (TIMES * math.nan, LINE, "0 of 41 poses are possible .* finite seconds"),
+        (TIMES, LINE * math.nan, "0 of 41 poses"),
+        (TIMES, LINE + 1e9, "0 of 41 poses .* metres up to"),
+        (TIMES * 0, LINE, "1 of 41 poses are possible and differ in their time"),
+        (TIMES[::-1], LINE, "40 times are earlier than those before; sort them"),
+        (TIMES * 100, LINE, "the times are up to 50 s apart; give at most"),
+        (TIMES / 1000, LINE, r"the robot moves at 500 m/s; give metres"),
+        (TIMES, LINE * 0.001, "no farther than 0.01 m; give a longer drive"),
+    ],
+)
+def test_a_drive_that_teaches_nothing_says_why(seconds: Any, positions: Any, reason: str) -> None:
+    experience = Experience(nominal_speed=0.5, max_pause=20.0)
+    before = experience.to_bytes()
+    learned = experience.record(seconds, positions)
+    assert not learned
+    assert re.search(reason, learned.reason), learned
+    assert experience.to_bytes() == before
+
+
+def test_a_drive_says_how_much_it_taught() -> None:
+    experience = Experience(nominal_speed=0.5)
+    holes = LINE.copy()
+    holes[20] = math.nan
+    for positions in (LINE, holes):
+        learned = experience.record(TIMES, positions)
+        assert learned
+        assert 10 < learned.places < 60
+        assert 15 < learned.seconds <= 20.1
+        assert not learned.reason

@@ -202,6 +202,16 @@ def test_bad_input_is_refused_by_name(user: Trainee, tmp_path: FilePath) -> None
     user.train_on(state="training", message="the map's")
 
 
+def test_a_goal_that_no_path_reaches_is_refused(user: Trainee, tmp_path: FilePath) -> None:
+    walled = user.values.copy()
+    walled[:, 3] = 100
+    user.client.publish("map", map_message(walled, user.grid), LATCHED)
+    wait_for("refusal", lambda: re.search(r"no path .* \(0, 0\) .* \(5, 5\)", user.refusal()))
+    assert not (tmp_path / "run").exists()
+    user.client.publish("goal_pose", pose(user.grid, START))
+    wait_for("refusal", lambda: "start and goal are both (0, 0)" in user.refusal())
+
+
 def test_an_invalid_value_is_refused_with_its_reason_and_nothing_is_half_set(user: Trainee) -> None:
     good = message_of("replay_capacity", 3000), message_of("epsilon_end", 0.2)
     assert user.try_to_set(*good).successful

@@ -1,6 +1,8 @@
+import math
 import warnings
 from dataclasses import replace
 from math import dist, hypot
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -13,6 +15,7 @@ from ddqn_planner.model.networks import ROBOT, observation_background
 from ddqn_planner.training.environment import GridEnvironment, GridVectorEnvironment, Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
+WALLED = np.array([[0, 0, 1, 0], [0, 0, 1, 0], [1, 1, 0, 0]])
 PARAMETERS = HyperParameters(max_episode_steps=12)
 
 
@@ -138,3 +141,79 @@ def test_a_move_that_succeeds_is_rewarded_for_the_goal_only_beside_it(small: Sce
     rewarded = {(int(c) % 5, int(c) // 5) for _, c in np.argwhere(environment.free_reward[0])}
     # The goal (4, 0) is at the end of its row: the first cells of the next one are far from it.
     assert rewarded == {(3, 0), (3, 1), (4, 1)}
+
+
+@pytest.mark.parametrize("action", [-1, 8, 2.5, 2.0, math.nan, None, "2", True, [2], np.array([2])])
+def test_what_is_no_action_is_refused_and_changes_nothing(paper: Scenario, action: Any) -> None:
+    environment = GridEnvironment(paper, PARAMETERS)
+    before, _ = environment.reset(seed=0)
+    with pytest.raises(ValueError, match=r"the action is .*; give a whole number, 0 to 7"):
+        environment.step(action)
+    np.testing.assert_array_equal(environment._observe(), before)
+    with pytest.raises(ValueError, match="the actions"):
+        environment.vector.move(np.array([-1]))
+
+
+@pytest.mark.parametrize("kind", [int, np.int64, np.uint8, np.array])
+def test_each_integer_type_is_an_action(paper: Scenario, kind: Any) -> None:
+    results = []
+    for action in (3, kind(3)):
+        environment = GridEnvironment(paper, PARAMETERS)
+        environment.reset(seed=1)
+        results.append(environment.step(action))
+    np.testing.assert_array_equal(results[0][0], results[1][0])
+    assert results[0][1:] == results[1][1:]
+
+
+def test_no_step_is_made_before_a_reset_or_after_the_end(paper: Scenario) -> None:
+    environment = GridEnvironment(paper, replace(PARAMETERS, max_episode_steps=1))
+    with pytest.raises(gymnasium.error.ResetNeeded, match="call reset before the first step"):
+        environment.step(0)
+    for _ in range(2):
+        environment.reset(seed=0)
+        *_, terminated, truncated, _ = environment.step(0)
+        assert terminated or truncated
+        with pytest.raises(gymnasium.error.ResetNeeded, match="ended; call reset"):
+            environment.step(0)
+
+
+@pytest.mark.parametrize(
+    ("start", "goal", "rule", "reason"),
+    [
+        ((0, 0), (3, 0), "corner_cutting", r"no path .* \(0, 0\) .* \(3, 0\) .*open the map"),
+        ((0, 0), (3, 2), "robot_safe", "no path .* robot_safe; give other cells, or open the map"),
+        ((1, 1), (2, 2), "robot_safe", "robot_safe; .* give the move rule corner_cutting"),
+        ((2, 0), (0, 0), "robot_safe", r"the start \(2, 0\) is not a free cell"),
+        ((0, 0), (9, 0), "robot_safe", r"the goal \(9, 0\) is not a free cell"),
+        ((0, 0), (0, 0), "robot_safe", r"both \(0, 0\); give two different"),
+        ((0, 0), None, "robot_safe", "the goal is None; give two whole numbers"),
+        ((0, 0), (1, 1), "flying", "'flying' is unknown; give one of"),
+    ],
+)
+def test_a_scenario_that_no_path_solves_is_refused(
+    start: Any, goal: Any, rule: Any, reason: str
+) -> None:
+    occupancy = WALLED.copy()
+    if "open" in reason:
+        occupancy[2] = 1
+        occupancy[2, 3] = 0
+    with pytest.raises(ValueError, match=reason):
+        Scenario(GridMap(occupancy), start, goal, rule)
+
+
+def test_a_scenario_takes_cells_of_any_type_and_one_way_zones_count() -> None:
+    grid = GridMap(np.zeros((1, 3)))
+    scenario = Scenario(grid, [np.int8(0), 0], np.array([2, 0]), "robot_safe")  # type: ignore[arg-type]
+    assert (scenario.start, scenario.goal) == ((0, 0), (2, 0))
+    assert scenario.move_rule is MoveRule.ROBOT_SAFE
+    forbidden = np.array([[0, 255, 0]], np.uint8)
+    with pytest.raises(ValueError, match="no path"):
+        Scenario(GridMap(np.zeros((1, 3)), forbidden=forbidden), (0, 0), (2, 0))
+
+
+def test_only_scenarios_and_parameters_make_an_environment(paper: Scenario) -> None:
+    for scenarios in ([], ["office"], [paper, None]):
+        with pytest.raises(ValueError, match="give at least one Scenario"):
+            GridVectorEnvironment(scenarios, PARAMETERS)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="give HyperParameters"):
+        GridEnvironment(paper, 5)  # type: ignore[arg-type]

@@ -1,6 +1,7 @@
 """The replay buffer, and one update of each network beside the same written down from equations."""
 
 import copy
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,13 @@ from torch_layers import in_torch, propagation_layers
 from torch_learner import TorchLearner
 
 from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap, MoveRule
+from ddqn_planner.grid.arguments import as_seed
 from ddqn_planner.model import AnyMapQNetwork
 from ddqn_planner.model.move_costs import patches
 from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions
-from ddqn_planner.training.environment import Scenario
+from ddqn_planner.training.environment import Scenario, paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.robot import RobotTrainer
 from ddqn_planner.training.shared_background import adam, differentiate, evaluate, look, networks_of
 from ddqn_planner.training.trainer import Trainer
 
@@ -194,3 +197,36 @@ def test_an_update_is_the_equations_and_counts_each_reward_once(
     evaluation = by_online if target == "printed" else by_target
     loss = mean_squared_error(trainer, batch, by_online, selection, evaluation)
     check_update(trainer, loss, before)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "reason"),
+    [
+        ("steps", 2.5, "steps is 2.5; give a whole number"),
+        ("steps", True, "steps is True; it must lie in 1 to 1000000000"),
+        ("steps", None, "steps is None; it must lie in"),
+        ("gamma", "0.9", "gamma is '0.9'; it must lie in"),
+        ("gamma", math.nan, "gamma is nan"),
+        ("network", 5, "network is 5; give one of paper"),
+        ("network", ["paper"], "give one of paper"),
+    ],
+)
+def test_hyper_parameters_of_a_wrong_kind_are_named(name: str, value: Any, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        HyperParameters(**{name: value})
+
+
+def test_hyper_parameters_are_plain_numbers() -> None:
+    made = HyperParameters(steps=np.int64(7), batch_size=4.0, gamma=1)  # type: ignore[arg-type]
+    assert [type(value) for value in (made.steps, made.batch_size, made.gamma)] == [int, int, float]
+    assert made == HyperParameters(steps=7, batch_size=4, gamma=1.0)
+
+
+@pytest.mark.parametrize("seed", [-1, 0.5, True, None, "0", 2**63, math.nan])
+def test_a_seed_that_is_none_is_named(seed: Any) -> None:
+    with pytest.raises(ValueError, match=r"the seed is .*; give a whole number, 0 to 9223"):
+        as_seed(seed)
+    with pytest.raises(ValueError, match="the seed is"):
+        Trainer([paper_scenario()], HyperParameters(), seed)
+    with pytest.raises(ValueError, match="the seed is"):
+        RobotTrainer("0.2", "differential", 0.5, 0.25, None, seed)

@@ -1,0 +1,135 @@
+"""What users pass in wrongly is named, with a remedy, whatever its kind."""
+
+import json
+import math
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ddqn_planner import GridMap, Planner
+from ddqn_planner.grid.motions import make_motions, read_lattice
+
+GRID = GridMap(np.zeros((40, 40), np.bool_), 0.05).with_patch(np.ones((2, 2)), 30, 30)
+START, GOAL = (0.7, 1.0, 0.0), (1.2, 1.0, 0.0)
+# What stands in for any number, cell, pose, map or file.
+KINDS = (None, "text", math.nan, math.inf, -math.inf, -1, 1e300, 10**400, True, 2j, b"1", object())
+LISTS: tuple[Any, ...] = ([], [[]], (1,), (1, 2, 3, 4), {}, np.array([None]))
+
+
+@cache
+def cells() -> Planner:
+    return Planner.load("any_map")
+
+
+@cache
+def body() -> Planner:
+    return Planner.load("differential_robot")
+
+
+def calls(wrong: Any) -> Iterator[Any]:
+    """Yield calls in which one argument is wrong."""
+    here, there = (1, 1), (5, 5)
+    yield lambda: cells().plan(wrong, here, there)
+    yield lambda: cells().plan(GRID, wrong, there)
+    yield lambda: cells().plan(GRID, here, wrong)
+    yield lambda: cells().plan(GRID, here, there, tolerance=wrong)
+    yield lambda: cells().plan(GRID, here, there, start_clearing_radius=wrong)
+    yield lambda: cells().plan(GRID, here, there, simplified=wrong)
+    yield lambda: cells().plan(GRID, here, there, "robot_safe", wrong)
+    yield lambda: cells().plan_nearest(GRID, here, wrong)
+    yield lambda: cells().plan_nearest(GRID, here, [wrong])
+    yield lambda: cells().plan_through(GRID, here, wrong)
+    yield lambda: cells().q_field(GRID, wrong)
+    yield lambda: cells().q_field(GRID, here, wrong if wrong is not None else "x")
+    yield lambda: cells().q_field(GRID, there).rollout(wrong)
+    yield lambda: body().plan_poses(GRID, wrong, GOAL)
+    yield lambda: body().plan_poses(GRID, START, wrong)
+    yield lambda: body().plan_poses(GRID, START, [wrong])
+    yield lambda: body().plan_poses(GRID, START, GOAL, wrong)
+    yield lambda: body().plan_poses(GRID, START, GOAL, bound=wrong)
+    yield lambda: GRID.reachable(wrong, "unit")
+    yield lambda: GRID.reachable([here], wrong)
+    yield lambda: GRID.is_free(wrong)
+    yield lambda: GRID.cell_to_world(wrong)
+    yield lambda: GRID.world_to_cell(wrong, 1.0)
+    yield lambda: GRID.with_patch(wrong, 0, 0)
+    yield lambda: GRID.with_patch([[True]], wrong, 0)
+    yield lambda: GridMap(wrong)
+    yield lambda: GridMap(np.zeros((2, 2), np.bool_), resolution=wrong)
+    yield lambda: GridMap(np.zeros((2, 2), np.bool_), origin=wrong)
+
+
+@pytest.mark.parametrize("wrong", [*KINDS, *LISTS], ids=lambda wrong: repr(wrong)[:20])
+def test_each_error_about_a_wrong_kind_is_a_value_error_with_a_remedy(wrong: Any) -> None:
+    unclear = []
+    for number, call in enumerate(calls(wrong)):
+        try:
+            call()  # some kinds are right for some arguments
+        except ValueError as error:
+            if not re.search("give |; use |; cut it", str(error)):
+                unclear.append((number, str(error)))
+    assert not unclear
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "said"), [(0.5, "0.5"), ((1,), r"\(1,\)"), ("12", "'12'"), ((0, -1), "-1")]
+)
+def test_a_tolerance_of_poses_is_two_numbers(tolerance: Any, said: str) -> None:
+    with pytest.raises(ValueError, match=rf"tolerance is {said}; give two numbers \(metres, rad"):
+        body().plan_poses(GRID, START, GOAL, tolerance)
+
+
+@pytest.mark.parametrize("bound", [math.inf, 1e300, 10**400, 1e6])
+def test_any_path_is_within_an_infinite_bound(bound: float) -> None:
+    walled = GridMap(np.zeros((80, 80), np.bool_), 0.05).with_patch(np.ones((20, 2)), 40, 30)
+    least = body().plan_poses(walled, (1, 1, 0), (3, 3, 1), bound=1.0)
+    planned = Planner.load("differential_robot").plan_poses(
+        walled, (1, 1, 0), (3, 3, 1), bound=bound
+    )
+    assert planned.poses.size
+    assert least.cost is not None
+    assert planned.cost is not None
+    assert least.cost <= planned.cost <= planned.bound * least.cost * 1.001
+    closed = walled.with_patch(np.ones((80, 2)), 40, 0)
+    assert not body().plan_poses(closed, (1, 1, 0), (3, 3, 1), bound=bound).poses.size
+
+
+def test_a_model_with_a_body_has_no_q_field_of_cells() -> None:
+    with pytest.raises(ValueError, match="no Q field of cells; use plan_poses"):
+        body().q_field(GRID, (1, 1))
+
+
+def test_no_path_is_sought_from_an_occupied_cell() -> None:
+    with pytest.raises(ValueError, match=r"the cell \(30, 31\) is occupied; give free cells"):
+        GRID.reachable([(1, 1), (30, 31)], "unit")
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"heading_angles": [0.1] * 15}, "it has 15 headings; give 16"),
+        ({"heading_angles": [math.nan] * 16}, "headings; give 16"),
+        ({"grid_resolution": 0}, "grid_resolution is 0; give metres, > 0"),
+        ({"grid_resolution": "0.05"}, "grid_resolution is '0.05'; give metres"),
+        ({"start_angle_index": 16}, "start_angle_index is 16; give 0 to 15"),
+        ({"end_angle_index": -1}, "end_angle_index is -1; give 0 to 15"),
+        ({"poses": []}, "cannot be read as a lattice"),
+        ({"grid_resolution": 0.07}, "off the centres of cells; give a file of the same"),
+    ],
+)
+def test_a_wrong_lattice_is_named(tmp_path: Path, changes: Any, reason: str) -> None:
+    angles = make_motions("ackermann", 0.5, 0.05).angles.tolist()
+    about = {"grid_resolution": 0.05, "heading_angles": angles}
+    ahead = {"start_angle_index": 0, "end_angle_index": 0, "trajectory_length": 0.15}
+    ahead["poses"] = [[0.05, 0.0, 0.0], [0.15, 0.0, 0.0]]  # type: ignore[assignment]
+    about |= {key: value for key, value in changes.items() if key in about}
+    ahead |= {key: value for key, value in changes.items() if key in ahead}
+    file = tmp_path / "lattice.json"
+    file.write_text(json.dumps({"lattice_metadata": about, "primitives": [ahead]}))
+    with pytest.raises(ValueError, match=reason):
+        read_lattice(file)
