@@ -58,7 +58,7 @@ class Site(User):
         self.client.publisher(Odometry, f"{self.space}odom", BEST_EFFORT)
         self.client.wait_for_discovery("trainer")
         self.client.publish("map", map_message(VALUES, GRID), LATCHED, listeners)
-        self.state(state="recording", message="^recording$")
+        self.state(state="recording", message="^recording")
 
     def odometry(self, x: float, y: float) -> Odometry:
         stamp = Time(sec=int(self.now), nanosec=int(1e9 * (self.now % 1)))
