@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.one_way import forbidden_on
 from ddqn_planner.nodes.conversions import grid_from_message
-from ddqn_planner.nodes.report import PATIENCE, Report
+from ddqn_planner.nodes.report import Report
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode
 
 DIRECTIONS = "map_directions"
+PUBLISHER_WAIT = 1.0  # seconds for the first message of a publisher that was discovered
 LATE = "the map's directions were not received on {} yet"
 Forbidden = NDArray[np.uint8]
 Place = tuple[Any, ...]  # shape, resolution and origin of a map
@@ -66,8 +67,9 @@ class Directions:
         # server is seen before its map comes, as its directions have the first publisher.
         if self._awaited_since is None:
             self._awaited_since = time.monotonic()
-        if time.monotonic() - self._awaited_since < PATIENCE:
-            return f"{LATE.format(self.topic)}; a new publisher has {PATIENCE:g} s to send them"
+        if time.monotonic() - self._awaited_since < PUBLISHER_WAIT:
+            late = LATE.format(self.topic)
+            return f"{late}; a new publisher has {PUBLISHER_WAIT:g} s to send them"
         self._know_publishers()
         return ""
 
