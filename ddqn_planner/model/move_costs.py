@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -21,6 +22,25 @@ VALUES = OCCUPIED - UNKNOWN + 1
 # Above all true ones. Time and memory of a field grow with it, and a broken model predicts any.
 MAX_MULTIPLIER = 20 * MAX_COST_MULTIPLIER
 OUTSIDE = 512  # the patch of cells outside the map: no move leads out of them
+LARGE = 2**21  # cells of a map whose patches are read where a field grows
+MARGIN = 64  # rows beyond those of a start and goals that are read at first
+SEEN = 2  # rows beyond those that a field closes cells in, of which it looks at patches
+
+
+class Rows:
+    """Which rows of a large map were read; several threads may use it."""
+
+    def __init__(self, grid: GridMap, first: int = 0, end: int = 0) -> None:
+        self.grid, self.first, self.end = grid, first, end
+        self.lock = threading.Lock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy has: it reads anew, under a lock of its own."""
+        return {"grid": self.grid}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Begin as a copy."""
+        self.__init__(**state)  # type: ignore[misc]
 
 
 class MoveCosts(NamedTuple):
@@ -41,6 +61,7 @@ class MoveCosts(NamedTuple):
     diagonal: float  # no diagonal move costs less
     low: Array  # (L,): with terms, the least multiplier by the least value of a map; or empty
     least: float = 1.0  # no multiplier on the map is less
+    rows: Rows | None = None  # whose patches and values were read; None for all
 
     @classmethod
     def of_table(cls, table_PA: Array) -> MoveCosts:
@@ -61,10 +82,11 @@ class MoveCosts(NamedTuple):
         for box in boxes:
             # The patches of the cells around see the box, too.
             around, seen = (wider(box, by, shape) for by in (1, 2))
+            self.read(around[0].start, around[0].stop)
             layers = [(name, getattr(grid, name)) for name in LAYERS]
             parts = {name: layer[seen].copy() for name, layer in layers if layer is not None}
             part = grid.with_layers(**parts)
-            of_part = self.on(part)
+            of_part = self.on(part, is_part=True)
             highest, least = max(after.highest, of_part.highest), min(after.least, of_part.least)
             after = after._replace(highest=highest, least=least)
             for name in ("patch", "value", "multiplier", "uphill"):
@@ -74,16 +96,29 @@ class MoveCosts(NamedTuple):
                     new = new[within(around, seen, 1)]
                     layer = replaced(layer, within(around, ORIGIN, 1), new)
                     after = after._replace(**{name: layer.ravel()})
+        if self.rows is not None:
+            after = after._replace(rows=Rows(grid, self.rows.first, self.rows.end))
         return after
 
-    def on(self, grid: GridMap, patch: NDArray[Any] | None = None) -> MoveCosts:
+    def on(
+        self, grid: GridMap, patch: NDArray[Any] | None = None, is_part: bool = False
+    ) -> MoveCosts:
         """Return the costs on a map, whose patches may be known, with all of its layers."""
-        value, least = self.value, self.least
+        value, least, rows = self.value, self.least, None
         if patch is None:
             cost = grid.cost if self.terms.size else None
-            patch, value, lowest = read_cells(grid.occupancy, cost)
+            if grid.occupancy.size > LARGE and grid.forbidden is None and not is_part:
+                # Pages of memory that no field needs are never touched.
+                cells, rows = (grid.height + 2) * (grid.width + 2), Rows(grid)
+                patch = np.zeros(cells, np.uint16)
+                value = np.zeros(cells if cost is not None else 0, np.uint8)
+                lowest = _lowest(grid.occupancy, cost)
+            else:
+                patch, value, lowest = read_cells(grid.occupancy, cost)
             least = float(self.low[lowest + 1]) if cost is not None else 1.0
-        costs = self._replace(patch=patch, value=value, width=grid.width + 2, least=least)
+        costs = self._replace(
+            patch=patch, value=value, width=grid.width + 2, least=least, rows=rows
+        )
         if grid.forbidden is not None:
             forbidden = _with_border(grid.forbidden, 0).ravel()
             patch, table = _with_directions(patch, self.table, forbidden)
@@ -98,6 +133,44 @@ class MoveCosts(NamedTuple):
             steepest = float(UPHILL[uphill.max()].max())
             costs = costs._replace(uphill=uphill, highest=steepest * costs.highest)
         return costs
+
+    def read(self, first: int, end: int) -> tuple[int, int]:
+        """Read the patches of some rows, and of all between them and those that were read.
+
+        Return the first cell that a field may close, and the end of these cells, as numbers.
+        """
+        rows = self.rows
+        if rows is None:
+            return 0, self.patch.size
+        height = rows.grid.height
+        first, end = max(first, 0), min(end, height)
+        with rows.lock:
+            if rows.first == rows.end:
+                rows.first = rows.end = min(first, height - 1)
+            self._read_rows(first, rows.first)
+            self._read_rows(rows.end, end)
+            rows.first, rows.end = min(first, rows.first), max(end, rows.end)
+            # Row y of the map is row y + 1 of the padded one.
+            low = 0 if rows.first == 0 else rows.first + 1 + SEEN
+            high = height + 2 if rows.end == height else max(rows.end + 1 - SEEN, 0)
+        return low * self.width, high * self.width
+
+    def _read_rows(self, first: int, end: int) -> None:
+        """Read the patches and values of the rows from the first one to before the end."""
+        if first >= end or self.rows is None:
+            return
+        grid, has_costs = self.rows.grid, self.value.size > 0
+        around = slice(max(first - 1, 0), min(end + 1, grid.height))
+        occupied = np.ones((end - first + 2, self.width), np.bool_)
+        occupied[around.start - first + 1 : around.stop - first + 1, 1:-1] = grid.occupancy[around]
+        cost = grid.cost[first:end] if has_costs and grid.cost is not None else None
+        patch, value, _ = _read_padded(occupied, cost)
+        # The border below the first row, and that above the last one, belong to the rows read.
+        inside = slice(first > 0, len(patch) - (end < grid.height))
+        into = slice(first + inside.start, first + inside.stop)
+        self.patch.reshape(-1, self.width)[into] = patch[inside]
+        if has_costs:
+            self.value.reshape(-1, self.width)[into] = value[inside]
 
 
 def _with_directions(
@@ -138,15 +211,38 @@ def read_cells(
 
     A patch has bit 3 y + x where its cell (x, y) is occupied.
     """
-    occupied = _with_border(occupancy, 1).view(np.uint8)
+    patch, value, lowest = _read_padded(_with_border(occupancy, 1), cost)
+    return patch.ravel(), value.ravel(), lowest
+
+
+def _read_padded(
+    padded: NDArray[np.bool_], cost: NDArray[np.int8] | None
+) -> tuple[NDArray[np.uint16], NDArray[np.uint8], int]:
+    """Do the work of `read_cells`, given the occupancy with a border; return arrays with one."""
+    occupied = padded.view(np.uint8)
     occupied.flags.writeable = False  # as costs are: numba compiles once for both
     patch = np.full(occupied.shape, OUTSIDE, np.uint16)
     if cost is None:
         _read_cells(occupied, occupied, patch, patch.view(np.uint8), False)
-        return patch.ravel(), np.empty(0, np.uint8), OCCUPIED
+        return patch, np.empty(0, np.uint8), OCCUPIED
     value = np.full(occupied.shape, VALUES - 1, np.uint8)
     lowest = _read_cells(occupied, cost.view(np.uint8), patch, value, True)
-    return patch.ravel(), value.ravel(), int(lowest)
+    return patch, value, int(lowest)
+
+
+def _lowest(occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None) -> int:
+    """Return the least cost, unknown most, as `read_cells` does; of most maps soon."""
+    lowest = OCCUPIED
+    rows = max(1, LARGE // occupancy.shape[1] // 8)
+    for first in range(0, len(occupancy) if cost is not None else 0, rows):
+        assert cost is not None
+        some = slice(first, first + rows)
+        # An unknown cell has a cost of 255 here, and an occupied one 0.
+        costs = cost[some].view(np.uint8) + occupancy[some] * np.uint8(OCCUPIED)
+        lowest = min(lowest, int(costs.min()))
+        if lowest == 0:
+            break
+    return lowest
 
 
 @in_place

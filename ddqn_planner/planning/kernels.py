@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ddqn_planner.compiled import in_place, inlined, inner
 from ddqn_planner.grid import MOVES
 from ddqn_planner.grid.moves import UPHILL
-from ddqn_planner.model.move_costs import VALUES, MoveCosts
+from ddqn_planner.model.move_costs import MARGIN, VALUES, MoveCosts
 
 # States. The distance of an open cell may fall; that of a closed one is the least. Until a cell is
 # reached its distance is 0: then pages of memory that no request needs are never touched.
@@ -23,6 +23,9 @@ AT_GOAL: Final = 5e-324  # the goal's distance: not 0, and as good as 0 in every
 CAPACITY = 4.0  # cells of a bucket, at first, per cell of a square map's side
 BUCKETS: Final = 2  # per unit of cost; more mean fewer visits of cells that a start does not need
 SAME: Final = 1 + 1e-12  # paths cost the same up to this factor: sums of floats are rounded
+
+# Why a field stopped growing: it is done, a bucket is full, or cells of the map were not read.
+DONE, FULL, UNREAD = 0, 1, 2
 
 MOVE_X, MOVE_Y = MOVES.T.copy()
 
@@ -86,8 +89,10 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
     ring = 1 << int((costs.highest + bounds[1]) * buckets + 2).bit_length()
     capacity = 9 + int(CAPACITY * math.sqrt(distance.size))
     offsets = (MOVE_Y * costs.width + MOVE_X).astype(np.uint64)
-    is_full = True
-    while is_full:
+    first_row, end_row = _rows_around(opened, start, costs)
+    closable = costs.read(first_row, end_row)
+    end = FULL
+    while end != DONE:
         order = np.empty(opened.size, np.int64)
         count = _order(distance, state, opened, order, (start, bounds, buckets, costs.width))
         opened, order = opened[:count], order[:count]
@@ -95,13 +100,28 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
             first = np.argsort(order)
             opened, order = opened[first], order[first]
         bucket, used = np.empty((ring, capacity), np.int32), np.zeros(ring, np.int64)
-        how = start, bounds, buckets, limit, offsets
+        how = start, bounds, buckets, limit, offsets, closable
         queue = opened, order, bucket, used
-        taken, visited, is_full = _grow(distance, state, queue, how, costs[:7])
+        taken, visited, end = _grow(distance, state, queue, how, costs[:7])
         left = [bucket[slot, : used[slot]] for slot in used.nonzero()[0]]
         opened = np.concatenate([opened[taken:], *left])
-        limit, capacity = limit - visited, 4 * capacity
+        limit -= visited
+        if end == FULL:
+            capacity *= 4
+        elif end == UNREAD:
+            more = end_row - first_row
+            first_row, end_row = first_row - more, end_row + more
+            closable = costs.read(first_row, end_row)
     return Known(distance, state, opened, is_final), limit >= 0 or not opened.size
+
+
+def _rows_around(opened: NDArray[np.int32], start: int, costs: MoveCosts) -> tuple[int, int]:
+    """Return the rows of the map to read before a field grows: the first one, and their end."""
+    height = costs.patch.size // costs.width - 2
+    if not start or costs.rows is None or not opened.size:
+        return 0, height
+    rows = [cell // costs.width - 1 for cell in (start, int(opened.min()), int(opened.max()))]
+    return min(rows) - MARGIN, max(rows) + 1 + MARGIN
 
 
 @in_place
@@ -132,15 +152,19 @@ def _remaining(x: int, y: int, bounds: Any) -> Any:
 
 
 @in_place
-def _grow(distance: Any, state: Any, queue: Any, how: Any, costs: Any) -> tuple[int, int, bool]:
-    """Do the work of `grow`, with the open cells in their order, until a bucket may be full."""
+def _grow(distance: Any, state: Any, queue: Any, how: Any, costs: Any) -> tuple[int, int, int]:
+    """Do the work of `grow`, with the open cells in their order, until a bucket may be full.
+
+    It stops, too, before a cell around which the map was not read.
+    """
     patch, table, value, terms, _, _, width = costs
     opened, order, bucket, used = queue
-    start, bounds, buckets, limit, offsets = how
+    start, bounds, buckets, limit, offsets, closable = how
+    low, high = np.uint64(closable[0]), np.uint64(closable[1])
     start_y, start_x = start // width, start % width
     ring, most = bucket.shape[0], bucket.shape[1] - 8
-    taken, queued, front, visited, is_full = 0, 0, 0, 0, False
-    while visited <= limit and not is_full:
+    taken, queued, front, visited, end = 0, 0, 0, 0, DONE
+    while visited <= limit and end == DONE:
         if queued == 0:
             if taken == opened.size:
                 break
@@ -150,7 +174,7 @@ def _grow(distance: Any, state: Any, queue: Any, how: Any, costs: Any) -> tuple[
             break
         slot = np.uint64(front & (ring - 1))
         read = 0
-        while not is_full:
+        while end == DONE:
             if taken < opened.size and order[taken] <= front:
                 cell = np.uint64(opened[taken])
                 taken += 1
@@ -163,6 +187,10 @@ def _grow(distance: Any, state: Any, queue: Any, how: Any, costs: Any) -> tuple[
                 break
             if state[cell] != OPEN:
                 continue
+            if cell < low or cell >= high:
+                end = UNREAD
+                taken -= opened.size > 0 and taken > 0 and opened[taken - 1] == cell
+                break
             state[cell] = CLOSED
             visited += 1
             here = distance[cell]
@@ -196,10 +224,10 @@ def _grow(distance: Any, state: Any, queue: Any, how: Any, costs: Any) -> tuple[
                 new = np.uint64((new if new > front else front) & (ring - 1))
                 bucket[new, np.uint64(used[new])] = previous
                 used[new] += 1
-                is_full |= used[new] > most
+                end |= used[new] > most
                 queued += 1
         front += 1
-    return taken, visited, is_full
+    return taken, visited, end
 
 
 # What changes of the map take back

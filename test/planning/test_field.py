@@ -16,13 +16,24 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
 from networks import ANY_MAP, new_planner
 from random_maps import generate_map
-from strategies import GRIDS, RULES, Data, Place, cells_of, patched, shapes
+from strategies import (
+    GRIDS,
+    RULES,
+    Data,
+    Place,
+    cells_of,
+    grids_with_costs,
+    grids_with_free_cell,
+    patched,
+    shapes,
+)
 
-from ddqn_planner import GridMap, MoveRule, PlanStatus
+from ddqn_planner import GridMap, MoveRule, Plan, Planner, PlanStatus
 from ddqn_planner.grid import Cell, copies, grid_map
 from ddqn_planner.grid.grid_map import LAYERS
 from ddqn_planner.grid.moves import MOVES, legal_moves, move_costs, shortest_distances
 from ddqn_planner.grid.noise import random_requests
+from ddqn_planner.model import move_costs as move_costs_module
 from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning import field as fields
 from ddqn_planner.planning import kernels
@@ -419,6 +430,51 @@ def test_threads_ask_a_field_for_what_others_compute() -> None:
 
     with ThreadPoolExecutor(4) as threads:
         assert all(threads.map(ask, range(4)))
+
+
+def grown_by_rows(planner: Planner, grid: GridMap, start: Cell, goal: Cell, rule: MoveRule) -> Plan:
+    """A plan for which patches are read row by row, as on a large map."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(move_costs_module, "LARGE", 0)
+        patch.setattr(kernels, "MARGIN", 0)
+        return planner.plan(grid, start, goal, rule)
+
+
+@settings(max_examples=150)
+@given(grids_with_costs() | grids_with_free_cell(), RULES, st.data())
+def test_where_patches_are_read_as_a_field_grows_plans_are_the_same(
+    place: Place, rule: MoveRule, data: Data
+) -> None:
+    grid, goal = place
+    at_once, by_rows = new_planner(), new_planner()
+    for _ in range(3):
+        start = data.draw(cells_of(place[0]))
+        plan = grown_by_rows(by_rows, grid, start, goal, rule)
+        assert plan == at_once.plan(grid, start, goal, rule)
+        grid = data.draw(patched(grid))  # its field is repaired
+
+
+def test_few_rows_of_a_large_map_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(move_costs_module, "LARGE", 2**16)
+    side = 1000
+    cost = np.zeros((side, side), np.int8)
+    grid, planner = GridMap(np.zeros((side, side)), cost=cost), new_planner()
+    for changed in (grid, grid.with_patch([[True]], 505, 500)):
+        assert planner.plan(changed, (500, 500), (560, 500)).path.size
+        (field,) = planner.fields._kept
+        assert isinstance(field, DistanceField)
+        rows = field.costs.rows
+        assert rows is not None
+        assert 0 < rows.first < 500 < rows.end < side
+        assert rows.end - rows.first < 300
+    # Around a wall, it has to look on.
+    wall = np.zeros((side, side), np.bool_)
+    wall[1:, 530] = True
+    walled = GridMap(wall, cost=cost)
+    plan = planner.plan(walled, (500, 500), (560, 500))
+    monkeypatch.setattr(move_costs_module, "LARGE", side**2)
+    assert plan == new_planner().plan(walled, (500, 500), (560, 500))
+    assert plan.path[:, 1].min() == 0
 
 
 def new_maps(side: int, kind: str) -> Iterator[GridMap]:
