@@ -11,8 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ddqn_planner import GridMap, Planner
+from ddqn_planner import GridMap, MoveRule, Planner
 from ddqn_planner.grid.motions import make_motions, read_lattice
+from ddqn_planner.planning.paths import is_path_valid
+from ddqn_planner.planning.plan import PlanRequest
+from ddqn_planner.planning.planner import last_step
 
 GRID = GridMap(np.zeros((40, 40), np.bool_), 0.05).with_patch(np.ones((2, 2)), 30, 30)
 START, GOAL = (0.7, 1.0, 0.0), (1.2, 1.0, 0.0)
@@ -133,3 +136,12 @@ def test_a_wrong_lattice_is_named(tmp_path: Path, changes: Any, reason: str) -> 
     file.write_text(json.dumps({"lattice_metadata": about, "primitives": [ahead]}))
     with pytest.raises(ValueError, match=reason):
         read_lattice(file)
+
+
+def test_a_path_far_beyond_the_map_takes_no_memory() -> None:
+    far = [(0, 0), (2 * 10**9, 0)]
+    assert not is_path_valid(far, (0, 0), GRID, "unit")
+    assert not is_path_valid([*far, (5, 0)], (0, 0), GRID, "unit")
+    assert is_path_valid([(0, 0), (5, 0)], (0, 0), GRID, "unit")
+    request = PlanRequest(GRID, (0, 0), ((5, 0),), MoveRule.UNIT, under_way=far)
+    assert last_step(cells().steps(request)).goal == (5, 0)

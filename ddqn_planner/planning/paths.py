@@ -150,6 +150,13 @@ def _near(cells: NDArray[np.bool_], centre: Cell, distance: float) -> NDArray[np
 # The path under way
 
 
+def _near_map(cells: Any, grid: GridMap) -> Any:
+    """Return cells of which none is farther outside the map than its sides are long."""
+    # Along a segment to a cell 1e9 m away lie more cells than memory holds.
+    size = np.array([grid.width, grid.height])
+    return np.clip(cells, -size, 2 * size).astype(np.int32)
+
+
 def is_path_valid(
     path: Cells, robot: Cell, grid: GridMap, move_rule: MoveRule | str, radius: float = 0.0
 ) -> bool:
@@ -157,6 +164,7 @@ def is_path_valid(
     cells = np.asarray(path, dtype=np.int32).reshape(-1, 2)
     if not len(cells):
         return False
+    cells = _near_map(cells, grid)
     passed, position = cells_along(cells)
     at = np.hypot(*(passed - np.array(robot, dtype=np.float64)).T).argmin()
     if grid.contains(robot) and not grid.is_free(robot):
@@ -178,6 +186,7 @@ def rest_of_path(path: Cells, robot: Cell, grid: GridMap, move_rule: MoveRule | 
     cells = np.asarray(path, dtype=np.int32).reshape(-1, 2)
     if not len(cells) or not grid.is_free(robot):
         return cells[:0]
+    cells = _near_map(cells, grid)
     passed, position = cells_along(cells)
     following = position.astype(np.int64) + 1
     distances = np.abs(passed - robot).max(axis=1)
