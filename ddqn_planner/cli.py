@@ -38,9 +38,12 @@ MODEL: Final = "name or file (default: %(default)s)"
 
 
 def exit_code(program: str, run: Callable[[], int]) -> int:
-    """Return what a program returns, or 2 after a line that names its error."""
+    """Return what a program returns, or 2 after a line that names its error; 130 after Ctrl-C."""
     try:
         return run()
+    except KeyboardInterrupt:
+        print(f"{program}: interrupted", file=sys.stderr)
+        return 130
     except (OSError, ValueError, ImportError, MemoryError, OverflowError) as error:
         print(f"{program}: {with_remedy(error)}", file=sys.stderr)
         return 2
@@ -417,7 +420,10 @@ COMMANDS: Final = {function.__name__.replace("_", "-"): function for function in
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; return 0 done, 1 no path or proof, 2 bad input or a missing library."""
+    """Run the command line; return 0 done, 1 no path or proof, 2 bad input or a missing library.
+
+    130 is returned after Ctrl-C.
+    """
     # NumPy is not yet imported. For small products one thread is as fast as several, and on a busy
     # machine several are ten times as slow.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

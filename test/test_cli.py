@@ -177,3 +177,15 @@ def test_files_that_cannot_be_written_are_named_before_a_plan(console: Any, tmp_
             error = console("plan dilemma", option, wrong, status=2).err
             assert re.search(f"(no regular file|cannot be written).*; give another {option}", error)
     assert not any(tmp_path.iterdir())
+
+
+def test_an_interrupted_compilation_ends_with_one_line(tmp_path: Path) -> None:
+    command = [executable("ddqn-planner"), "warm-up"]
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    child = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
+    assert child.stderr is not None
+    assert "compiles its functions" in child.stderr.readline()
+    child.send_signal(signal.SIGINT)
+    assert child.wait(PATIENCE) == 130
+    assert child.stderr.read() == "ddqn-planner: interrupted\n"
+    child.stderr.close()

@@ -1,10 +1,14 @@
 """The three ROS 2 nodes and the message conversions; nothing else of the package imports rclpy."""
 
+import logging
 import os
 import signal
 import sys
+import traceback
+from contextlib import suppress
 from functools import partial
 from importlib import import_module
+from typing import NoReturn
 
 from ddqn_planner.resources import with_remedy
 
@@ -13,17 +17,27 @@ from ddqn_planner.resources import with_remedy
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
-def run(name: str) -> int:
-    """Run a node; return its exit code, which is 1 if a library is missing."""
-    # Until the node listens to it, Ctrl-C ends the process: Python drops exceptions that a signal
-    # raises inside a callback of the import system, and then the node would start all the same.
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+def run(name: str) -> NoReturn:
+    """Run a node, and end the process; its exit code is 1 if the node cannot start."""
+    # Until the node listens to signals, one of them ends the process: nothing is there to be saved.
+    # Not by an exception, as Python drops those that come inside a callback of the import system.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: os._exit(0))
+    code = 1
     try:
-        module = import_module(f"{__name__}.{name}")
+        code = int(import_module(f"{__name__}.{name}").main())
     except ImportError as error:
         print(f"{name}: {with_remedy(error)}", file=sys.stderr)
-        return 1
-    return int(module.main())
+    except Exception:
+        traceback.print_exc()
+    # Python's own end frees all that numba has compiled, for seconds on a busy machine. It stops
+    # threads in the middle of LLVM, too, and may then wait without end for a lock that one holds.
+    # The node has saved what it has to save, DDS has left the graph, and these are written:
+    logging.shutdown()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError, AttributeError):  # it is closed, or there is none
+            stream.flush()
+    os._exit(code)
 
 
 run_map_server, run_planner, run_trainer = (

@@ -22,7 +22,7 @@ from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidHandle, NameValidationException, ParameterException
-from rclpy.executors import SingleThreadedExecutor, await_or_execute
+from rclpy.executors import Executor, SingleThreadedExecutor, await_or_execute
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -53,6 +53,8 @@ STEADY = Clock(clock_type=ClockType.STEADY_TIME)  # for timers, without simulate
 # The middleware drops requests that do not fit into the queue, and the node cannot see it: ROS's
 # default of ten lost half of 20 requests. Fast DDS keeps 5,000 messages by default.
 SERVICE_QUALITY = QoSProfile(depth=5000)
+
+CALLBACK_PATIENCE = 0.5  # seconds that a callback may take after a signal to stop
 
 # What parameters may change of each subscription.
 OVERRIDABLE = [QoSPolicyKind[name] for name in ("HISTORY", "DEPTH", "DURABILITY", "RELIABILITY")]
@@ -276,10 +278,10 @@ class Worker:
         finally:
             task.cancel()
 
-    def close(self) -> None:
-        """Wait until all calls have ended; take no more."""
+    def close(self, patience: float | None = None) -> None:
+        """Wait until all calls have ended, or so many seconds; take no more."""
         self._calls.put(None)
-        self._thread.join()
+        self._thread.join(patience)
 
 
 @coroutine
@@ -319,13 +321,12 @@ def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | 
             words = filter(None, (f"{kind}, default {value}", limits, "read-only" * read_only))
             print(f"  {name}: {'; '.join(words)}\n      {description}")
         return 0
-    stopping = threading.Event()
+    stop = StopSignal()
     try:
         # With rclpy's handlers, nothing could be published any more when the node ends.
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         executor = SingleThreadedExecutor()
-        # A task, not a flag: the executor wakes and returns.
-        _at_signals(lambda: executor.create_task(stopping.set))
+        stop.listen(executor)
         unread = remove_ros_args(sys.argv)[1:]
         if parameters and unread:
             remedy = "give settings after --ros-args, as in --ros-args -p robot_radius:=0.3"
@@ -337,23 +338,58 @@ def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | 
         get_logger("ddqn_planner").fatal(f"cannot start: {error}")
         rclpy.try_shutdown()
         return 1
+    except Interrupted:
+        rclpy.try_shutdown()
+        return 0
     try:
         executor.add_node(node)
-        while not stopping.is_set():
+        while not stop.has_come:
             executor.spin_once()
+    except Interrupted:
+        pass
     finally:
+        stop.obeyed.set()
         node.destroy_node()
         executor.shutdown()
         rclpy.shutdown()
     return 0
 
 
-def _at_signals(function: Callable[[], object]) -> None:
-    """Have a thread call a function at the first SIGINT or SIGTERM."""
-    # Python's handlers run in the main thread, and not while that waits for messages.
-    heard, told = os.pipe()
-    os.set_blocking(told, False)
-    signal.set_wakeup_fd(told, warn_on_full_buffer=False)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: None)
-    threading.Thread(target=lambda: os.read(heard, 1) and function(), daemon=True).start()
+class Interrupted(BaseException):
+    """Ends a callback in which the main thread is long after a signal to stop."""
+
+
+class StopSignal:
+    """The first SIGINT or SIGTERM. It ends what the main thread does."""
+
+    def __init__(self) -> None:
+        self.has_come = self._is_late = False
+        self.obeyed = threading.Event()
+        """The main thread runs no callback any more: from now on, it saves."""
+
+    def listen(self, executor: Executor) -> None:
+        """Hear the signals from now on, and wake the executor."""
+        # Python's handlers run in the main thread, and not while that waits for messages.
+        heard, told = os.pipe()
+        os.set_blocking(told, False)
+        signal.set_wakeup_fd(told, warn_on_full_buffer=False)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
+
+        def wait() -> None:
+            os.read(heard, 1)
+            # A task, not a flag: the executor wakes and returns.
+            executor.create_task(self._come)
+            # It may compile in a callback, or wait for a thread that does.
+            while not self.obeyed.wait(CALLBACK_PATIENCE):
+                self._is_late = True
+                signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
+
+        threading.Thread(target=wait, daemon=True).start()
+
+    def _come(self) -> None:
+        self.has_come = True
+
+    def _on_signal(self, *_: object) -> None:
+        if self._is_late and not self.obeyed.is_set():
+            raise Interrupted

@@ -43,6 +43,8 @@ HYPER_PARAMETERS: Final = {
     for entry in fields(HyperParameters)
 }
 
+FIRST_STEP_PATIENCE = 0.5  # seconds
+
 PARAMETERS: Final = {
     "learn_from": Declared(
         "simulation", "Episodes, or the robot's drives", ["simulation", "driving"], read_only=True
@@ -241,8 +243,16 @@ class TrainerNode(BaseNode):
         if self._has_begun:  # newer releases destroy a node that cannot start, and some twice
             self._has_begun = False
             self._learner.stop()
-            self.worker.close()  # torch, half imported, may fail when the process ends
+            self._wait_for_training()
         super().destroy_node()
+
+    def _wait_for_training(self) -> None:
+        """Wait until a training has saved. The worker's import of torch has nothing to save."""
+        run = self._run
+        if run is not None and self.state == "training":
+            # Before its first step a training compiles, for a minute perhaps, and has no news.
+            has_news = run.trainer.steps > self._first_step
+            self.worker.close(None if has_news else FIRST_STEP_PATIENCE)
 
     # A training in simulation: what `Driving` has, too
 
@@ -257,7 +267,7 @@ class TrainerNode(BaseNode):
             return self.fail("the training cannot start", error)
         self.state, self.error, self.save_error = "training", "", ""
         self.refusals.refused.clear()
-        self._run, self._run_map = run, place
+        self._run, self._run_map, self._first_step = run, place, run.trainer.steps
         run.on_saved = self._tell_saved
         self.get_logger().info(run.description)
         self.worker.call(self._train, run, place)

@@ -365,29 +365,3 @@ def test_requests_wait_for_the_first_map_and_model_and_another_one_set_meanwhile
 def test_a_planner_that_is_stopped_waits_for_no_model(run_waiting: Any) -> None:
     with run_waiting("/loads_for_ever") as robot:
         robot.node.wait_for_log("a model waits")
-
-
-INTERRUPTED = """
-import os, signal, sys, weakref
-
-class Place: pass
-
-def interrupt(_):
-    os.kill(os.getpid(), signal.SIGINT)
-    for _ in range(100): pass  # here Python would raise KeyboardInterrupt, and drop it
-
-class Finder:
-    def find_spec(name, path, target=None):
-        if name == {module!r}:
-            weakref.ref(Place(), interrupt)
-
-sys.meta_path.insert(0, Finder)
-"""
-
-
-@pytest.mark.parametrize("module", ["nodes.planner_node", "grid", "planning", "nodes.nav2"])
-def test_a_signal_ends_a_planner_that_still_imports_its_modules(run_node: Any, module: str) -> None:
-    interrupted = INTERRUPTED.format(module=f"ddqn_planner.{module}")
-    code = -signal.SIGINT
-    with run_node("planner_node", exit_code=code, sitecustomize=interrupted) as node:
-        assert node.process.wait(TIMEOUT) == code
