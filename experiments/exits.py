@@ -9,20 +9,20 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from processes import claim_ros_domain, executable, run_script, running
 from tables import table
 
 RUNS = 10  # of each node
-FIRST_SECONDS = 10.0  # of a node, in which the signal comes
+FIRST_SECONDS = 8.0  # of a node, in which the signal comes
 SETTLE = 3.0  # seconds until a load is one
 LIMIT = 2.0  # seconds that an exit may take
 NODES: Mapping[str, Mapping[str, object]] = {
     "map_server_node": {"yaml_filename": "office"},
     "planner_node": {},
-    "trainer_node": {"map_file": "dilemma", "steps": 10**9},
+    "trainer_node": {},
 }
 
 
@@ -53,28 +53,28 @@ def catches(process: int, number: signal.Signals) -> bool:
 
 
 def stop_node(
-    name: str, delay: float, number: signal.Signals, code_folder: Path, n_busy: int, starts: bool
+    name: str, delay: float, number: signal.Signals, code_folder: Path, n_busy: int
 ) -> Exit:
     """Start a node, send it a signal some time after its own first line, and wait for its end."""
-    parameters = {**NODES[name], "output_folder": code_folder / "training"}
-    if name != "trainer_node":
-        del parameters["output_folder"]
-    words = [word for key, value in parameters.items() for word in ("-p", f"{key}:={value}")]
+    words = [word for key, value in NODES[name].items() for word in ("-p", f"{key}:={value}")]
     command = [executable(name), "--ros-args", "--log-level", "fatal", *words]
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(code_folder)}
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    with running(*command, env=environment, **quiet) as child:
-        # Before that, Python itself starts, and a signal ends it as any program.
-        while not catches(child.pid, signal.SIGTERM):
-            time.sleep(0.001)
-        if starts:
-            call = ["ros2", "service", "call", "/trainer/start", "std_srvs/srv/Trigger"]
-            subprocess.run(call, check=True, stdout=subprocess.DEVNULL)
-        time.sleep(delay)
-        with busy_processes(n_busy):
-            began = time.monotonic()
-            child.send_signal(number)
-            return Exit(child.wait(), time.monotonic() - began)
+    log = code_folder.with_suffix(".log")
+    with log.open("ab") as file:
+        output: Any = {"stdout": file, "stderr": file, "env": environment}
+        with running(*command, **output) as child:
+            # Before that, Python itself starts, and a signal ends it as any program.
+            while not catches(child.pid, signal.SIGTERM):
+                time.sleep(0.001)
+            time.sleep(delay)
+            with busy_processes(n_busy):
+                began = time.monotonic()
+                child.send_signal(number)
+                code = child.wait()
+                seconds = time.monotonic() - began
+    if code:
+        print(log.read_text())
+    return Exit(code, seconds)
 
 
 def summary(exits: Sequence[Exit]) -> list[object]:
@@ -102,7 +102,7 @@ def main(arguments: Sequence[str]) -> int:
                     delay = FIRST_SECONDS if is_late else random.uniform(0, FIRST_SECONDS)
                     folder = warm if is_late else Path(name, f"{node}_{run}")
                     number = (signal.SIGINT, signal.SIGTERM)[run % 2]
-                    stopped.append(stop_node(node, delay, number, folder, n_busy, False))
+                    stopped.append(stop_node(node, delay, number, folder, n_busy))
                 exits += stopped
                 rows.append([node, when, *summary(stopped)])
     print(table("node | stopped | runs | exit codes | median (s) | slowest (s)", rows))
