@@ -150,11 +150,12 @@ def _near(cells: NDArray[np.bool_], centre: Cell, distance: float) -> NDArray[np
 # The path under way
 
 
-def _near_map(cells: Any, grid: GridMap) -> Any:
+def _near_map(cells: NDArray[np.int32], grid: GridMap) -> NDArray[np.int32]:
     """Return cells of which none is farther outside the map than its sides are long."""
     # Along a segment to a cell 1e9 m away lie more cells than memory holds.
     size = np.array([grid.width, grid.height])
-    return np.clip(cells, -size, 2 * size).astype(np.int32)
+    near: NDArray[np.int32] = np.clip(cells, -size, 2 * size).astype(np.int32)
+    return near
 
 
 def is_path_valid(
