@@ -7,7 +7,8 @@ import numpy as np
 from ddqn_planner.experience import Experience
 from ddqn_planner.grid import GridMap
 from ddqn_planner.planning import Planner
-from ddqn_planner.planning.paths import is_path_valid
+from ddqn_planner.planning.exact_paths import exact_path
+from ddqn_planner.planning.paths import rest_of_path
 
 
 def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
@@ -26,8 +27,10 @@ def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
         yield from (None, None)  # there is no rest
         return
     planner.plan(grid, start, goal, simplified=True)
+    leg, rule = np.array([start, goal], np.int32), planner.metadata.move_rule
+    exact_path([leg], grid, rule, [(0.6, 0.7), grid.cell_to_world(goal)])
     planner.plan(grid.with_patch([[True]], 1, 1), start, goal)
-    is_path_valid([start, goal], start, grid, planner.metadata.move_rule)
+    rest_of_path([start, goal], start, grid, rule)
     yield
     # From an obstacle there is a way out, to where a path begins, perhaps in one direction only.
     obstacle = free.copy()

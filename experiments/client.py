@@ -6,6 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
+from itertools import pairwise
 from subprocess import Popen
 from typing import Any, TypeVar
 
@@ -29,9 +30,8 @@ from std_msgs.msg import Header
 
 from ddqn_planner.grid import OCCUPIED, Cell, GridMap, MapFile, MoveRule, read_map_file
 from ddqn_planner.grid.noise import random_requests
-from ddqn_planner.nodes.conversions import occupancy_message, quaternion, turns
+from ddqn_planner.nodes.conversions import occupancy_message, quaternion
 from ddqn_planner.nodes.report import seconds
-from ddqn_planner.planning.paths import is_path_valid
 from ddqn_planner.resources import find_map
 
 RULE = MoveRule.ROBOT_SAFE  # of the planner's default model
@@ -329,17 +329,44 @@ class MapFixture:
 
     def error(self, request: GetPlan.Request, plan: Path) -> str:
         """Say what is wrong with an answer for a robot that cuts no corners; "" if nothing is."""
-        grid, cells = self.grid, [cell_of(self.grid, stamped) for stamped in turns(plan.poses)]
+        grid = self.grid
         start, goal = (cell_of(grid, pose) for pose in (request.start, request.goal))
-        if not cells:
+        if not plan.poses:
             both_free = grid.is_free(start) and grid.is_free(goal)
             possible = both_free and grid.reachable([start], RULE)[goal[::-1]]
             return f"no path from {start} to {goal}, where there is one" if possible else ""
-        if (cells[0], cells[-1]) != (start, goal):
-            return f"a path from {cells[0]} to {cells[-1]}, asked was {start} to {goal}"
+        points = np.array([point_of(stamped) for stamped in plan.poses])
+        for point, pose in ((points[0], request.start), (points[-1], request.goal)):
+            if point.tolist() != [*point_of(pose)]:
+                return f"a path from {points[0]} to {points[-1]}, asked was {start} to {goal}"
+        cells = cells_passed(grid, points)
         # A robot on an obstacle may leave it, and what is next to it.
-        legal = is_path_valid(cells, start, grid, RULE, radius=1)
-        return "" if legal else f"an illegal segment in {cells}"
+        leaving = 0
+        while leaving < len(cells) and not grid.is_free(cells[leaving]):
+            leaving += 1
+        is_right = all(map(grid.is_free, cells[leaving:])) and leaving < len(cells)
+        is_right &= all(np.hypot(*np.subtract(cell, start)) <= 1 for cell in cells[:leaving])
+        for (x, y), (to_x, to_y) in pairwise(cells[leaving:]):
+            is_right &= grid.is_free((to_x, y)) and grid.is_free((x, to_y))
+        return "" if is_right else f"an illegal segment in {points.tolist()}"
+
+
+def point_of(stamped: PoseStamped) -> tuple[float, float]:
+    """Return where a pose is."""
+    return stamped.pose.position.x, stamped.pose.position.y
+
+
+def cells_passed(grid: GridMap, points: NDArray[np.float64]) -> list[Cell]:
+    """Return the cells at points of a path, each a twentieth of a cell from the next."""
+    spacing = grid.resolution / 20
+    cells: list[Cell] = []
+    for begin, end in pairwise([*points, points[-1]]):
+        count = int(np.hypot(*(end - begin)) / spacing) + 2
+        for x, y in np.linspace(begin, end, count).tolist():
+            cell = grid.world_to_cell(x, y)
+            if cells[-1:] != [cell]:
+                cells.append(cell)
+    return cells
 
 
 def generated_map(kind: str, side: int, resolution: float = 0.05, seed: Any = 0) -> MapFixture:

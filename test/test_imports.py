@@ -120,7 +120,8 @@ CODE = """
 import sys
 import numpy as np
 from ddqn_planner import Experience, GridMap, Planner
-from ddqn_planner.planning.paths import is_path_valid
+from ddqn_planner.planning.exact_paths import exact_path
+from ddqn_planner.planning.paths import rest_of_path
 from ddqn_planner.warm_up import warm_up
 
 
@@ -160,13 +161,14 @@ def ask(planner):
     for layers in ({}, {"cost": costs}, {"slowness": slowness}, {"forbidden": forbidden}):
         grid = GridMap(occupancy, **layers)
         for simplified in (False, True):
-            planner.plan(grid, (2, 2), (40, 4), simplified=simplified)
+            plan = planner.plan(grid, (2, 2), (40, 4), simplified=simplified)
+            exact_path([plan.path], grid, plan.move_rule, [(2.3, 2.6), (40.5, 4.9)])
         planner.plan(grid, (2, 2), (40, 38), tolerance=40)
         patched = grid.with_patch([[True]], 20, 2)
         planner.plan(patched, (2, 2), (40, 4))
         planner.plan(patched, (20, 2), (40, 4), start_clearing_radius=1)
         planner.plan(experience.apply(grid), (2, 2), (40, 4))
-        is_path_valid([(2, 2), (9, 4), (30, 4)], (2, 2), grid, "robot_safe")
+        rest_of_path([(2, 2), (9, 4), (30, 4)], (2, 2), grid, "robot_safe")
 
 
 planner = Planner.load(sys.argv[1])

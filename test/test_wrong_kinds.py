@@ -13,7 +13,7 @@ import pytest
 
 from ddqn_planner import GridMap, MoveRule, Planner
 from ddqn_planner.grid.motions import make_motions, read_lattice
-from ddqn_planner.planning.paths import is_path_valid
+from ddqn_planner.planning.path_check import invalid_poses
 from ddqn_planner.planning.plan import PlanRequest
 from ddqn_planner.planning.planner import last_step
 
@@ -140,8 +140,7 @@ def test_a_wrong_lattice_is_named(tmp_path: Path, changes: Any, reason: str) -> 
 
 def test_a_path_far_beyond_the_map_takes_no_memory() -> None:
     far = [(0, 0), (2 * 10**9, 0)]
-    assert not is_path_valid(far, (0, 0), GRID, "unit")
-    assert not is_path_valid([*far, (5, 0)], (0, 0), GRID, "unit")
-    assert is_path_valid([(0, 0), (5, 0)], (0, 0), GRID, "unit")
+    poses = np.array([(x + 0.5, y + 0.5, 0.0) for x, y in (*far, (5, 0))])
+    assert invalid_poses(poses, GRID).tolist() == [1]
     request = PlanRequest(GRID, (0, 0), ((5, 0),), MoveRule.UNIT, under_way=far)
     assert last_step(cells().steps(request)).goal == (5, 0)

@@ -398,13 +398,18 @@ class GridMap:
 
     def world_to_cell(self, x: float, y: float) -> Cell:
         """Return the cell of a point, in metres; it owns its lower edges, and may lie outside."""
-        origin_x, origin_y, yaw = self.origin
-        dx, dy = arguments.real(x) - origin_x, arguments.real(y) - origin_y
-        column = (math.cos(yaw) * dx + math.sin(yaw) * dy) / self.resolution
-        row = (-math.sin(yaw) * dx + math.cos(yaw) * dy) / self.resolution
+        column, row = self.in_cells(arguments.real(x), arguments.real(y))
         if not (math.isfinite(column) and math.isfinite(row)):
             raise ValueError(f"the point is {(x, y)}; give finite metres x, y")
         return math.floor(column), math.floor(row)
+
+    def in_cells(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """Return a point in metres, or each of many (arrays), in cells from the map's corner."""
+        origin_x, origin_y, yaw = self.origin
+        dx, dy = x - origin_x, y - origin_y
+        column = (math.cos(yaw) * dx + math.sin(yaw) * dy) / self.resolution
+        row = (-math.sin(yaw) * dx + math.cos(yaw) * dy) / self.resolution
+        return column, row
 
     def cell_to_world(self, cell: Cell) -> tuple[float, float]:
         """Return the centre of a cell in the map frame, in metres."""

@@ -4,8 +4,6 @@ import array
 import hashlib
 import math
 import pickle
-from collections.abc import Sequence
-from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -19,8 +17,8 @@ from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.grid.arguments import Cells
 from ddqn_planner.grid.body import grid_from_costmap
 from ddqn_planner.grid.map_file import MAX_CELLS
-from ddqn_planner.grid.moves import positions
 from ddqn_planner.grid.rotations import Rotation
+from ddqn_planner.planning.exact_paths import dense
 
 Origin = tuple[float, float, float]
 Float64 = NDArray[np.float64]
@@ -37,7 +35,6 @@ BLANK_POSES = pickle.dumps(
         for _ in range(64)
     ]
 )
-SAME_DIRECTION = 1e-6  # radians: poses along a segment are rounded
 
 
 def grid_from_message(message: OccupancyGrid, *rules: Any) -> GridMap:
@@ -92,19 +89,19 @@ def occupancy_message(
 
 
 def path_message(
-    centres: Float64, yaws: Float64, header: Header, last: Quaternion | None = None
+    points: Float64, yaws: Float64, header: Header, last: Quaternion | None = None
 ) -> Path:
-    """Make a path message of positions and directions, see `path_bytes`."""
+    """Make a path message of points and directions, see `path_bytes`."""
     path = Path(header=header)
     # Most of an answer's time is making messages. Poses in the same direction share a quaternion,
     # and all are copies, which take a quarter of the time of the messages' constructors.
     poses: list[PoseStamped] = []
-    while len(poses) < len(centres):
+    while len(poses) < len(points):
         poses += pickle.loads(BLANK_POSES)
-    del poses[len(centres) :]
+    del poses[len(points) :]
     towards = {yaw: quaternion(yaw) for yaw in {*yaws.tolist()}}
     orientations = [*map(towards.get, yaws.tolist()), last]
-    places = centres.tolist()
+    places = points.tolist()
     for stamped, (x, y), orientation in zip(poses, places, orientations, strict=False):
         stamped.header = header
         stamped.pose.orientation = orientation
@@ -114,24 +111,50 @@ def path_message(
     return path
 
 
-def along(cells: Cells, grid: GridMap, is_dense: bool = False) -> tuple[Float64, Float64]:
-    """Return positions on a path (N, 2), at most a cell apart if dense, and headings (N - 1)."""
+def along(points: Float64, spacing: float = math.inf) -> tuple[Float64, Float64]:
+    """Return points on a path (N, 2), at most a spacing apart, and headings (N - 1)."""
+    x, y = np.diff(points, axis=0).T
+    yaws = np.arctan2(y, x)
+    if len(yaws) and math.isfinite(spacing):
+        points, piece = dense(points, spacing)
+        yaws = yaws[piece]
+    return points, yaws
+
+
+def centres(cells: Cells, grid: GridMap) -> Float64:
+    """Return the centres of cells in metres, (N, 2)."""
     x, y = np.asarray(cells, dtype=np.float64).reshape(-1, 2).T
-    yaws = grid.origin[2] + np.arctan2(np.diff(y), np.diff(x))
-    if is_dense and x.size:
-        at = positions(np.ceil(np.hypot(np.diff(x), np.diff(y))).astype(np.int64))
-        yaws = yaws[at[:-1].astype(np.int64)]
-        x, y = (np.interp(at, np.arange(x.size), axis) for axis in (x, y))
-    return np.column_stack(grid.centres(x, y)), yaws
+    return np.column_stack(grid.centres(x, y))
 
 
-def turns(poses: Sequence[PoseStamped]) -> list[PoseStamped]:
-    """Return the first and last of some poses, and those where their path turns."""
-    points = np.array([complex(p.pose.position.x, p.pose.position.y) for p in poses])
-    with np.errstate(invalid="ignore"):  # two poses at one place, or NaN
-        directions = np.diff(points) / np.abs(np.diff(points))
-        is_turn = ~(np.abs(np.diff(directions)) < SAME_DIRECTION)
-    return [*compress(poses, [True, *is_turn, True])] if len(poses) > 2 else [*poses]
+def frame_of(path: Path) -> str:
+    """Return the frame of a path, or of its first pose where the path names none."""
+    frame = path.header.frame_id or (path.poses[0].header.frame_id if path.poses else "")
+    return str(frame)
+
+
+def poses_of(path: Path, with_yaw: bool = True) -> Float64:
+    """Return the poses of a path, (N, 3), with the yaw 0 if it does not count; or a ValueError."""
+    if not path.poses:
+        raise ValueError("the path has no pose; give one or more")
+    poses = [stamped.pose for stamped in path.poses]
+    array = np.zeros((len(poses), 3))
+    array[:, :2] = [(pose.position.x, pose.position.y) for pose in poses]
+    if with_yaw:
+        array[:, 2] = [rotation(pose.orientation).yaw for pose in poses]
+    is_finite = np.isfinite(array).all(axis=1)
+    if not is_finite.all():
+        number = int(is_finite.argmin())
+        raise ValueError(f"pose {number} of the path is {array[number]}; give finite numbers")
+    return array
+
+
+def moved(poses: Float64, origin: Origin) -> Float64:
+    """Return poses (N, 3) of a frame in the one where the frame's origin is given."""
+    x, y, yaw = poses.T
+    cos, sin = math.cos(origin[2]), math.sin(origin[2])
+    points = origin[0] + cos * x - sin * y, origin[1] + sin * x + cos * y
+    return np.column_stack([*points, yaw + origin[2]])
 
 
 def path_bytes(

@@ -161,6 +161,11 @@ class MapSource:
         return self._used.header
 
     @property
+    def unknown(self) -> NDArray[np.bool_] | None:
+        """Return which cells of the map are unknown, (H, W) bool; None without a map."""
+        return _values(self._used.message) < 0 if self._used is not None else None
+
+    @property
     def missing(self) -> str:
         """Why there is no map to plan on, and what to do; empty with a map."""
         try:

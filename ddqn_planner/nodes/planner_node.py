@@ -1,6 +1,7 @@
 """The planner node: plans on the map from the robot's pose to the goal pose."""
 
 import ctypes
+import math
 from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from dataclasses import replace
@@ -282,9 +283,17 @@ class PlannerNode(ManagedNode):
     async def _on_is_path_valid(self, request: Any, response: Any) -> Any:
         """Answer Nav2's IsPathValid: whether the robot can drive the rest of a path."""
         response.is_valid = False
+        has_success = hasattr(response, "success")  # with it, Nav2 needs the robot's pose
         try:
-            checking = self._requests.is_path_valid(request.path)
-            response.is_valid = await unless(checking, lambda: self._refusal) is True
+            checking = self._requests.invalid_poses(request, needs_robot=has_success)
+            invalid = await unless(checking, lambda: self._refusal)
+            if isinstance(invalid, Outcome):
+                raise ValueError(invalid.reason)
+            response.is_valid = not invalid
+            if has_success:
+                response.success = True
+            if hasattr(response, "invalid_pose_indices"):
+                response.invalid_pose_indices = invalid
         except Exception as error:  # as when no memory is left: the node must survive
             self.get_logger().warning(f"no path to check: {str(error) or repr(error)}")
         return response
@@ -347,7 +356,8 @@ def _paths(outcome: Outcome, *makers: Callable[..., Any]) -> list[Any]:
         return [Path(header=header) for _ in makers]
     if isinstance(plan, PosePlan):
         return [make(plan.poses[:, :2], plan.poses[:, 2], header) for make in makers]
-    along_path = along(plan.path, outcome.request.grid, outcome.is_dense)
+    spacing = outcome.request.grid.resolution if outcome.is_dense else math.inf
+    along_path = along(outcome.path.points, spacing)
     return [make(*along_path, header, outcome.goal.pose.orientation) for make in makers]
 
 

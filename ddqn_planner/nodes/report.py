@@ -15,6 +15,7 @@ from std_msgs.msg import Header
 from ddqn_planner.grid import Cell
 from ddqn_planner.nodes.runtime import BaseNode
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus, unknown_space
+from ddqn_planner.planning.exact_paths import NO_PATH, ExactPath
 from ddqn_planner.planning.plan import PosePlan
 from ddqn_planner.planning.pose_planner import PoseRequest
 
@@ -55,9 +56,15 @@ class Outcome:
     plan: Plan = field(default_factory=lambda: Plan(PlanStatus.NO_PATH))
     goal: PoseStamped | None = None  # in the map's frame
     map_header: Header | None = None  # of the map that it was planned on
+    path: ExactPath = field(default=NO_PATH, compare=False)  # of a disc, between exact poses
     is_dense: bool = False  # whether its path has a pose at least every cell
     header: Header = field(default_factory=Header)  # of its path
     last_reached: int = ALL_GOALS  # of several goals, the index of the one where the path ends
+
+    @property
+    def length(self) -> float:
+        """Length of its path in cells."""
+        return self.plan.length if isinstance(self.plan, PosePlan) else self.path.length
 
 
 NO_REQUEST = Outcome("NO_REQUEST", "no plan was asked for yet")
@@ -66,7 +73,12 @@ NOT_ACTIVE = Outcome("NOT_ACTIVE", f"the node is not active; configure and activ
 
 
 def reason_of(
-    request: Request, plan: Plan, start: PoseStamped, goal: PoseStamped, robot_radius: float
+    request: Request,
+    plan: Plan,
+    start: PoseStamped,
+    goal: PoseStamped,
+    robot_radius: float,
+    path: ExactPath = NO_PATH,
 ) -> str:
     """Say how a path between two poses was found, or why there is none and what to do."""
     grid, has_body = request.grid, isinstance(plan, PosePlan)
@@ -99,18 +111,19 @@ def reason_of(
         return f"{reason}; {remedy}"
     several = len(goals) > 1
     number = f" to goal {reached(request, plan) + 1} of {len(goals)}" if several else ""
-    how = "by greedy steps"
+    how, length = "by greedy steps", path.length
     if isinstance(plan, PosePlan):
+        length = plan.length
         how = f"by greedy steps, of at most {plan.bound:.3g} times the least cost"
         if math.isinf(plan.bound):
             how = "kept, as there is none from the cell and heading nearest to the start"
     elif plan.method is not PlanMethod.GREEDY:
         how = "searched for in the order of the Q field: the greedy steps were trapped"
-    reason = f"a path of {plan.length:.2f} cells{number}, {how}"
+    reason = f"a path of {length:.2f} cells{number}, {how}"
     if plan.extra_cost:
         reason += f", kept: its cost is {plan.extra_cost:+.1%} beside that of a new one"
     if plan.goal is not None and plan.goal not in goals and not several:
-        metres = math.dist(plan.goal, goals[0]) * grid.resolution
+        metres = math.dist(plan.goal, goals[0]) * grid.resolution  # as the tolerance counts
         why = "is cut off" if grid.is_free(goals[0]) else "is occupied"
         reason += f"; the goal {why} and moved {metres:.3g} m"
     if grid.is_obstacle(plan.path[0]):
@@ -217,7 +230,7 @@ class Report(Refusals):
             "status": outcome.status,
             "reason": outcome.reason,
             "method": plan.method.value,
-            "path length (cells)": f"{plan.length:.3f}",
+            "path length (cells)": f"{outcome.length:.3f}",
             "field time (ms)": f"{plan.field_ms:.3f}",
             "rollout time (ms)": f"{plan.rollout_ms:.3f}",
             "planned on the map of (s)": seconds(of_map.stamp) if of_map else "",

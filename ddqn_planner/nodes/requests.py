@@ -4,8 +4,7 @@ import gc
 import math
 import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import SimpleNamespace
@@ -13,15 +12,15 @@ from typing import Any, TypeVar
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Path
 from rclpy.task import Future
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
+from ddqn_planner.grid.footprint import read_footprint
 from ddqn_planner.grid.motions import HEADINGS
 from ddqn_planner.model import find_model
 from ddqn_planner.model.certificate import NO_CERTIFICATE
-from ddqn_planner.nodes.conversions import cell_from_pose, pose_of, turns
+from ddqn_planner.nodes.conversions import cell_from_pose, frame_of, moved, pose_of, poses_of
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.poses import Places
 from ddqn_planner.nodes.report import (
@@ -36,9 +35,12 @@ from ddqn_planner.nodes.report import (
 from ddqn_planner.nodes.retries import FAILURES, Retries
 from ddqn_planner.nodes.runtime import BaseNode, Worker
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus
+from ddqn_planner.planning.exact_paths import NO_PATH, ExactPath, exact_path
 from ddqn_planner.planning.field import shift_between
-from ddqn_planner.planning.paths import is_path_valid, rest_of_path
+from ddqn_planner.planning.path_check import LETHAL, invalid_poses
+from ddqn_planner.planning.paths import rest_of_path
 from ddqn_planner.planning.plan import PosePlan, joined
+from ddqn_planner.planning.pose_paths import points_of
 from ddqn_planner.planning.pose_planner import PoseRequest
 from ddqn_planner.warm_up import warm_up
 
@@ -346,7 +348,8 @@ class Requests:
             plans.append(await self._plan(planner, request))
         plan, number = joined(plans) if more else plans[0], len(plans)
         before, goal = poses[number - 1], poses[number + reached(request, plan)]
-        reason = reason_of(request, plan, before, goal, settings.robot_radius)
+        path = _exact_path(plans, request, [*poses[:number], goal]) if len(plan.path) else NO_PATH
+        reason = reason_of(request, plan, before, goal, settings.robot_radius, path)
         last_reached = ALL_GOALS
         if more and not len(plan.path):
             missed = names[number - 1]
@@ -355,7 +358,9 @@ class Requests:
             reason = f"{missed}: {reason}"
             if settings.allow_partial_planning and number > 1 and not has_via_points:
                 plan, goal = joined(plans[:-1]), poses[number - 1]
-                reason = f"a partial path of {plan.length:.2f} cells, {reason}"
+                path = _exact_path(plans, request, poses)
+                length = path.length or plan.length
+                reason = f"a partial path of {length:.2f} cells, {reason}"
                 last_reached = number - 2
         return Outcome(
             plan.status.name,
@@ -365,6 +370,7 @@ class Requests:
             plan,
             goal,
             map_header=header,
+            path=path,
             is_dense=settings.path_simplification == "straight",
             last_reached=last_reached,
         )
@@ -389,25 +395,48 @@ class Requests:
             plan = await self.worker.run(next, steps)
         return plan
 
-    async def is_path_valid(self, path: Path) -> bool:
-        """Return whether a path is free now, from the robot on, or all of it if that is unknown."""
+    async def invalid_poses(self, request: Any, needs_robot: bool) -> list[int]:
+        """Return the poses of Nav2's IsPathValid that are not free, from the robot on.
+
+        A ValueError says why the path cannot be judged. Where the robot's pose is unknown and not
+        needed, all poses count.
+        """
         header, grid, planner = await self._inputs()
-        frame, settings = header.frame_id, self.settings
-        poses = [PoseStamped(header=path.header, pose=stamped.pose) for stamped in path.poses]
-        # What a straight path passes between its turns is known, between its poses not.
-        poses = turns(poses) if planner.pose_planner is None else poses
-        cells = [cell_from_pose("the path", pose, grid, frame) for pose in poses]
-        if not cells:
-            return False
-        robot, cell = poses[0], cells[0]
-        with suppress(RequestError):
+        body = None if planner.pose_planner is None else planner.pose_planner.points
+        if footprint := getattr(request, "footprint", ""):
+            body = points_of(read_footprint(footprint), grid.resolution)
+        if layer := getattr(request, "layer_name", ""):
+            missing = f"layer_name is {layer!r}, and the planner has one map without layers"
+            raise ValueError(f"{missing}; leave it empty")
+        poses = poses_of(request.path, with_yaw=body is not None)
+        frame = frame_of(request.path) or header.frame_id
+        if frame != header.frame_id:
+            origin = PoseStamped(header=Header(frame_id=frame))
+            origin.pose.orientation.w = 1.0
+            in_map, _ = await self._in_map(grid, header.frame_id, "the path", origin)
+            poses = moved(poses, pose_of(in_map))
+        robot = None
+        try:
             start = await self._wait_for(self.places.start)
-            robot, cell = await self._in_map(grid, frame, "the start", start)
-        if planner.pose_planner is not None:
-            way, anywhere = np.array([*map(pose_of, poses)]), (np.inf, np.inf)
-            return len(planner.pose_planner.rest_of(way, pose_of(robot), grid, anywhere)) > 0
-        rule = MoveRule(settings.move_rule or planner.metadata.move_rule)
-        return is_path_valid(cells, cell, grid, rule, _clearing_radius(settings, grid))
+            start, _ = await self._in_map(grid, header.frame_id, "the start", start)
+            robot = pose_of(start)[:2]
+        except RequestError:
+            if needs_robot:
+                raise
+        unknown = None
+        if getattr(request, "consider_unknown_as_obstacle", False):
+            unknown = self.map.unknown
+        invalid: list[int] = invalid_poses(
+            poses,
+            grid,
+            robot=robot,
+            body=body,
+            unknown=unknown,
+            max_cost=getattr(request, "max_cost", LETHAL),
+            distance=getattr(request, "max_lookahead_distance", 0.0),
+            clearing_radius=_clearing_radius(self.settings, grid),
+        ).tolist()
+        return invalid[:1] if getattr(request, "stop_at_first_collision", True) else invalid
 
     async def _inputs(self) -> tuple[Header, GridMap, Planner]:
         """Return the header of the map of now, this map ready to plan on, and the planner."""
@@ -460,6 +489,15 @@ def check_request(goals: list[PoseStamped], planner_id: str, known_id: str) -> N
     if planner_id not in ("", known_id):
         remedy = f"give {known_id!r} or '' as the planner_id, or set the parameter 'planner_id'"
         raise RequestError("INVALID_PLANNER", f"there is no planner {planner_id!r}; {remedy}")
+
+
+def _exact_path(plans: list[Plan], request: Any, poses: Sequence[PoseStamped]) -> ExactPath:
+    """Return a disc's path along the plans that have one, through poses; none for a body."""
+    legs = [plan.path for plan in plans if plan.path.size]
+    if isinstance(request, PoseRequest):
+        return NO_PATH
+    points = [pose_of(stamped)[:2] for stamped in poses[: len(legs) + 1]]
+    return exact_path(legs, request.grid, request.move_rule, points)
 
 
 def _clearing_radius(settings: SimpleNamespace, grid: GridMap) -> float:

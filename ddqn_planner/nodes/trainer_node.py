@@ -310,7 +310,7 @@ class TrainerNode(BaseNode):
                 for episode in episodes:
                     self._rewards.publish(Float32(data=episode.average_reward))
                     if episode.number % self.value("episode_interval") == 0:
-                        positions = conversions.along(episode.cells, place.grid)[0]
+                        positions = conversions.centres(episode.cells, place.grid)
                         executor.create_task(self.draw, place.frame, positions)
             ends = "stopped" if "stop" in run.asked else "finished"
         except Exception as error:  # the node must survive any error
@@ -331,7 +331,7 @@ class TrainerNode(BaseNode):
         if self._run is not None and self._run.folder == file.parent:
             place = self._run_map
         episodes = read_cells(file, self.value("episode_interval"))
-        return place.frame, (conversions.along(cells, place.grid)[0] for cells in episodes)
+        return place.frame, (conversions.centres(cells, place.grid) for cells in episodes)
 
     def look(self) -> dict[str, str]:
         """Return what the diagnostics say of it, each second."""

@@ -158,30 +158,6 @@ def _near_map(cells: NDArray[np.int32], grid: GridMap) -> NDArray[np.int32]:
     return near
 
 
-def is_path_valid(
-    path: Cells, robot: Cell, grid: GridMap, move_rule: MoveRule | str, radius: float = 0.0
-) -> bool:
-    """Return whether any path is free and legal from its cell nearest to the robot on."""
-    cells = np.asarray(path, dtype=np.int32).reshape(-1, 2)
-    if not len(cells):
-        return False
-    cells = _near_map(cells, grid)
-    passed, position = cells_along(cells)
-    at = np.hypot(*(passed - np.array(robot, dtype=np.float64)).T).argmin()
-    if grid.contains(robot) and not grid.is_free(robot):
-        free = (index for index in range(at, len(passed)) if grid.is_free((*passed[index],)))
-        out = next(free, len(passed))
-        obstacles = obstacles_in_the_way(grid, robot, radius)
-        leaving = GridMap(obstacles, forbidden=grid.forbidden)
-        if not legal_segments(passed[at : out + 1], leaving, move_rule).all():
-            return False
-        at = out
-    if at == len(passed):
-        return False
-    begin, segment = np.modf(position[at])
-    return _legal_from(cells[int(segment) :], grid, move_rule, begin) == 0
-
-
 def rest_of_path(path: Cells, robot: Cell, grid: GridMap, move_rule: MoveRule | str) -> Path:
     """Return what is left of a path from a robot's cell on, (N, 2): empty if it is too far."""
     cells = np.asarray(path, dtype=np.int32).reshape(-1, 2)
@@ -225,8 +201,8 @@ def keep_or_switch(request: PlanRequest, new: Path) -> tuple[Path, float | None]
     return way, cost / new_cost - 1 if new_cost else 0.0
 
 
-def _legal_from(cells: Path, grid: GridMap, move_rule: MoveRule | str, begin: float = 0.0) -> int:
+def _legal_from(cells: Path, grid: GridMap, move_rule: MoveRule | str) -> int:
     """Return the first cell of a path from which on all of it is legal; N if its end is not."""
     # As a segment of no length the last cell has to be free too.
-    legal = legal_segments(np.concatenate([cells, cells[-1:]]), grid, move_rule, begin)
+    legal = legal_segments(np.concatenate([cells, cells[-1:]]), grid, move_rule)
     return int(np.flatnonzero(~legal).max(initial=-1)) + 1

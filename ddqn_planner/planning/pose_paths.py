@@ -63,10 +63,9 @@ def points_of(corners: Float64, resolution: float) -> Body:
 
 def in_cells(poses: Float64, grid: GridMap) -> Float64:
     """Return poses (N, 3) with x and y in cells from the centre of cell (0, 0), turned with it."""
-    x, y, yaw = (np.reshape(poses, (-1, 3)) - grid.origin).T
-    along, across = math.cos(grid.origin[2]), math.sin(grid.origin[2])
-    turned = np.column_stack([along * x + across * y, along * y - across * x])
-    return np.column_stack([turned / grid.resolution - 0.5, yaw])
+    x, y, yaw = np.reshape(poses, (-1, 3)).T
+    column, row = grid.in_cells(x, y)
+    return np.column_stack([column - 0.5, row - 0.5, yaw - grid.origin[2]])
 
 
 def nearest_pose(poses: Float64, robot: Any, grid: GridMap, reach: tuple[float, float]) -> int:

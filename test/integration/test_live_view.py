@@ -17,7 +17,13 @@ pytest.importorskip("rerun", reason="rerun is missing")
 import live_view
 from rerun.chunk import RrdReader
 
-from ddqn_planner.nodes.conversions import along, grid_from_message, occupancy_message, path_message
+from ddqn_planner.nodes.conversions import (
+    along,
+    centres,
+    grid_from_message,
+    occupancy_message,
+    path_message,
+)
 from ddqn_planner.nodes.runtime import LATCHED
 
 HEADER, ORIGIN = Header(frame_id="map"), (-1.0, 2.0, 0.7)
@@ -60,7 +66,7 @@ def test_a_recording_holds_all(
         client.publish("planner/value", occupancy_message(field, 0.5, ORIGIN, HEADER), LATCHED)
         client.publish("map", message, LATCHED)
         for topic, cells in (("plan", CELLS["plan"]), ("trainer/episode", CELLS["episode"])):
-            path = path_message(*along(cells, grid), HEADER, Quaternion(w=1.0))
+            path = path_message(*along(centres(cells, grid)), HEADER, Quaternion(w=1.0))
             client.publish(topic, path, LATCHED)
         client.publish("trainer/average_reward", Float32(data=-0.5))
         wanted = {*(f"map/{layer}" for layer in live_view.LAYERS), "reward"}

@@ -26,6 +26,7 @@ from integration.robot import (
     changed,
     check_path,
     constant_model,
+    point_of,
     points_of,
     yaw_of,
 )
@@ -82,12 +83,12 @@ def test_goal_pose_is_answered_by_a_plan_a_value_and_diagnostics(robot: Robot) -
 def test_get_plan_answers_and_does_not_change_the_active_goal(robot: Robot) -> None:
     path = robot.get_plan(robot.pose((2, 5)), robot.pose(GOAL, GOAL_YAW))
     check_path(path, robot.grid)
-    assert points_of(path)[0] == pytest.approx(robot.grid.cell_to_world((2, 5)))
+    assert points_of(path)[0] == point_of(robot.pose((2, 5)))
     assert yaw_of(path.poses[-1].pose.orientation) == pytest.approx(GOAL_YAW)
     path = robot.get_plan(PoseStamped(), robot.pose(GOAL))  # from the known start
-    assert points_of(path)[0] == pytest.approx(robot.grid.cell_to_world(START))
+    assert points_of(path)[0] == point_of(robot.pose(START))
     path = robot.get_plan(robot.pose(START), robot.pose(START, GOAL_YAW))
-    assert points_of(path) == [robot.grid.cell_to_world(START)]
+    assert points_of(path) == [point_of(robot.pose(START))]
     assert yaw_of(path.poses[0].pose.orientation) == pytest.approx(GOAL_YAW)
     robot.send_start(robot.pose((3, 3)))
     robot.wait_for_path((3, 3), GOAL)
@@ -366,7 +367,7 @@ def test_all_else_is_answered_while_a_plan_takes_long(slow_robot: Any) -> None:
     robot.gate.touch()
     wait_for("plan", plan.done)
     check_path(plan.result().plan, robot.grid)
-    assert points_of(plan.result().plan)[-1] == pytest.approx(robot.grid.cell_to_world(GOAL))
+    assert points_of(plan.result().plan)[-1] == point_of(robot.pose(GOAL))
 
 
 def test_what_comes_while_a_plan_takes_long_has_the_last_plan(slow_robot: Any) -> None:

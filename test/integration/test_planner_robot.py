@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,9 @@ from integration.robot import (
     START,
     WARN,
     Robot,
+    corners_of,
     odometry,
+    points_of,
     repeating,
     yaw_of,
 )
@@ -31,7 +34,6 @@ from std_msgs.msg import Header
 
 from ddqn_planner import Planner
 from ddqn_planner.grid import Cell, GridMap, inflate
-from ddqn_planner.nodes.conversions import turns
 from ddqn_planner.nodes.poses import has_tf
 
 
@@ -79,8 +81,10 @@ def test_a_path_is_the_librarys_with_the_same_parameters(robot: Robot) -> None:
         request.start, request.goal = robot.pose(asked["start"]), robot.pose(asked["goal"])
         path = robot.client.call(GetPlan, "planner/get_plan", request).plan
         how = parameters.get("path_simplification", "straight")
-        path.poses = turns(path.poses) if how == "straight" else path.poses
-        assert cells_of(grid, path) == [*plan.cells]
+        points = corners_of(path) if how == "straight" else points_of(path)
+        cells = [grid.world_to_cell(*point) for point in points]
+        # Beside an obstacle the centre of an end's cell stays.
+        assert [cell for cell, after in pairwise([*cells, None]) if cell != after] == [*plan.cells]
         seen.add((how, plan.cells))
     assert len(seen) == len(SAME)  # each parameter counts
 
@@ -268,7 +272,7 @@ def test_docks_in_another_frame_stay_where_they_are_when_it_moves(transformed: R
     client.publish("tf", odom)
     client.publish("goal_poses", PoseArray(header=Header(frame_id="odom"), poses=docks))
     robot.wait_for_path((4, 7), (1, 7), yaw=0.5)
-    robot.wait_for_reason("^a path of 3.00 cells to goal 1 of 2, ")
+    robot.wait_for_reason("^a path of 2.96 cells to goal 1 of 2, ")
     odom.transform.translation.x += 1.0
     client.publish("tf", odom)
     client.publish("tf", transform(robot, (4, 12)))

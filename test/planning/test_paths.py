@@ -30,7 +30,8 @@ from ddqn_planner import GridMap, MoveRule, PlanStatus, inflate, simplify
 from ddqn_planner.grid import MOVES, Cell, path_length, shortest_distances, shortest_path
 from ddqn_planner.grid.moves import cells_along
 from ddqn_planner.planning import PlanRequest
-from ddqn_planner.planning.paths import REACH, is_path_valid, keep_or_switch, rest_of_path, search
+from ddqn_planner.planning.path_check import invalid_poses
+from ddqn_planner.planning.paths import REACH, keep_or_switch, rest_of_path, search
 from ddqn_planner.planning.planner import last_step
 from ddqn_planner.planning.segments import cost_along, legal_segments
 
@@ -55,38 +56,31 @@ def drawn_path(data: Data, grid: GridMap, goal: Cell, rule: MoveRule) -> list[Ce
 
 
 @given(GRIDS, RULES, st.data())
-def test_a_path_is_valid_by_its_rest(place: Place, rule: MoveRule, data: Data) -> None:
+def test_cells_along_a_path_are_those_nearest_to_it(
+    place: Place, rule: MoveRule, data: Data
+) -> None:
     grid, goal = place
     path = drawn_path(data, grid, goal, rule)
     path = data.draw(st.sampled_from([path, [*simplify(path, grid, rule)]]))
-    robot = data.draw(st.tuples(st.integers(-99, 99), st.integers(-99, 99)))
-    after = data.draw(patched(grid))
     passed = cells_with_positions(path)
     assert cells_along(np.array(path))[0].tolist() == [[*cell] for cell, _ in passed]
-    _, position = min(passed, key=lambda entry: math.dist(entry[0], robot))
-    segments = [*pairwise([*path, path[-1]])][int(position) :]
-    expected = is_legal(*segments[0], after, rule, position % 1)
-    expected &= all(is_legal(*segment, after, rule) for segment in segments[1:])
-    assert is_path_valid(path, robot, after, rule) == expected
-    assert is_path_valid(path, robot, grid, rule)
+
+
+def is_still_legal(path: Sequence[Cell], grid: GridMap, rule: MoveRule) -> bool:
+    return all(is_legal(*segment, grid, rule) for segment in pairwise([*path, path[-1]]))
 
 
 def test_what_lies_behind_a_robot_on_a_segment_does_not_count() -> None:
     grid, path, rule = GridMap(np.zeros((9, 31))), [(0, 2), (15, 5), (30, 7)], "robot_safe"
     for blocked, is_free in (((2, 2), True), ((12, 4), False), ((24, 6), False)):
         after = grid.with_patch([[True]], *blocked)
-        assert is_path_valid(path, (5, 3), after, rule) == is_free
         assert (len(rest_of_path(path, (5, 3), after, rule)) > 0) == is_free
 
 
-def test_a_path_of_which_only_an_occupied_end_or_nothing_is_left_is_not_valid() -> None:
+def test_a_path_of_which_only_an_occupied_end_or_nothing_is_left_is_lost() -> None:
     grid, path = GridMap(np.zeros((1, 9))), [(0, 0), (1, 0), (2, 0)]
     closed = grid.with_patch([[True]], 2, 0)
     assert not len(rest_of_path(path, (2, 0), closed, "robot_safe"))
-    for robot in ((9, 0), (2, 5)):  # off the map, so that its own cell does not count
-        assert is_path_valid(path, robot, grid, "robot_safe")
-        assert not is_path_valid(path, robot, closed, "robot_safe")
-    assert not is_path_valid([], (0, 0), grid, "robot_safe")
     assert not len(rest_of_path([], (0, 0), grid, "robot_safe"))
 
 
@@ -100,7 +94,7 @@ def test_the_rest_of_a_path_leads_to_it(place: Place, rule: MoveRule, data: Data
         rest = list(map(tuple, rest_of_path(followed, robot, after, rule).tolist()))
         left = followed[followed.index(robot) :] if robot in followed else []
         if not rest:
-            assert not left or not is_path_valid(left, robot, after, rule)
+            assert not left or not is_still_legal(left, after, rule)
             continue
         assert (rest[0], rest[-1]) == (robot, goal)
         assert after.is_free(robot)
@@ -116,7 +110,7 @@ def test_the_rest_of_a_path_leads_to_it(place: Place, rule: MoveRule, data: Data
         assert all(max(abs(x - a), abs(y - b)) == 1 for (x, y), (a, b) in beside)
         if followed is path:
             assert any(rest[n:] == path[n - len(rest) :] for n in range(len(rest))[: REACH + 1])
-            if left and is_path_valid(left, robot, after, rule):
+            if left and is_still_legal(left, after, rule):
                 assert rest == left
 
 
@@ -422,32 +416,13 @@ def test_a_start_that_is_not_free_is_left_by_the_shortest_way(
     tied = [end for end, length in ways.items() if length < shortest + 1e-6]
     assert math.dist(way[-1], goal) == pytest.approx(min(math.dist(end, goal) for end in tied))
     assert rest == ANY_MAP.plan(grid, way[-1], goal, rule).cells
-    assert is_path_valid(plan.cells, start, grid, rule, clearing_radius)
+    poses = np.column_stack([*grid.centres(*plan.path.T), np.zeros(len(plan.path))])
+    robot = grid.cell_to_world(start)
+    assert not len(invalid_poses(poses, grid, robot=robot, clearing_radius=clearing_radius))
     if start in obstacles:
-        assert not is_path_valid(plan.cells, start, grid, rule)
+        assert len(invalid_poses(poses, grid, robot=robot))
         several = ANY_MAP.plan_nearest(grid, start, [goal], rule, "greedy", False, clearing_radius)
         assert several.cells == plan.cells
-
-
-def test_a_path_that_leaves_is_valid_until_another_obstacle_lies_on_it() -> None:
-    occupancy = np.zeros((5, 12), dtype=bool)
-    occupancy[2, 2:5] = True
-    grid = GridMap(occupancy)
-    path = [(x, 2) for x in range(2, 12)]
-    blocked = grid.with_patch([[True]], 8, 2)
-    for part, robot, each, radius, is_valid in (
-        *((path, (4, 2), grid, 1, True), (path, (2, 2), grid, 2, True)),
-        (path, (2, 2), grid, 1, False),  # its third cell is beyond
-        (path[:3], (2, 2), grid, 2, False),  # it leads nowhere
-        (path, (2, 2), blocked, 2, False),
-        (path, (1, 2), grid, 2, False),  # a robot beside the obstacle has to go round it
-    ):
-        assert is_path_valid(part, robot, each, "robot_safe", radius) == is_valid
-    only_west = np.full(occupancy.shape, 0b10000011, dtype=np.uint8)
-    only_west[:, 5:] = 0
-    one_way = GridMap(occupancy, forbidden=only_west)
-    assert not is_path_valid(path, (4, 2), one_way, "robot_safe", 1)
-    assert is_path_valid([(2, 2), (1, 2)], (2, 2), one_way, "robot_safe", 1)
 
 
 KEPT = [(2, 2)], True, [(2, 2), (2, 3), (3, 4), (4, 4)]  # the robot's cell alone: straight on

@@ -1,0 +1,162 @@
+"""Paths in metres: from where the robot is, along the cells of a plan, to exactly the goal."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.compiled import in_place
+from ddqn_planner.grid import GridMap, MoveRule
+from ddqn_planner.grid.moves import positions
+from ddqn_planner.planning.segments import BITS, Path
+
+Float64 = NDArray[np.float64]
+Point = tuple[float, float]
+
+# Cells: points so near to each other are one point, and a line so near to a cell touches it. More
+# than what is rounded between metres and cells, on maps far from their frame's origin, too.
+MARGIN: Final = 1e-6
+
+
+class ExactPath(NamedTuple):
+    """A path of straight pieces."""
+
+    points: Float64  # (N, 2): metres in the map frame
+    length: float  # in cells, see `path_length`
+
+
+NO_PATH: Final = ExactPath(np.empty((0, 2)), 0.0)
+
+
+def exact_path(
+    legs: Sequence[Path], grid: GridMap, move_rule: MoveRule, points: Sequence[Point]
+) -> ExactPath:
+    """Return the path by the cells of some legs that begins, and ends each leg, at exact points.
+
+    Parameters
+    ----------
+    legs : sequence of (N, 2)
+        Cells, each leg from the last cell of the one before it.
+    grid : GridMap
+    move_rule : MoveRule
+        How the length is measured.
+    points : sequence of (x, y)
+        Metres in the map frame: one in the first cell of the first leg, and one for the end of each
+        leg. Where a point lies in another cell, as that of a goal which moved, the cell's centre
+        takes its place.
+
+    Returns
+    -------
+    ExactPath
+        Where a straight piece from or to an exact point would touch an occupied cell, or leave a
+        cell as it forbids, the path also passes the centre of that point's cell.
+    """
+    begin = _point_in(grid, legs[0][0], points[0])
+    parts = [begin]
+    for path, point in zip(legs, points[1:], strict=True):
+        end = _point_in(grid, path[-1], point)
+        corners = _corners_between(path, grid, _in_cells(begin, grid), _in_cells(end, grid))
+        parts += [np.column_stack(grid.centres(*corners.T)), end]
+        begin = end
+    path_points = np.vstack(parts)
+    is_new = np.append(True, np.diff(path_points, axis=0).any(axis=1))
+    return ExactPath(path_points[is_new], _length(path_points, grid, move_rule))
+
+
+def dense(points: Float64, spacing: float) -> tuple[Float64, NDArray[np.int64]]:
+    """Return points on a path (M, 2), at most a spacing apart, and the piece of each but the last.
+
+    All points of the path are among them.
+    """
+    lengths = np.hypot(*np.diff(points, axis=0).T)
+    parts = np.ceil(lengths / spacing * (1 - MARGIN)).astype(np.int64)
+    position = positions(parts)
+    number = np.arange(len(points))
+    dense_points = np.column_stack([np.interp(position, number, axis) for axis in points.T])
+    return dense_points, position[:-1].astype(np.int64)
+
+
+def _point_in(grid: GridMap, cell: NDArray[np.int32], point: Point) -> Float64:
+    """Return a point (2,) if it lies in a cell, else the cell's centre."""
+    x, y = cell.tolist()
+    return np.array(point if grid.world_to_cell(*point) == (x, y) else grid.centres(x, y))
+
+
+def _in_cells(points: Float64, grid: GridMap) -> Float64:
+    """Return points (..., 2) in cells from the centre of cell (0, 0)."""
+    return np.stack(grid.in_cells(points[..., 0], points[..., 1]), axis=-1) - 0.5
+
+
+def _corners_between(path: Path, grid: GridMap, begin: Float64, end: Float64) -> Path:
+    """Return the cells of a leg whose centres lie on the way between two points in its ends."""
+    first, last = path[0], path[-1]
+    is_at_first, is_at_last = _is_near(begin, first), _is_near(end, last)
+    if len(path) == 1:
+        return path[:0]
+    if len(path) == 2:
+        # Between two centres it is the plan's own segment.
+        if (is_at_first and is_at_last) or _is_clear(begin, end, grid):
+            return path[:0]
+        if is_at_first or _is_clear(begin, last, grid):
+            return path[1:]
+    skips_first = is_at_first or _is_clear(begin, path[1], grid)
+    skips_last = is_at_last or _is_clear(path[-2], end, grid)
+    return path[int(skips_first) : len(path) - int(skips_last)]
+
+
+def _is_near(point: Float64, cell: NDArray[np.int32]) -> bool:
+    return bool(np.abs(point - cell).max() < MARGIN)
+
+
+def _is_clear(begin: Any, end: Any, grid: GridMap) -> bool:
+    """Return whether a straight piece touches only free cells, and leaves none as it forbids.
+
+    The cells of its ends need not be free: a robot may leave an obstacle.
+    """
+    occupancy, forbidden, *_ = grid.for_kernels(MoveRule.ROBOT_SAFE)
+    (x, y), (to_x, to_y) = begin.tolist(), end.tolist()
+    return _touches_none(float(x), float(y), float(to_x), float(to_y), occupancy, forbidden)
+
+
+@in_place
+def _touches_none(
+    x: float, y: float, to_x: float, to_y: float, occupancy: Any, forbidden: Any
+) -> bool:
+    """Return whether no cell is in the way of a piece, see `_is_clear`."""
+    height, width = occupancy.shape
+    column, row = math.floor(x + 0.5), math.floor(y + 0.5)
+    to_column, to_row = math.floor(to_x + 0.5), math.floor(to_y + 0.5)
+    dx, dy = to_x - x, to_y - y
+    step_x, step_y = (dx > MARGIN) - (dx < -MARGIN), (dy > MARGIN) - (dy < -MARGIN)
+    # It lies between a diagonal move and one along its longer axis.
+    actions = BITS[step_y + 1, step_x + 1]
+    actions |= BITS[step_y * (abs(dy) >= abs(dx)) + 1, step_x * (abs(dx) >= abs(dy)) + 1]
+    left, right = min(x, to_x), max(x, to_x)
+    bottom, top = min(y, to_y), max(y, to_y)
+    slope = dy / dx if step_x != 0 else 0.0
+    for at_x in range(math.floor(left + 0.5 - MARGIN), math.floor(right + 0.5 + MARGIN) + 1):
+        # The part of the piece within this column, from one edge to the other.
+        low, high = bottom, top
+        if step_x != 0:
+            entered = y + (max(at_x - 0.5 - MARGIN, left) - x) * slope
+            left_at = y + (min(at_x + 0.5 + MARGIN, right) - x) * slope
+            low, high = min(entered, left_at), max(entered, left_at)
+        for at_y in range(math.floor(low + 0.5 - MARGIN), math.floor(high + 0.5 + MARGIN) + 1):
+            is_inside = 0 <= at_x < width and 0 <= at_y < height
+            if not is_inside or (at_x == to_column and at_y == to_row):
+                continue
+            if forbidden.size and forbidden[at_y, at_x] & actions:
+                return False
+            if occupancy[at_y, at_x] and not (at_x == column and at_y == row):
+                return False
+    return True
+
+
+def _length(points: Float64, grid: GridMap, move_rule: MoveRule) -> float:
+    """Return the length of a path of points in cells, see `path_length`."""
+    steps = np.diff(_in_cells(points, grid), axis=0)
+    if move_rule is MoveRule.UNIT:
+        return float(np.abs(steps).max(axis=1, initial=0.0).sum())
+    return float(np.hypot(*steps.T).sum())

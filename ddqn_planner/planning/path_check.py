@@ -1,0 +1,104 @@
+"""Whether a path is still free, judged pose by pose as Nav2's planner server does."""
+
+import math
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.grid import GridMap
+from ddqn_planner.grid.arguments import Occupancy
+from ddqn_planner.planning.paths import obstacles_in_the_way
+from ddqn_planner.planning.pose_paths import Body, Float64, in_cells, touches
+from ddqn_planner.planning.pose_world import occupied_for_body
+
+LETHAL: Final = 254  # Nav2's cost of an obstacle
+INSCRIBED: Final = 253  # and of a free cell so near to one that a disc touches it
+COST_STEP: Final = 2.5  # of Nav2's costs in one of a `GridMap`, as NavFn counts them
+
+
+def invalid_poses(
+    poses: Float64,
+    grid: GridMap,
+    *,
+    robot: Any = None,
+    body: Body | None = None,
+    unknown: Occupancy | None = None,
+    max_cost: int = LETHAL,
+    distance: float = math.inf,
+    clearing_radius: float = 0.0,
+) -> NDArray[np.int64]:
+    """Return the indices of the poses that are not free, from the one nearest to the robot on.
+
+    What lies between two poses does not count.
+
+    Parameters
+    ----------
+    poses : (N, 3)
+        Metres and radians in the map frame, one or more; the headings count with a body alone.
+    grid : GridMap
+    robot : (x, y), optional
+        Where the robot is, in metres. By default all poses count.
+    body : pair of arrays, optional
+        The points of a body, see `points_of`: then only obstacles count, below all of it. By
+        default the cell of a pose must be free.
+    unknown : (H, W) bool, optional
+        Cells that count as obstacles too.
+    max_cost : int
+        Nav2's cost, 0 to 255, from which on a cell is not free. Obstacles never are.
+    distance : float
+        Metres along the path that are looked at; 0 or less means all.
+    clearing_radius : float
+        A disc that stands in a cell which is not free may leave it by such cells. If the cell is an
+        obstacle, it may pass those within so many cells of it.
+    """
+    first, end = _part_to_check(poses, robot, distance)
+    closed = _closed_cells(grid, body is not None, unknown, max_cost)
+    if body is not None:
+        path = in_cells(poses, grid)
+        points = np.concatenate(body)
+        bits = closed.view(np.uint8)
+        numbers = range(first, end)
+        return np.array([n for n in numbers if touches(path[n : n + 1], points, bits)], np.int64)
+    x, y, _ = poses[first:end].T
+    cells = np.floor(np.column_stack(grid.in_cells(x, y)))  # float64: they may be far away
+    is_invalid = _is_closed(cells, closed)
+    cell = None if robot is None else grid.world_to_cell(*robot)
+    if cell is not None and grid.contains(cell) and not grid.is_free(cell):
+        before_free = int(is_invalid.argmin())  # 0 if it leads nowhere
+        obstacles = obstacles_in_the_way(grid, cell, clearing_radius)
+        is_invalid[:before_free] = _is_closed(cells[:before_free], obstacles)
+    return first + np.flatnonzero(is_invalid)
+
+
+def _part_to_check(poses: Float64, robot: Any, distance: float) -> tuple[int, int]:
+    """Return the first pose to check, and the one after the last."""
+    x, y, _ = poses.T
+    first = 0 if robot is None else int(np.hypot(x - robot[0], y - robot[1]).argmin())
+    if not distance > 0:
+        return first, len(poses)
+    ahead = np.cumsum(np.hypot(np.diff(x[first:]), np.diff(y[first:])))
+    return first, first + 1 + int(np.count_nonzero(ahead <= distance))
+
+
+def _closed_cells(
+    grid: GridMap, has_body: bool, unknown: Occupancy | None, max_cost: int
+) -> Occupancy:
+    """Return the cells that are not free, (H, W) bool."""
+    closed = occupied_for_body(grid) if has_body else grid.occupancy
+    if unknown is not None:
+        closed = closed | unknown
+    if max_cost < LETHAL:
+        cost = np.zeros(closed.shape) if grid.cost is None else COST_STEP * np.maximum(grid.cost, 0)
+        closed = closed | (np.where(grid.occupancy, INSCRIBED, cost) >= max_cost)
+    return closed
+
+
+def _is_closed(cells: Float64, closed: Occupancy) -> NDArray[np.bool_]:
+    """Return which cells (N, 2) are closed, or lie outside the map."""
+    height, width = closed.shape
+    is_closed: NDArray[np.bool_]
+    is_closed = np.any((cells < 0) | (cells >= (width, height)), axis=1)
+    column, row = cells[~is_closed].astype(np.int64).T
+    is_closed[~is_closed] = closed[row, column]
+    return is_closed
