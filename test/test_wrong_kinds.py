@@ -140,7 +140,7 @@ def test_a_wrong_lattice_is_named(tmp_path: Path, changes: Any, reason: str) -> 
 
 def test_a_path_far_beyond_the_map_takes_no_memory() -> None:
     far = [(0, 0), (2 * 10**9, 0)]
-    poses = np.array([(x + 0.5, y + 0.5, 0.0) for x, y in (*far, (5, 0))])
+    poses = np.array([(*GRID.cell_to_world(cell), 0.0) for cell in (*far, (5, 0))])
     assert invalid_poses(poses, GRID).tolist() == [1]
     request = PlanRequest(GRID, (0, 0), ((5, 0),), MoveRule.UNIT, under_way=far)
     assert last_step(cells().steps(request)).goal == (5, 0)
