@@ -12,7 +12,7 @@ import nav_msgs.msg
 import numpy as np
 import pytest
 import rclpy
-from client import map_message, pose, wait_for
+from client import TIMEOUT, map_message, pose, wait_for
 from geometry_msgs.msg import PoseStamped
 from integration.robot import GOAL, NUMBERS, START, Robot, changed, check_path, points_of
 from nav_msgs.msg import Path as PathMessage
@@ -373,7 +373,7 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
 
         def run(task: Any) -> Any:
             future = executor.create_task(task)
-            executor.spin_until_future_complete(future, 60)
+            executor.spin_until_future_complete(future, TIMEOUT)
             return future.result()
 
         def plan(dear: slice, threshold: float) -> tuple[bool, str]:
@@ -430,7 +430,7 @@ def test_a_path_leads_through_its_goals_in_order_or_as_far_as_it_can() -> None:
             node._map._take(map_message(values, grid, next(NUMBERS)))
             task = Task(start, [*goals], "", via)
             future = executor.create_task(node._plan_for_action(task, lambda: None))
-            executor.spin_until_future_complete(future, 60)
+            executor.spin_until_future_complete(future, TIMEOUT)
             path, outcome = future.result()
             return path, outcome
 
