@@ -247,7 +247,8 @@ def test_a_planner_tells_what_it_does_not_read_and_takes_what_is_meant(
             assert not result.successful
             assert reason in result.reason
         assert client.get_parameter("planner", "robot_radius") == 2.0
-        assert len(re.findall("WARN", node.log)) == 4
+        # The middleware of a newer release has warnings of its own.
+        assert len(re.findall(r"WARN.*planner\]: ", node.log)) == 4
 
 
 def test_a_map_server_without_a_map_waits_for_one(run_node: Any, make_client: Any) -> None:
