@@ -134,14 +134,15 @@ class MoveCosts(NamedTuple):
             costs = costs._replace(uphill=uphill, highest=steepest * costs.highest)
         return costs
 
-    def read(self, first: int, end: int) -> tuple[int, int]:
+    def read(self, first: int, end: int) -> tuple[int, int] | None:
         """Read the patches of some rows, and of all between them and those that were read.
 
-        Return the first cell that a field may close, and the end of these cells, as numbers.
+        Return the first cell that a field may close, and the end of these cells, as numbers; None
+        if it may close all.
         """
         rows = self.rows
         if rows is None:
-            return 0, self.patch.size
+            return None
         height = rows.grid.height
         first, end = max(first, 0), min(end, height)
         with rows.lock:

@@ -454,6 +454,26 @@ def test_where_patches_are_read_as_a_field_grows_plans_are_the_same(
         grid = data.draw(patched(grid))  # its field is repaired
 
 
+@pytest.mark.parametrize("margin", [0, 1, 3])
+def test_where_rows_are_read_ends_lie_in_the_first_and_the_last_rows(
+    margin: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    height, width = 24, 5
+    random = np.random.default_rng(margin)
+    cells = random.random((height, width)) < 0.15
+    grid = GridMap(cells, cost=random.integers(0, 100, (height, width)))
+    rows = 0, 1, 2, height // 2, height - 3, height - 2, height - 1
+    ends = [(x, y) for x, y in grid.free_cells() if y in rows]
+    at_once = [new_planner().q_field(grid, goal) for goal in ends]
+    monkeypatch.setattr(move_costs_module, "LARGE", 0)
+    monkeypatch.setattr(kernels, "MARGIN", margin)
+    for goal, field_at_once in zip(ends, at_once, strict=True):
+        by_rows = new_planner().q_field(grid, goal)
+        for start in ends[::-1]:
+            assert by_rows.rollout(start) == field_at_once.rollout(start)
+        np.testing.assert_array_equal(by_rows.value, field_at_once.value)
+
+
 def test_few_rows_of_a_large_map_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(move_costs_module, "LARGE", 2**16)
     side = 1000
