@@ -13,6 +13,7 @@ from numba.core.event import Listener, register
 from numba.core.serialize import dumps
 
 from ddqn_planner.files import write_atomically
+from ddqn_planner.memory import llvm_was_used
 
 LOGGER = logging.getLogger("ddqn_planner")
 CHECKSUM_BYTES = hashlib.sha256().digest_size
@@ -107,6 +108,7 @@ class CheckedCache(FunctionCache):
 
     def load_overload(self, signature: Any, target: Any) -> Any:
         """Return the code for a signature, None if there is none or it cannot be used."""
+        llvm_was_used.set()
         try:
             return super().load_overload(signature, target)  # type: ignore[no-untyped-call]
         except MemoryError:  # no fault of the file
@@ -123,6 +125,7 @@ class CheckedCache(FunctionCache):
 
     def save_overload(self, signature: Any, result: Any) -> None:
         """Keep the code for a signature, if that is possible."""
+        llvm_was_used.set()
         try:
             super().save_overload(signature, result)  # type: ignore[no-untyped-call]
         except MemoryError:

@@ -1,9 +1,7 @@
 """The planner node: plans on the map from the robot's pose to the goal pose."""
 
-import ctypes
 import math
 from collections.abc import Callable, Coroutine
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +12,7 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallb
 from rclpy.parameter import Parameter
 from std_msgs.msg import UInt8MultiArray
 
+from ddqn_planner.memory import give_back, llvm_was_used, reuse_small_arrays
 from ddqn_planner.model import model_of
 from ddqn_planner.nodes.conversions import along, bytes_of, path_bytes, path_message
 from ddqn_planner.nodes.display import FieldDisplay
@@ -341,6 +340,9 @@ class PlannerNode(ManagedNode):
             has_come = active.lacks_pose and self._places.know(active.poses)
             if has_come or active.is_look_due(bool(missing[-1])):
                 self._replan.trigger()
+        if llvm_was_used.is_set() and not self._model.loading:
+            llvm_was_used.clear()
+            self._worker.call(give_back)
         if self._report.is_due():
             missing += ["the model is being loaded"] if self._model.loading else []
             fatal = self._model.planner is None and "model" in self._report.refused
@@ -363,9 +365,5 @@ def _paths(outcome: Outcome, *makers: Callable[..., Any]) -> list[Any]:
 
 def main() -> int:
     """Run the planner node until SIGINT or SIGTERM."""
-    # glibc reuses the memory of arrays up to 16 MB, because new pages would cost small fields a
-    # third of their time. It returns larger arrays at once, so that the memory does not grow.
-    with suppress(AttributeError):  # another C library
-        for option, value in ((-1, 2**24), (-3, 2**24), (-8, 1)):
-            ctypes.CDLL(None).mallopt(option, value)  # TRIM_THRESHOLD, MMAP_THRESHOLD, ARENA_MAX
+    reuse_small_arrays()
     return spin_until_shutdown(PlannerNode, PLANNER_PARAMETERS)
