@@ -33,7 +33,7 @@ from ddqn_planner.nodes.runtime import LATCHED
 sys.path.insert(0, str(FilePath(__file__).resolve().parents[1] / "examples"))
 from simulated_robot import STEP, Robot
 
-MINUTES, MAX_GROWTH = 30.0, 5.0  # percent
+MINUTES, MAX_GROWTH = 30.0, 2.0  # percent
 # Seconds between two samples of the memory, events of the robot, and pieces of work.
 PERIOD, EVENT_PERIOD, PAUSE = 5.0, 10.0, 0.02
 STEADY_FIELDS = 8  # that are computed before each sample

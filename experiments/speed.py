@@ -28,6 +28,7 @@ from ddqn_planner import GridMap, MoveRule, Plan, Planner, QField
 from ddqn_planner.grid import Cell, inflate, shortest_distances
 from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.noise import random_costs, random_requests
+from ddqn_planner.model.move_costs import read_cells
 from ddqn_planner.training.environment import GridEnvironment, paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import Trainer
@@ -231,6 +232,24 @@ def measure_short_requests(side: int) -> Iterator[bool]:
     yield report(name, with_costs / without, "x", 2.0)
 
 
+def measure_first_request(side: int) -> Iterator[bool]:
+    """Time the first request on a huge map, to a near goal, and with all patches read first."""
+    random = np.random.default_rng(0)
+    occupancy = random.random((side, side)) < 0.1
+    middle = side // 2
+    start, goal = (middle, middle), (middle + 60, middle)
+    occupancy[start[::-1]] = occupancy[goal[::-1]] = False
+    for name, cost in (("", None), (", random costs", random_costs(occupancy, random))):
+        grid, times = GridMap(occupancy, cost=cost), []
+        for _ in range(ROUNDS):
+            ms, plan = timed(new_planner().plan, grid, start, goal, RULE)
+            assert plan.cells
+            times.append((ms, timed(read_cells, occupancy, cost)[0]))
+        ms, reading_ms = medians(times)
+        figure = f"{side}x{side}{name}, 60 cells: all patches {reading_ms:.0f} ms; request"
+        yield report(figure, ms, "ms", 60)
+
+
 def measure_repairs(sides: tuple[int, int], with_costs: bool) -> Iterator[bool]:
     """Compare replans near the robot, patches included, on a large map with those on a small."""
     known: list[list[Any]] = []
@@ -348,6 +367,7 @@ def main() -> int:
     for side in (256, 1024):
         missed += [*measure_requests(side), *measure_requests_with_costs(side)]
     missed += [*measure_short_requests(1024), *measure_replans(1024)]
+    missed += measure_first_request(8192)
     for with_costs in (False, True):
         missed += measure_repairs((1024, 4096), with_costs)
     missed += measure_whole_fields(64, True, 30)

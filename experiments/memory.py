@@ -1,0 +1,98 @@
+"""Measures the memory of the planner node: where it goes, and whether reloads add to it."""
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import client as ros
+import numpy as np
+import processes
+from nav_msgs.srv import GetPlan
+from std_srvs.srv import Trigger
+from tables import report
+
+from ddqn_planner import Planner
+from ddqn_planner.grid import read_map_file
+from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.resources import find_map
+
+PLANS, LARGE, RELOADS, FIRST_RELOADS = 8, 2000, 1500, 50
+SETTLED = 5.0  # seconds until all is compiled, and what is not needed given back
+KINDS = {"RssAnon": "own", "RssFile": "of files", "RssShmem": "shared", "VmRSS": "all"}
+STEPS = str(Path(__file__).with_name("memory_steps.py"))
+
+
+def measure_layers(fixture: ros.MapFixture) -> None:
+    """Print the sizes of the arrays of a map, and those of one field on it."""
+    grid, planner = fixture.grid, Planner.load("any_map")
+    (request,) = fixture.requests(1, np.random.default_rng(0))
+    start, goal = (ros.cell_of(grid, pose) for pose in (request.start, request.goal))
+    field = planner.q_field(grid, goal, ros.RULE)
+    field.rollout(start)
+    layers = [value.nbytes for value in vars(grid).values() if isinstance(value, np.ndarray)]
+    patches = field.costs.patch.nbytes if field.costs is not None else 0
+    cells = grid.occupancy.size
+    sizes = {"message": cells, "map": sum(layers), "patches": patches, "a field": field.nbytes}
+    words = ", ".join(f"{name} {size / 1e6:.1f} MB" for name, size in sizes.items())
+    print(f"{grid.width}x{grid.height}: {words}")
+
+
+def measure_node(
+    name: str, fixture: ros.MapFixture, bound: float, map_file: Path | None = None
+) -> Iterator[bool]:
+    """Measure the planner node after plans to some goals on a map, from a map server or sent."""
+    requests = fixture.requests(PLANS, np.random.default_rng(0))
+    with ros.Client() as client, processes.running_node("planner_node") as node:
+        if map_file is not None:
+            server = processes.running_node("map_server_node", yaml_filename=map_file.resolve())
+            client.enter_context(server)
+        else:
+            client.publish("map", fixture.message(), LATCHED)
+        get_plan = client.service(GetPlan, "planner/get_plan")
+        ros.wait_for("plan", lambda: ros.ask(get_plan, requests[0]).plan.poses)
+        time.sleep(SETTLED)
+        greatest = 0.0
+        for request in requests:
+            ros.ask(get_plan, request)
+            greatest = max(greatest, processes.memory(node.pid))
+        split = ", ".join(
+            f"{words} {processes.memory(node.pid, kind):.0f}" for kind, words in KINDS.items()
+        )
+        peak = processes.memory(node.pid, "VmHWM")
+        print(f"{name}: MB after {PLANS} plans: {split}; the greatest since the start {peak:.0f}")
+        yield report(f"{name}: planner_node, after any of the plans", greatest, "MB", bound)
+
+
+def measure_reloads() -> Iterator[bool]:
+    """Measure by how much reloads of the model make the planner node grow."""
+    quiet = processes.running_node("planner_node", "--log-level", "error")
+    with ros.Client() as client, quiet as node:
+        reload_model = client.service(Trigger, "planner/reload_model")
+        memory = []
+        for count in (FIRST_RELOADS, RELOADS):
+            for _ in range(count):
+                assert ros.ask(reload_model, Trigger.Request()).success
+            time.sleep(SETTLED)
+            memory.append(processes.memory(node.pid, "RssAnon"))
+    yield report(f"{RELOADS} reloads of the model: growth", memory[1] - memory[0], "MB", 1)
+
+
+def main(_: Sequence[str]) -> int:
+    """Print tables, and each figure beside its bound; return 1 if one is missed."""
+    office = find_map("office")
+    of_office = ros.MapFixture(read_map_file(office))
+    large = ros.generated_map("office", LARGE, seed=np.random.default_rng(0))
+    with processes.claim_ros_domain():
+        subprocess.run([sys.executable, STEPS], check=True)
+        for fixture in (of_office, large):
+            measure_layers(fixture)
+        missed = [*measure_node("office", of_office, 210, office)]
+        missed += measure_node(f"{LARGE}x{LARGE}", large, 250)
+        missed += measure_reloads()
+    return int(any(missed))
+
+
+if __name__ == "__main__":
+    processes.run_script(main)
