@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.qos import QoSProfile
 from rclpy.task import Future
-from rclpy.time import Time as RosTime
 from std_msgs.msg import Header, UInt8MultiArray
 
 from ddqn_planner.experience import Experience
@@ -128,19 +127,6 @@ class MapSource:
             return 0.0
         limits = [2 * arrivals.period, timeout or math.inf]
         return float(min(limits)) if min(limits) < math.inf else UPDATE_WAIT
-
-    def now(self) -> RosTime:
-        """Return the time of the node's clock, which stamps of maps may have."""
-        return self._node.get_clock().now()
-
-    def is_newer(self, header: Header | None, moment: RosTime) -> bool:
-        """Return whether a map was made after a moment, by its stamp and a clock like the node's.
-
-        A stamp of 0, as on the updates of Nav2's costmaps, or in the future does not tell.
-        """
-        if header is None:
-            return False
-        return moment < RosTime.from_msg(header.stamp, moment.clock_type) <= self.now()
 
     def check(self) -> Header:
         """Return the header of the map or update that is planned on, or raise a RequestError."""

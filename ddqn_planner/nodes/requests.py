@@ -239,10 +239,13 @@ class Requests:
         """Do what `plan_now` does; after a failed plan for the same goal, on the next costmap.
 
         Who clears a costmap after a failure, as Nav2's behavior trees do, asks again before the
-        cleared costmap has come. So a plan that fails again waits for it.
+        cleared costmap has come. So a plan that fails again waits for it, and as the costmap of
+        before may come first, for the next ones. Their stamps may be those of another clock.
         """
-        asked, deadline = self.map.now(), math.inf
+        first = self.map.arrivals.number
+        deadline = math.inf
         while True:
+            began = time.monotonic()
             costmap = self.map.arrivals.number
             outcome = await self.plan_now(start, goals, *options, **named_options)
             if outcome.status not in FAILURES or outcome.request is None:
@@ -252,21 +255,19 @@ class Requests:
                 if not self.retries.is_retry(goals, costmap, resolution):
                     break
                 deadline = time.monotonic() + self.map.retry_wait
-            elif time.monotonic() >= deadline:
-                break
-            if self.map.is_newer(outcome.map_header, asked):
+            elif began >= deadline:
                 break
             if not await self._wait_for_costmap(costmap, deadline):
+                if self.map.arrivals.number == first:
+                    self.map.arrivals.awaited_in_vain = first
                 break
         self.retries.note(goals, costmap, outcome)
         return outcome
 
     async def _wait_for_costmap(self, last: int, deadline: float) -> bool:
         """Return whether a costmap or an update came after the one of a number, or has come."""
-        arrivals = self.map.arrivals
-        while arrivals.number == last:
+        while self.map.arrivals.number == last:
             if time.monotonic() >= deadline:
-                arrivals.awaited_in_vain = last
                 return False
             self.look_soon()
             await self.next_look

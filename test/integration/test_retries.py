@@ -2,7 +2,9 @@
 
 import array
 import math
+import time
 from collections.abc import Callable, Iterator
+from itertools import product
 from types import SimpleNamespace
 from typing import Any
 
@@ -53,7 +55,7 @@ class Asked:
     """A planner in this process, whose costmaps come when the test sends them."""
 
     def __init__(self) -> None:
-        self.columns = iter(range(0, 60, 2))  # of goals that nobody asked for
+        self.goals = product(range(0, 60, 2), range(46, 60, 2))  # that nobody asked for
         self.node, self.executor = PlannerNode(), SingleThreadedExecutor()
         self.executor.add_node(self.node)
 
@@ -98,7 +100,7 @@ class Asked:
     def is_waiting(self, task: Any) -> bool:
         """Return whether there is no answer yet, after other requests were answered."""
         for _ in range(2):
-            assert self.answer(self.ask((next(self.columns), 50))) == "NO_PATH"
+            assert self.answer(self.ask(next(self.goals))) == "NO_PATH"
         return not task.done()
 
 
@@ -131,13 +133,55 @@ def test_a_retry_waits_for_the_cleared_costmap_and_no_other_request_does(asked: 
     assert asked.is_waiting(retry)
     asked.send_update(FREE)
     assert asked.answer(retry) == "SUCCEEDED"
-    # After a successful plan a failure is answered at once, and on a newer costmap as well.
+    # After a successful plan a failure is answered at once.
     asked.send(RING)
     assert asked.answer(asked.ask()) == "NO_PATH"
-    retry = asked.ask()
-    assert asked.is_waiting(retry)
-    asked.send(RING, seconds_ahead=0)
-    assert asked.answer(retry) == "NO_PATH"
+
+
+def test_a_retry_waits_whatever_the_stamps_of_costmaps(
+    asked: Asked, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    late = [0.0]
+    clock = SimpleNamespace(monotonic=lambda: time.monotonic() + late[0])
+    monkeypatch.setattr("ddqn_planner.nodes.requests.time", clock)
+    failed_before(asked)
+    for shift in (None, -100.0, -1.0, -0.1, 0.0, 0.1, 1.0, 100.0):
+        retry = asked.ask()
+        assert asked.is_waiting(retry)
+        asked.send(RING, seconds_ahead=shift)  # from before the clear, or from a clear in vain
+        asked.set_period(1000.0)
+        assert asked.is_waiting(retry)
+        late[0] += 2001.0
+        assert asked.answer(retry) == "NO_PATH"
+        # The costmaps came, though none had a path: the next one may.
+        retry = asked.ask()
+        assert asked.is_waiting(retry)
+        asked.send(FREE, seconds_ahead=shift)
+        assert asked.answer(retry) == "SUCCEEDED"
+        asked.send(RING, seconds_ahead=shift)
+        asked.set_period(1000.0)
+        assert asked.answer(asked.ask()) == "NO_PATH"
+
+
+def test_the_last_costmap_in_time_counts_though_it_is_planned_on_later(
+    asked: Asked, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    late = [0.0]
+    clock = SimpleNamespace(monotonic=lambda: time.monotonic() + late[0])
+    monkeypatch.setattr("ddqn_planner.nodes.requests.time", clock)
+    failed_before(asked)
+    plan_now, costmaps = asked.node._requests.plan_now, [RING, FREE]
+
+    async def slow_plan(*arguments: Any, **options: Any) -> Outcome:
+        outcome = await plan_now(*arguments, **options)
+        if costmaps:  # comes while the plan is made
+            asked.send(costmaps.pop(0))
+            asked.set_period(1000.0)
+            late[0] += 1500.0
+        return outcome
+
+    monkeypatch.setattr(asked.node._requests, "plan_now", slow_plan)
+    assert asked.answer(asked.ask()) == "SUCCEEDED"
 
 
 def test_a_retry_that_waits_is_canceled_or_answered_when_the_node_stops(asked: Asked) -> None:
