@@ -25,7 +25,7 @@ from ddqn_planner.planning import PlanStatus
 
 # Returns the answer of another planner to a goal's handle, or the outcome if there is none.
 AskOther = Callable[[Any, GivenUp, Callable[[], bool]], Awaitable[Any]]
-RESULT_TIMEOUT = 2  # seconds to keep a result: each request goes over all goals with theirs
+RESULT_TIMEOUT = 10  # seconds to keep a result, as action_server_result_timeout of Nav2's servers
 CANCELED = Outcome("CANCELED", "the goal was canceled")
 PREEMPTED = Outcome("PREEMPTED", "a newer goal of the same action came")
 
