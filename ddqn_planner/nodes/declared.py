@@ -1,6 +1,7 @@
 """What a parameter may be, and what users mean who write it in another way."""
 
 import math
+from array import array
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
@@ -58,6 +59,8 @@ class Declared(NamedTuple):
         A whole number is a number, and 65.0 is 65. A choice may have capitals and blanks around it.
         """
         kind = type(self.default)
+        if isinstance(value, array):  # what ROS makes of a list of numbers
+            value = value.tolist()
         if kind is list:
             return self._read_names(name, value)
         if kind is float and type(value) is int:
@@ -116,8 +119,8 @@ class Declared(NamedTuple):
 
     def _shown(self, value: Any) -> str:
         """Return a value and its type, and how to write it if only quotes are wrong."""
-        if value is None:  # what ROS makes of []
-            return "an empty list"
+        if value is None:  # also what ROS makes of [] and of blanks
+            return "no value, an empty list or blanks"
         words = f"{value!r}, {TYPES.get(type(value), type(value).__name__)}"
         if isinstance(self.default, str) and isinstance(value, (bool, int, float)):
             return f"{words} (with quotes, '{value}', it is a text)"

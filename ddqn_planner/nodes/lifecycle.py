@@ -207,10 +207,11 @@ class ManagedNode(BaseNode):
         asked = request.transition
         known = {change.number: change.label for change in self._changes()}
         label = asked.label or known.get(asked.id, "")
-        if self._is_changing or label not in known.values():
+        if self._is_changing or self.is_stopping or label not in known.values():
             what = repr(asked.label) if asked.label else f"transition {asked.id}"
             choices = ", ".join(known.values()) or "none"
             when = "while it changes its state" if self._is_changing else f"when {self.state}"
+            when = "as it is being stopped" if self.is_stopping else when
             self.get_logger().error(f"{what} refused: the node has {choices} {when}")
             return response
         self._is_changing = True

@@ -147,3 +147,67 @@ def _parameters(tree: Any, prefix: str = "") -> Iterator[str]:
             yield from _parameters(below, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}"
+
+
+def wrong_argument(arguments: Sequence[str]) -> str:
+    """Return which argument or parameter file ROS cannot read, and a remedy; empty if none."""
+    is_for_ros, rest = False, iter(arguments)
+    for argument in rest:
+        wrong = ""
+        if argument in ("--ros-args", "--"):
+            is_for_ros = argument == "--ros-args"
+        elif is_for_ros and argument == "--params-file":
+            wrong = _wrong_file(next(rest, ""))
+        elif is_for_ros and argument in ("-p", "--param"):
+            wrong = _wrong_rule(next(rest, ""))
+        if wrong:
+            return wrong
+    return ""
+
+
+def _wrong_rule(rule: str) -> str:
+    """Return why a setting of -p cannot be read; empty if it can."""
+    target, assignment, value = rule.partition(":=")
+    if not assignment:
+        return f"-p {rule} has no ':='; write -p NAME:=VALUE, as in -p robot_radius:=0.3"
+    node, colon, name = target.rpartition(":")
+    if colon and "/" in node:
+        return f"-p {rule} names a node with '/'; write -p {node.split('/')[-1]}:{name}:={value}"
+    if not value.strip():
+        return f"-p {rule} has no value; give one, and for an empty text: -p \"{target}:=''\""
+    try:
+        yaml.load(value, Loader=yaml.BaseLoader)
+    except yaml.YAMLError as error:
+        return f"-p {rule}: the value is no YAML ({_reason(error)}); put a text in quotes"
+    return ""
+
+
+def _wrong_file(file: str) -> str:
+    """Return why a parameter file cannot be read; empty if it can."""
+    form = "write NODE:, below it ros__parameters:, and below that NAME: VALUE"
+    try:
+        document = yaml.load(Path(file).read_bytes(), Loader=yaml.BaseLoader)
+    except OSError as error:
+        return f"the parameter file {file!r} cannot be read ({error.strerror}); check the path"
+    except (ValueError, yaml.YAMLError, RecursionError) as error:
+        return f"the parameter file {file!r} is no YAML ({_reason(error)}); correct it"
+    if not document:
+        return f"the parameter file {file!r} is empty; {form}, or leave it out"
+    if not [*_sections(document)]:
+        similar = nearest(PARAMETERS, _keys(document))
+        instead = f", but {similar}" if similar else ""
+        return f"the parameter file {file!r} has no {PARAMETERS}{instead}; {form}"
+    return ""
+
+
+def _keys(tree: Any) -> Iterator[str]:
+    for key, below in tree.items() if isinstance(tree, dict) else ():
+        yield key
+        yield from _keys(below)
+
+
+def _reason(error: Exception) -> str:
+    """Return why a text is no YAML, with the line where that is known."""
+    if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
+        return f"line {error.problem_mark.line + 1}: {error.problem}"
+    return str(error).partition("\n")[0]

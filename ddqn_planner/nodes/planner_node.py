@@ -23,7 +23,14 @@ from ddqn_planner.nodes.nav2 import Task, serve_nav2
 from ddqn_planner.nodes.other_planners import GivenUp, OtherPlanners, check_prefix
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.poses import Places, check_source
-from ddqn_planner.nodes.report import NO_REQUEST, NOT_ACTIVE, Outcome, Report, RequestError
+from ddqn_planner.nodes.report import (
+    NO_REQUEST,
+    NOT_ACTIVE,
+    STOPPING,
+    Outcome,
+    Report,
+    RequestError,
+)
 from ddqn_planner.nodes.requests import UNCHANGED, ActiveGoal, ModelSource, Requests, read_model
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker, spin_until_shutdown, unless
 from ddqn_planner.planning import Planner
@@ -47,7 +54,6 @@ class PlannerNode(ManagedNode):
         self._report = Report(self, self._look_soon)
         self._worker, self._map_worker, self._display_worker = (Worker(self) for _ in range(3))
         self._model = ModelSource(self, self._report, self._worker)
-        self._answering = 0
         self.deactivate()
         self.add_post_set_parameters_callback(self._apply_parameters)
         if self._settings.autostart:
@@ -118,21 +124,31 @@ class PlannerNode(ManagedNode):
         self.after_jump_back.clear()
         for name in ("_places", "_display", "_map", "_requests"):
             vars(self).pop(name, None)  # not all are there, if `configure` failed
-        self._model.forget()
+        if not self.is_stopping:  # the process ends, and a collection may take a second
+            self._model.forget()
 
     async def prepare(self, transition: str) -> bool:
         """Load the model before ``configure``; answer what waits before the node stops."""
         if transition == "configure":
             self._model.load()
-            await self._model.first()
-            return self._model.planner is not None
+            await unless(self._model.first(), lambda: self.is_stopping)
+            return self._model.planner is not None and not self.is_stopping
         if transition != "activate":
-            self._refusal = NOT_ACTIVE
-            while self._answering:
+            self._refuse(NOT_ACTIVE)
+            while self.state in CONFIGURED and self.is_answering:
+                self._look_soon()
                 await self._requests.next_look
-                if not self._answering:  # an answer that ends with its service may be lost
-                    await self._requests.next_look
         return True
+
+    def refuse_requests(self) -> None:
+        """Answer what waits, as before ``deactivate``."""
+        super().refuse_requests()
+        self._refuse(STOPPING)
+
+    def _refuse(self, refusal: Outcome) -> None:
+        self._refusal = refusal
+        if self.state in CONFIGURED:
+            self._requests.look_again()  # whoever waits sees the refusal
 
     # Parameters
 
@@ -245,19 +261,17 @@ class PlannerNode(ManagedNode):
     ) -> Any:
         """Return another planner's answer to a goal, or the outcome if there is none."""
         goal = handle.request
-        self._answering += 1
         try:
-            answer = await others.ask(
-                goal.planner_id,
-                goal,
-                handle.goal_id,
-                given_up=lambda: self._refusal or given_up(),
-                is_kept=is_kept,
-            )
+            with self.answering():
+                answer = await others.ask(
+                    goal.planner_id,
+                    goal,
+                    handle.goal_id,
+                    given_up=lambda: self._refusal or given_up(),
+                    is_kept=is_kept,
+                )
         except Exception as error:  # the node must survive
             answer = Outcome("FAILED", f"the other planner could not be asked ({error!r})")
-        finally:
-            self._answering -= 1
         if isinstance(answer, Outcome):
             self._report.note(answer)
             self._report.log(answer)
@@ -285,7 +299,8 @@ class PlannerNode(ManagedNode):
         has_success = hasattr(response, "success")  # with it, Nav2 needs the robot's pose
         try:
             checking = self._requests.invalid_poses(request, needs_robot=has_success)
-            invalid = await unless(checking, lambda: self._refusal)
+            with self.answering():
+                invalid = await unless(checking, lambda: self._refusal)
             if isinstance(invalid, Outcome):
                 raise ValueError(invalid.reason)
             response.is_valid = not invalid
@@ -301,16 +316,14 @@ class PlannerNode(ManagedNode):
         self, goals: list[PoseStamped], planning: Planning, given_up: GivenUp = lambda: None
     ) -> Outcome:
         """Plan, unless the node stops or the request is given up."""
-        self._answering += 1
         try:
-            outcome: Outcome = await unless(planning, lambda: self._refusal or given_up())
+            with self.answering():
+                outcome: Outcome = await unless(planning, lambda: self._refusal or given_up())
         except RequestError as error:
             outcome = Outcome(error.status, str(error))
         except Exception as error:  # as when no memory is left: the node must survive
             remedy = "give a smaller map, or another model"
             outcome = Outcome("FAILED", f"the planning failed ({error!r}); {remedy}")
-        finally:
-            self._answering -= 1
         if outcome is not UNCHANGED:
             self._report.note(outcome)
         frame = self._map.frame or (goals[0].header.frame_id if goals else "")

@@ -69,6 +69,7 @@ class Outcome:
 
 NO_REQUEST = Outcome("NO_REQUEST", "no plan was asked for yet")
 WAYS = "with a lifecycle manager or `ros2 lifecycle set`"
+STOPPING = Outcome("NOT_ACTIVE", "the node is being stopped; start it again, and ask again")
 NOT_ACTIVE = Outcome("NOT_ACTIVE", f"the node is not active; configure and activate it, {WAYS}")
 
 

@@ -1,13 +1,15 @@
 """What the nodes share: parameters, services, topics, the background worker, the shutdown."""
 
 import json
+import math
 import os
 import queue
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Coroutine, Generator, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from copy import copy
 from itertools import product
 from pathlib import Path
@@ -40,10 +42,10 @@ from std_srvs.srv import Trigger
 from ddqn_planner.nodes.declared import Parameters, read_all
 from ddqn_planner.nodes.overrides import (
     QOS,
-    nearest,
     unread_names,
     unread_qualities,
     unread_sections,
+    wrong_argument,
 )
 
 # Late subscribers receive the last message too: for maps, plans, saved models.
@@ -55,11 +57,16 @@ STEADY = Clock(clock_type=ClockType.STEADY_TIME)  # for timers, without simulate
 SERVICE_QUALITY = QoSProfile(depth=5000)
 
 CALLBACK_PATIENCE = 0.5  # seconds that a callback may take after a signal to stop
+ANSWER_PATIENCE = 0.5  # seconds after a signal in which waiting requests are answered
+FAREWELL = 0.1  # seconds after an answer until its service may end, which would lose it
 
+GREATEST_DEPTH = 2**31 - 1  # of a queue in DDS
 # What parameters may change of each subscription.
 OVERRIDABLE = [QoSPolicyKind[name] for name in ("HISTORY", "DEPTH", "DURABILITY", "RELIABILITY")]
 # What of a publisher's quality is less than what a subscription may ask for.
 MISFITS = ("durability", "volatile", "transient_local"), ("reliability", "best_effort", "reliable")
+
+STOPPED = False, "the node is being stopped"  # of triggers that wait at a signal
 
 # What happens on topics of a type that only one node should publish.
 EFFECTS_OF_SEVERAL_PUBLISHERS = {
@@ -80,6 +87,9 @@ class BaseNode(Node):
         self._logged_problems: list[str] = []
         self.after_jump_back: list[Callable[[], None]] = []
         """Called when a bag loops or a simulator is reset."""
+        self.is_stopping = False
+        """A signal has come: whoever waits is to be refused."""
+        self._waiting, self._last_answer = 0, -math.inf
         super().__init__(name)
         # As tf2 has it. Another clock, by use_sim_time, counts as a jump, too.
         back = JumpThreshold(min_forward=None, min_backward=Duration(seconds=-1))
@@ -153,16 +163,25 @@ class BaseNode(Node):
         try:
             if all(each.name for each in messages):
                 return self.set_parameters_atomically(self._meant(messages))
-        except ParameterException as error:  # it is not declared
-            names = [nearest(each.name, self._declared) for each in messages]
-            similar = ", ".join(filter(None, names))
-            reason = f"{error}; the nearest is {similar}" if similar else str(error)
+        except ParameterException as error:
+            reason = str(error)
         except ValueError as error:
             reason = str(error)
         return msg.SetParametersResult(successful=False, reason=reason)
 
     def _meant(self, messages: Sequence[msg.Parameter]) -> list[Parameter]:
-        """Return parameters with what their values mean."""
+        """Return parameters with what their values mean; a ValueError says what is wrong."""
+        names = [each.name for each in messages]
+        if repeated := {name for name in names if names.count(name) > 1}:
+            wrong = f"{', '.join(sorted(repeated))} is set twice in one request"
+            raise ValueError(f"{wrong}; give one value each")
+        if unknown := [name for name in names if not self.has_parameter(name)]:
+            node = self.get_fully_qualified_name()
+            raise ValueError(unread_names(unknown, self._declared, node))
+        for name in names:
+            if name in self._declared and self._declared[name].read_only:
+                start = f"set it at the start, with -p {name}:=VALUE or in a file"
+                raise ValueError(f"{name} is read-only; {start}")
         try:
             parameters = [Parameter.from_parameter_msg(each) for each in messages]
         except ValueError as error:
@@ -179,6 +198,25 @@ class BaseNode(Node):
         (service,) = [each for each in self.services if each.srv_type is service_type]
         service.callback = callback
 
+    @contextmanager
+    def answering(self) -> Iterator[None]:
+        """Count a request until it is answered: a node that stops waits for its answer."""
+        self._waiting += 1
+        try:
+            yield
+        finally:
+            self._waiting -= 1
+            self._last_answer = time.monotonic()
+
+    @property
+    def is_answering(self) -> bool:
+        """Return whether a request waits for its answer, or an answer may still be on its way."""
+        return self._waiting > 0 or time.monotonic() < self._last_answer + FAREWELL
+
+    def refuse_requests(self) -> None:
+        """Give up what requests wait for, as the node is being stopped."""
+        self.is_stopping = True
+
     def create_service(self, *arguments: Any, **options: Any) -> Service:
         """Create a service with the queue of `SERVICE_QUALITY`."""
         return super().create_service(*arguments, **{"qos_profile": SERVICE_QUALITY, **options})
@@ -187,7 +225,9 @@ class BaseNode(Node):
         """Create a service; its handler returns whether it succeeds and a message, or awaits."""
 
         async def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-            response.success, response.message = await await_or_execute(handler)
+            with self.answering():
+                handling = unless(await_or_execute(handler), lambda: self.is_stopping and STOPPED)
+                response.success, response.message = await handling
             return response
 
         self.create_service(Trigger, name, answer, **options)
@@ -203,7 +243,15 @@ class BaseNode(Node):
     ) -> Subscription:
         """Create a subscription with the quality that parameters may override."""
         name = self.resolve_topic_name(topic)
-        options["qos_overriding_options"] = QoSOverridingOptions(OVERRIDABLE)
+
+        def check_depth(quality: QoSProfile) -> msg.SetParametersResult:
+            if not 0 <= quality.depth <= GREATEST_DEPTH:
+                parameter = f"qos_overrides.{name}.subscription.depth"
+                raise ValueError(f"{parameter} is {quality.depth}; give 0 to {GREATEST_DEPTH}")
+            return msg.SetParametersResult(successful=True)
+
+        overriding = QoSOverridingOptions(OVERRIDABLE, callback=check_depth)
+        options["qos_overriding_options"] = overriding
         options["event_callbacks"] = SubscriptionEventCallbacks(use_default_callbacks=False)
         quality = copy(qos_profile)  # rclpy writes what the parameters say into it
         try:
@@ -309,6 +357,9 @@ qos_overrides.TOPIC.subscription.POLICY, where POLICY is history, depth, durabil
 """
 
 
+SYNTAX = "write --ros-args [-p NAME:=VALUE] [--params-file FILE] [-r NAME:=NEW_NAME]"
+
+
 def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | None = None) -> int:
     """Run one node until SIGINT or SIGTERM, or print help; return 1 if it cannot start."""
     if parameters and {"-h", "--help"} & {*sys.argv[1:]}:
@@ -335,7 +386,10 @@ def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | 
         if isinstance(node, BaseNode):
             node.tell_unread_qualities()
     except (NameValidationException, ParameterException, RuntimeError, ValueError) as error:
-        get_logger("ddqn_planner").fatal(f"cannot start: {error}")
+        # rcl names neither the argument nor the line in some cases.
+        has_read = rclpy.ok()
+        reason = str(error) if has_read else wrong_argument(sys.argv) or f"{error}; {SYNTAX}"
+        get_logger("ddqn_planner").fatal(f"cannot start: {reason}")
         rclpy.try_shutdown()
         return 1
     except Interrupted:
@@ -343,8 +397,11 @@ def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | 
         return 0
     try:
         executor.add_node(node)
-        while not stop.has_come:
-            executor.spin_once()
+        with suppress(Interrupted):
+            while not stop.has_come:
+                executor.spin_once()
+        if isinstance(node, BaseNode):
+            answer_waiting(node, executor)
     except Interrupted:
         pass
     finally:
@@ -353,6 +410,14 @@ def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | 
         executor.shutdown()
         rclpy.shutdown()
     return 0
+
+
+def answer_waiting(node: BaseNode, executor: Executor) -> None:
+    """Refuse the requests that wait, for as long as their clients may wait for the answers."""
+    node.refuse_requests()
+    deadline = time.monotonic() + ANSWER_PATIENCE
+    while node.is_answering and time.monotonic() < deadline:
+        executor.spin_once(FAREWELL / 10)
 
 
 class Interrupted(BaseException):
@@ -378,17 +443,15 @@ class StopSignal:
 
         def wait() -> None:
             os.read(heard, 1)
-            # A task, not a flag: the executor wakes and returns.
-            executor.create_task(self._come)
+            # A flag, as many requests may stand before a task; a task, as it wakes the executor.
+            self.has_come = True
+            executor.create_task(lambda: None)
             # It may compile in a callback, or wait for a thread that does.
             while not self.obeyed.wait(CALLBACK_PATIENCE):
                 self._is_late = True
                 signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
 
         threading.Thread(target=wait, daemon=True).start()
-
-    def _come(self) -> None:
-        self.has_come = True
 
     def _on_signal(self, *_: object) -> None:
         if self._is_late and not self.obeyed.is_set():

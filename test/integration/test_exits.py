@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from client import wait_for
 from integration.conftest import TIMEOUT
+from integration.robot import ask_for_plan
 from std_srvs.srv import Trigger
 
 NODES = "map_server_node", "planner_node", "trainer_node"
@@ -98,6 +100,20 @@ def test_a_signal_ends_a_trainer_that_imports_torch(run_node: Any) -> None:
     with run_node("trainer_node", torch=TORCH) as node:
         node.wait_for_log("an import waits")
         assert node.stop() == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_answers_what_waits(run_waiting: Any, number: signal.Signals) -> None:
+    with run_waiting(f"/refused_{number}") as robot:
+        robot.set_map(robot.stamped_map())
+        robot.node.wait_for_log("a model waits")
+        waiting = [ask_for_plan(robot), ask_for_plan(robot)]
+        robot.wait_for_reason("the model is being loaded")
+        assert not any(future.done() for future in waiting)
+        assert robot.node.stop(number) == 0
+        wait_for("answers", lambda: all(future.done() for future in waiting))
+        assert [future.result().plan.poses for future in waiting] == [[], []]
+        assert "no plan: the node is being stopped" in robot.node.log
 
 
 # As where a request waits for code that another thread compiles.

@@ -2,19 +2,25 @@
 
 import math
 import re
+from array import array
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from client import wait_for
+from client import TIMEOUT, wait_for
 from hypothesis import given
 from hypothesis import strategies as st
 from nav_msgs.srv import GetMap, LoadMap
 
 from ddqn_planner.nodes import map_server_node, trainer_node
 from ddqn_planner.nodes.declared import Declared, read_all
-from ddqn_planner.nodes.overrides import nearest, unread_names, unread_sections
+from ddqn_planner.nodes.overrides import (
+    nearest,
+    unread_names,
+    unread_sections,
+    wrong_argument,
+)
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 
 ROBOTS = trainer_node.PARAMETERS["robots"]
@@ -50,7 +56,8 @@ WRONG = [
     ("robot_radius", "0.3", "is '0.3', a text .*no quotes.*; give a number, 0 to 100"),
     ("robot_radius", True, "is True, a truth value; give a number, 0 to 100"),
     ("robot_radius", [0.3], r"is \[0.3\], a list; give a number"),
-    ("robot_radius", None, "is an empty list; give a number"),
+    ("robot_radius", None, "is no value, an empty list or blanks; give a number"),
+    ("robot_radius", array("d", [0.3]), r"is \[0.3\], a list; give a number"),
     ("robot_radius", -0.1, "is -0.1; give 0 to 100"),
     ("clearance_weight", 1.1, "is 1.1; give 0 to 1"),
     ("map_timeout", math.inf, "is inf; give 0 to 3600"),
@@ -212,6 +219,53 @@ def test_any_file_is_read_or_left_out(tmp_path_factory: Any, tree: Any) -> None:
     unread_sections(["--ros-args", "--params-file", str(file)], PARAMETERS, "/planner")
 
 
+UNREADABLE = [
+    ("-p", "robot_radius=0.3", "no ':='; write -p NAME:=VALUE"),
+    ("-p", "model:=", "-p model:= has no value; give one, and for an empty text: -p \"model:=''\""),
+    ("-p", "/planner:robot_radius:=0.3", "write -p planner:robot_radius:=0.3"),
+    ("-p", "mode:=[greedy", "-p mode:=\\[greedy: the value is no YAML .line 1: "),
+    ("planner:\n  ros__parameters:\n\tmode: greedy\n", "no YAML .line 3: .*correct it"),
+    ("planner:\n  ros_parameters:\n    mode: greedy\n", "no ros__parameters, but ros_parameters;"),
+    ("", "is empty; write NODE:"),
+    (None, "cannot be read .No such file or directory.; check the path"),
+]
+
+
+@pytest.mark.parametrize("case", UNREADABLE)
+def test_an_argument_that_ros_cannot_read_is_named(case: Any, tmp_path: Path) -> None:
+    *arguments, remedy = case
+    if len(arguments) == 1:
+        file = tmp_path / "parameters.yaml"
+        if arguments[0] is not None:
+            file.write_text(arguments[0])
+        arguments = ["--params-file", str(file)]
+    assert re.search(remedy, wrong_argument(["node", "--ros-args", *arguments]))
+    assert wrong_argument(["node", *arguments]) == ""  # not for ROS
+
+
+def test_arguments_that_ros_reads_are_not_wrong(tmp_path: Path) -> None:
+    file = tmp_path / "parameters.yaml"
+    file.write_text(yaml.safe_dump({"planner": RADIUS}))
+    settings = ["-p", "robot_radius:=0.3", "-p", "planner:mode:=greedy", "-p", "model:=''"]
+    assert wrong_argument(["node", "--ros-args", "--params-file", str(file), *settings]) == ""
+
+
+@pytest.mark.parametrize(
+    ("setting", "reason"),
+    [
+        ("model:=", "cannot start: -p model:= has no value"),
+        ("qos_overrides./map.subscription.depth:=-3", "depth is -3; give 0 to 2147483647"),
+    ],
+)
+def test_a_node_that_cannot_start_names_the_setting(
+    run_node: Any, setting: str, reason: str
+) -> None:
+    with run_node("planner_node", settings=["--ros-args", "-p", setting], exit_code=1) as node:
+        assert node.process.wait(TIMEOUT) == 1
+    assert reason in node.log
+    assert node.log.count("FATAL") == 1
+
+
 def test_a_planner_tells_what_it_does_not_read_and_takes_what_is_meant(
     run_node: Any, make_client: Any, tmp_path: Path
 ) -> None:
@@ -239,7 +293,8 @@ def test_a_planner_tells_what_it_does_not_read_and_takes_what_is_meant(
             assert result.successful
             assert client.get_parameter("planner", name) == meaning
         for name, value, reason in (
-            ("robot_raduis", 0.1, "the nearest is robot_radius"),
+            ("robot_raduis", 0.1, "robot_raduis (the nearest is robot_radius)"),
+            ("follow_trainer", True, "read-only; set it at the start, with -p follow_trainer:="),
             ("robot_radius", "0.1", "a number and a truth value have no quotes"),
             ("model", 3, "with quotes"),
         ):

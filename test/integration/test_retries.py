@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import rclpy
 from clears import GOAL, START, Costmap, Navigator
-from client import map_message, pose, wait_for
+from client import TIMEOUT, map_message, pose, wait_for
 from geometry_msgs.msg import PoseStamped
 from integration.robot import NUMBERS
 from rclpy.duration import Duration
@@ -24,9 +24,10 @@ from std_msgs.msg import Header
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.map_source import Arrivals
 from ddqn_planner.nodes.nav2 import CANCELED, Task
-from ddqn_planner.nodes.planner_node import PlannerNode
-from ddqn_planner.nodes.report import NOT_ACTIVE, Outcome
+from ddqn_planner.nodes.planner_node import IDLE_PERIOD, PlannerNode
+from ddqn_planner.nodes.report import NOT_ACTIVE, STOPPING, Outcome
 from ddqn_planner.nodes.retries import Retries
+from ddqn_planner.nodes.runtime import FAREWELL
 from ddqn_planner.planning import Plan, PlanRequest, PlanStatus
 
 CLEARS = 8
@@ -193,8 +194,21 @@ def test_a_retry_that_waits_is_canceled_or_answered_when_the_node_stops(asked: A
     assert asked.answer(retry) == CANCELED.status
     retry = asked.ask()
     assert asked.is_waiting(retry)
-    asked.node._refusal = NOT_ACTIVE
+    asked.node.refuse_requests()
+    assert asked.answer(retry) == STOPPING.status
+
+
+def test_a_deactivation_answers_at_once(asked: Asked) -> None:
+    failed_before(asked)
+    retry = asked.ask()
+    assert asked.is_waiting(retry)
+    began = time.monotonic()
+    preparing = asked.executor.create_task(asked.node.prepare, "deactivate")
+    asked.executor.spin_until_future_complete(preparing, TIMEOUT)
+    assert preparing.result()
+    assert retry.done()
     assert asked.answer(retry) == NOT_ACTIVE.status
+    assert FAREWELL < time.monotonic() - began < IDLE_PERIOD
 
 
 def test_a_costmap_that_stays_away_is_awaited_once(asked: Asked) -> None:
