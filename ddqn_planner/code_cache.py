@@ -12,10 +12,11 @@ from numba.core.caching import FunctionCache
 from numba.core.event import Listener, register
 from numba.core.serialize import dumps
 
-from ddqn_planner.files import write_atomically
+from ddqn_planner.files import read_file, write_atomically
 from ddqn_planner.memory import llvm_was_used
 
 LOGGER = logging.getLogger("ddqn_planner")
+MAX_BYTES = 2**26  # of a file; the code of a function has some 100 kB
 CHECKSUM_BYTES = hashlib.sha256().digest_size
 
 
@@ -27,7 +28,7 @@ def write_checked(path: Path, value: object) -> None:
 
 def read_checked(path: Path) -> Any:
     """Return the value that a file holds; ValueError if its checksum is another one."""
-    content = path.read_bytes()
+    content = read_file(path, MAX_BYTES)
     checksum, pickled = content[:CHECKSUM_BYTES], content[CHECKSUM_BYTES:]
     if hashlib.sha256(pickled).digest() != checksum:
         raise ValueError("damaged or cut short")

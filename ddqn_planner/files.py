@@ -1,17 +1,23 @@
-"""Writes files so that a crash or a full disk never leaves half a file or half a record."""
+"""Reads regular files alone, and writes files so that a crash never leaves half a file.
+
+A named pipe or a device in place of a file would never end, or block who opens it.
+"""
 
 import csv
+import errno
 import fcntl
 import io
+import math
 import os
 import pwd
 import re
 import reprlib
 import secrets
+import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, Final
 
 TEMPORARY = re.compile(r"\..+\.[0-9a-f]{16}")  # the name of a file that is being written
 URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
@@ -19,6 +25,95 @@ URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
 VARIABLE = re.compile(r"(?P<name>\$(?:[A-Za-z_]\w*|\{[^/}]*\}|\([^)]*\)))[^/]*")
 MAX_NAME, MAX_PATH = 255, 4095  # bytes that Linux allows for a name, and for a path
 MAX_REST = 2**24  # bytes of records that are kept while a disk is full; those beyond are left out
+MAX_RECORD_BYTES = 2**30  # of an ``episodes.csv``: 20,000 of the longest drives
+MAX_ROW = 2**20  # bytes of a row there
+
+KINDS: Final = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a named pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
+
+
+class FileWriteError(OSError):
+    """A file cannot be written; `strerror` says why."""
+
+    def __init__(self, path: Path, error: OSError) -> None:
+        reason, remedy = error.strerror or str(error), "give another path, or allow writing there"
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            remedy = "make room there, or give another path"
+        elif error.errno == errno.EINVAL:
+            remedy = "give the path of a regular file"
+        elif error.errno in (errno.EEXIST, errno.ENOTDIR):
+            reason, remedy = f"{path.parent} is no folder", "give a path in a folder"
+        super().__init__(f"{path} cannot be written ({reason}); {remedy}")
+        self.strerror = reason
+
+
+def kind_of(path: str | Path) -> str:
+    """Return what a path is in words, as "a named pipe"; empty for a regular file, or for none."""
+    try:
+        mode = os.stat(path).st_mode
+    except (OSError, ValueError):
+        return ""
+    return _kind(mode)
+
+
+def _kind(mode: int) -> str:
+    return "" if stat.S_ISREG(mode) else KINDS.get(stat.S_IFMT(mode), "no file")
+
+
+def open_regular(path: Path, limit: float = math.inf) -> BinaryIO:
+    """Open a regular file to read its bytes; a ValueError for another, or for a larger one."""
+    if kind := kind_of(path):  # to open a device may change it
+        raise ValueError(f"{path} is {kind}; give a regular file")
+    # It may be another one by now, and to open a pipe would wait for its writer.
+    file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
+    try:
+        status = os.fstat(file.fileno())
+        if kind := _kind(status.st_mode):
+            raise ValueError(f"{path} is {kind}; give a regular file")
+        if status.st_size > limit:
+            raise ValueError(f"{path} has {status.st_size} bytes; give at most {limit:.0f}")
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def read_file(path: Path, limit: int) -> bytes:
+    """Return the bytes of a regular file; a ValueError for another, or for a larger one."""
+    with open_regular(path, limit) as file:
+        content = file.read(limit + 1)
+    if content is None:  # a file of the kernel that has nothing to read now
+        raise ValueError(f"{path} has no content that can be read; give a regular file")
+    if len(content) > limit:  # a file of the kernel tells no size
+        raise ValueError(f"{path} has more than {limit} bytes; give at most that many")
+    return content
+
+
+def read_rows(path: Path) -> Iterator[bytes]:
+    """Yield the rows of a record, with their ends; one that is too long in pieces."""
+    with open_regular(path, MAX_RECORD_BYTES) as file:
+        yield from iter(lambda: file.readline(MAX_ROW), b"")
+
+
+def open_to_append(path: Path) -> BinaryIO:
+    """Open a regular file, or make one, to append bytes to it, without a buffer."""
+    try:
+        _refuse_other_kinds(path)
+        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC
+        return open(os.open(path, flags, 0o666), "ab", buffering=0)
+    except OSError as error:
+        raise FileWriteError(path, error) from error
+
+
+def _refuse_other_kinds(path: Path) -> None:
+    """Raise an OSError if a path is something else than a regular file, or a missing one."""
+    if kind := kind_of(path):
+        raise OSError(errno.EINVAL, f"it is {kind}")
 
 
 def as_path(path: Any, name: str = "path") -> Path:
@@ -81,26 +176,33 @@ def _with_home(text: str, problem: str) -> str:
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a temporary file beside `path` and rename it; missing folders are made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
+    """Write a temporary file beside `path` and rename it; missing folders are made.
+
+    A FileWriteError names `path`, not the temporary file.
+    """
     try:
-        with temporary.open("xb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except BaseException:
-        with suppress(OSError):  # report the first error
-            temporary.unlink()
-        raise
+        _refuse_other_kinds(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
+        try:
+            with temporary.open("xb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(path)
+        except BaseException:
+            with suppress(OSError):  # report the first error
+                temporary.unlink()
+            raise
+    except OSError as error:
+        raise FileWriteError(path, error) from error
 
 
 def check_writable(path: Path, option: str) -> None:
     """Raise a ValueError, before hours of work, if a file could not be written afterwards."""
     remedy = f"give another {option}"
-    if path.exists() and not path.is_file():
-        raise ValueError(f"{path} is no regular file; {remedy}")
+    if kind := kind_of(path):
+        raise ValueError(f"{option} is {path}, {kind}, no regular file; {remedy}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         probe = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
@@ -112,11 +214,40 @@ def check_writable(path: Path, option: str) -> None:
         raise ValueError(f"{str(path)!r} is no file's name ({error}); {remedy}") from None
 
 
+def check_distinct(outputs: Mapping[str, Path | None], inputs: Mapping[str, Path | None]) -> None:
+    """Raise a ValueError if an output would replace another one, or a file that is read."""
+    taken = [(name, path) for name, path in inputs.items() if path is not None]
+    for option, path in outputs.items():
+        if path is None:
+            continue
+        for name, other in taken:
+            if _is_same(path, other):
+                raise ValueError(f"{option} and {name} are one file, {path}; give another {option}")
+        taken.append((option, path))
+
+
+def _is_same(path: Path, other: Path) -> bool:
+    if os.path.realpath(path) == os.path.realpath(other):
+        return True
+    try:
+        return path.samefile(other)  # two names of one file
+    except OSError:
+        return False
+
+
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Wait until no other process holds the lock of a file, and hold it; folders are made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.with_name(f".{path.name}.lock").open("ab") as file:
+    """Wait until no other process holds the lock of a file, and hold it; folders are made.
+
+    A FileWriteError names the file, not its lock.
+    """
+    try:
+        _refuse_other_kinds(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = open_to_append(path.with_name(f".{path.name}.lock"))
+    except OSError as error:
+        raise FileWriteError(path, error) from error
+    with lock as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield
 
@@ -154,7 +285,7 @@ class WorkFolder(ExitStack):
         self.on_saved: Callable[[Any], None] = lambda _: None  # hears of each save, whatever came
         with self.opening():
             # The system closes the file, and so unlocks it, when the process ends.
-            file = self.enter_context((folder / marks[0]).open("ab"))
+            file = self.enter_context(open_to_append(folder / marks[0]))
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -191,7 +322,7 @@ class Appender:
 
     def __init__(self, path: Path) -> None:
         # Unbuffered: readers see every record, also after a crash.
-        self._file = path.open("ab", buffering=0)
+        self._file = open_to_append(path)
         self._rest = bytearray()
         self.close = self._file.close
 

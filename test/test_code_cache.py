@@ -1,5 +1,6 @@
 """What becomes of compiled functions when the files of their code are damaged, or none can be."""
 
+import os
 import pickle
 import shutil
 from collections.abc import Callable
@@ -97,6 +98,16 @@ def link_to_itself(path: Path) -> None:
     path.symlink_to(path)
 
 
+def replace_by_pipe(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+def link_to_a_device(path: Path) -> None:
+    path.unlink()
+    path.symlink_to("/dev/full")  # which has zeros without end
+
+
 DAMAGES = (
     empty,
     cut,
@@ -108,6 +119,8 @@ DAMAGES = (
     write_with_checksum,
     replace_by_folder,
     link_to_itself,
+    replace_by_pipe,
+    link_to_a_device,
 )
 
 
@@ -136,9 +149,9 @@ def test_a_folder_with_files_in_the_place_of_code_stays(folder: Path, caplog: An
     for _ in range(2):
         assert hits(compile_area()) == 0
     (record,) = caplog.records
-    assert f"{path} cannot be used (Is a directory): compiled at each start; remove it by hand" in (
-        record.getMessage()
-    )
+    reason = f"{path} is a folder; give a regular file"
+    remedy = "compiled at each start; remove it by hand"
+    assert f"{path} cannot be used ({reason}): {remedy}" in record.getMessage()
     assert (path / "file").exists()
 
 

@@ -8,6 +8,7 @@ import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from enum import Enum
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +25,16 @@ from ddqn_planner.experience.experience import (
     ways,
 )
 from ddqn_planner.experience.posterior import cells_of
-from ddqn_planner.files import Appender, WorkFolder, as_path, differences
+from ddqn_planner.files import (
+    MAX_RECORD_BYTES,
+    Appender,
+    WorkFolder,
+    as_path,
+    differences,
+    open_regular,
+    read_file,
+    read_rows,
+)
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.rotations import Rotation
 
@@ -45,6 +55,7 @@ STAND_PERIOD = 2.0  # seconds after which a robot that stands at its goal has ar
 ARRIVAL_DISTANCE = 0.5  # metres from the goal
 PAUSE = 120.0  # seconds: a robot that stands for longer waits for no door and no crowd
 SHORTEST = 0.5  # metres: a robot that went no farther away has not driven
+MAX_CSV_BYTES = 2**28  # of a recording: some 8 million poses
 MOST_SAMPLES = 2000  # a drive is cut there, so that the robot learns while it drives for hours
 JUMP = 1.0  # seconds back by which a clock begins anew: a bag loops, a simulator is reset
 WINDOW, STEP = 0.5, 0.25  # a drive's length joins means of so many seconds, so many metres apart
@@ -107,12 +118,11 @@ class Drive(NamedTuple):
 def read_drives(path: str | Path) -> Iterator[Drive]:
     """Yield the drives of an ``episodes.csv`` in its complete rows; an OSError if it has none."""
     ends = {end.value.encode(): end for end in DriveEnd}
-    with as_path(path).open("rb") as file:
-        for row in map(ROW.fullmatch, file):
-            if row and row[2] in ends:
-                text = [sample.split(b":") for sample in row[4].split()]
-                samples = np.array(text, dtype=np.float64)
-                yield Drive(ends[row[2]], samples[:, 0] + float(row[3]), samples[:, 1:])
+    for row in map(ROW.fullmatch, read_rows(as_path(path))):
+        if row and row[2] in ends:
+            text = [sample.split(b":") for sample in row[4].split()]
+            samples = np.array(text, dtype=np.float64)
+            yield Drive(ends[row[2]], samples[:, 0] + float(row[3]), samples[:, 1:])
 
 
 class DriveRecorder:
@@ -245,7 +255,7 @@ class DriveFolder(WorkFolder):
 
 def _cut_incomplete_row(path: Path) -> int:
     """Cut what a crash left of a row at the end; return the number of the last drive, or 0."""
-    content = path.read_bytes() if path.exists() else b""
+    content = read_file(path, MAX_RECORD_BYTES) if path.exists() else b""
     complete = content[: content.rfind(b"\n") + 1]
     if complete != content:
         os.truncate(path, len(complete))
@@ -307,7 +317,9 @@ def _files_of(path: Path) -> Sequence[Path]:
 def read_csv(path: Path) -> list[Sample]:
     """Read the columns seconds, x and y; a ValueError if one is missing or has no numbers."""
     samples, names = [], ("seconds", "x", "y")
-    with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
+    with TextIOWrapper(
+        open_regular(path, MAX_CSV_BYTES), "utf-8-sig", errors="replace", newline=""
+    ) as file:
         reader = csv.DictReader(line for line in file if line.strip(" ,\r\n"))
         reader.fieldnames = [name.strip() for name in reader.fieldnames or ()]
         if missing := sorted(set(names) - set(reader.fieldnames)):
@@ -340,7 +352,7 @@ def read_mcap(
     frames: dict[str, set[str]] = defaultdict(set)
     trees: dict[str, Transforms] = defaultdict(dict)
     for path in paths:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             try:
                 reader = make_reader(file, decoder_factories=[DecoderFactory()])
                 for schema, channel, _, message in reader.iter_decoded_messages():

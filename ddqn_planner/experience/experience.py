@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import io
 import math
+import reprlib
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import pairwise
@@ -17,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.experience.evidence import FARTHEST, Evidence, Visits
 from ddqn_planner.experience.prior import Prior
-from ddqn_planner.files import as_path, differences, locked, write_atomically
+from ddqn_planner.files import as_path, differences, locked, read_file, write_atomically
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import POSITIVE, Cells, as_number, cells_inside, numbers
 from ddqn_planner.grid.grid_map import Exploration
@@ -26,6 +27,7 @@ from ddqn_planner.grid.moves import MOVES, UPHILL, actions_along, cells_along
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
+MAX_FILE_BYTES = 2**27  # a larger file is refused before it is read
 VERSION = 3  # 2 was never released
 PRIOR = "prior_"  # before the names of its arrays in a file
 EXPERIENCE = "experience.npz"  # the name of the file in a folder
@@ -224,6 +226,9 @@ class Experience:
         self._learn(partial(Evidence.merge, other=copy.deepcopy(other.evidence)))
 
     def _check_kind(self, other: Experience) -> None:
+        if not isinstance(other, Experience):
+            remedy = "give an Experience, as Experience.load returns it"
+            raise ValueError(f"the other experience is {reprlib.repr(other)}; {remedy}")
         if changed := differences(other.options, self.options):
             raise ValueError(f"the other experience has {changed}; give those of one kind of robot")
 
@@ -333,7 +338,7 @@ class Experience:
         """
         path = as_path(path).absolute()
         with locked(path):
-            old = path.read_bytes() if path.exists() else None
+            old = read_file(path, MAX_FILE_BYTES) if path.exists() else None
             if old is not None and self._synchronised != (path, crc32(old)):
                 saved = Experience.load(path)
                 saved._check_kind(self)
@@ -371,6 +376,9 @@ class Experience:
         """
         try:
             with np.lib.npyio.NpzFile(io.BytesIO(data)) as file:  # which unpickles nothing
+                size = sum(entry.file_size for entry in file.zip.infolist())
+                if size > MAX_FILE_BYTES:  # a small file can claim arrays of any size
+                    raise ValueError(f"it unpacks to {size} bytes, over {MAX_FILE_BYTES}")
                 arrays = dict.fromkeys(ARRAYS, np.zeros(0)) | dict(file)  # older ones lack some
             version = int(arrays["version"])
             if version not in (1, VERSION):
@@ -401,11 +409,12 @@ class Experience:
         path = as_path(path)
         path = path / EXPERIENCE if path.is_dir() else path
         try:
-            content = path.read_bytes()
+            content = read_file(path, MAX_FILE_BYTES)
             experience = cls.from_bytes(content)
-        except (OSError, ExperienceFileError) as error:
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
             raise ExperienceFileError(
-                f"{path}: cannot be read ({error}); give a file that `Experience.save` wrote, or "
+                f"{path}: cannot be read ({reason}); give a file that `Experience.save` wrote, or "
                 "delete it to begin anew"
             ) from error
         experience._synchronised = path.absolute(), crc32(content)

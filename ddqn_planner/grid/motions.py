@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.files import as_path
+from ddqn_planner.files import as_path, read_file
 from ddqn_planner.grid.arguments import POSITIVE, Choice, as_number
 
 Array = NDArray[np.float64]
@@ -22,6 +22,7 @@ TURNED: Final = QUARTER[:, ::-1] * (-1, 1)
 DIRECTIONS: Final = np.concatenate([QUARTER, TURNED, -QUARTER, -TURNED])
 HEADINGS: Final = len(DIRECTIONS)
 
+MAX_LATTICE_BYTES = 2**26  # Nav2's own files have up to 1 MB
 STRIDE = 0.4  # metres of a long step straight ahead
 BEHIND = 2.0  # what a metre counts that is not driven ahead; Nav2's reverse_penalty
 TURN = 0.5  # metres that a turn on the spot by one radian counts
@@ -91,7 +92,7 @@ def read_lattice(file: str | Path) -> Motions:
     """Read the motion primitives of a state lattice in Nav2's JSON format; else a ValueError."""
     file = as_path(file, "the lattice")
     try:
-        lattice = json.loads(file.read_text())
+        lattice = json.loads(read_file(file, MAX_LATTICE_BYTES))
         about = lattice["lattice_metadata"]
         cell = as_number("grid_resolution", about["grid_resolution"], *POSITIVE, "metres, > 0")
         angles = np.array(about["heading_angles"], float)

@@ -11,7 +11,7 @@ import numpy as np
 import safetensors.numpy
 from safetensors import SafetensorError
 
-from ddqn_planner.files import as_path, write_atomically
+from ddqn_planner.files import as_path, kind_of, read_file, write_atomically
 from ddqn_planner.grid import MoveRule
 from ddqn_planner.model.networks import (
     AnyMapQNetwork,
@@ -69,7 +69,9 @@ def find_model(name: str | Path) -> Path:
     except ValueError as error:
         raise ModelFileError(str(error)) from None
     if path.suffix == MODEL_SUFFIX or path.name != str(name):
-        if os.path.isfile(path):
+        if kind := kind_of(path):
+            raise ModelFileError(f"the model {str(path)!r} is {kind}; give a model file")
+        if os.path.exists(path):
             return path
         raise ModelFileError(f"there is no model file {str(path)!r}; check the path")
     try:
@@ -95,15 +97,16 @@ def load_model(name: str | Path) -> tuple[QNetwork, ModelMetadata]:
     """Read a model file, given by path or a shipped model's name; else raise ModelFileError."""
     path = find_model(name)
     try:
-        size = os.path.getsize(path)
-        if size > MAX_FILE_BYTES:
-            raise ValueError(f"has {size} bytes; give a model of at most {MAX_FILE_BYTES}")
-        return model_of(path.read_bytes())
+        content = read_file(path, MAX_FILE_BYTES)
     except OSError as error:
-        problem = f"cannot be read ({error}); check its rights"
+        problem = f"cannot be read ({error.strerror}); check its rights"
+        raise ModelFileError(f"{path}: {problem}") from None
     except ValueError as error:
-        problem = str(error)
-    raise ModelFileError(f"{path}: {problem}")
+        raise ModelFileError(str(error)) from None
+    try:
+        return model_of(content)
+    except ValueError as error:
+        raise ModelFileError(f"{path}: {error}") from None
 
 
 def model_of(data: bytes) -> tuple[QNetwork, ModelMetadata]:

@@ -9,6 +9,10 @@ from typing import Any, Final, NamedTuple
 
 import yaml
 
+from ddqn_planner.files import read_file
+
+MAX_FILE_BYTES: Final = 2**24  # of a parameter file
+
 PARAMETERS: Final = "ros__parameters"
 QOS: Final = "qos_overrides."
 TOPICS_OF_ROS: Final = ("/clock", "/parameter_events", "/rosout", "/tf", "/tf_static")
@@ -121,7 +125,7 @@ def _sources(arguments: Sequence[str]) -> Iterator[tuple[str, list[Section]]]:
             file = next(rest, "")
             # ROS has read it before, or has said what is wrong with it.
             with suppress(OSError, ValueError, yaml.YAMLError, RecursionError):
-                document = yaml.load(Path(file).read_bytes(), Loader=yaml.BaseLoader)
+                document = yaml.load(read_file(Path(file), MAX_FILE_BYTES), Loader=yaml.BaseLoader)
                 yield file, [*_sections(document)]
         elif is_for_ros and argument in ("-p", "--param"):
             rule = next(rest, "")

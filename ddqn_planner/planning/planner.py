@@ -14,7 +14,7 @@ import numpy as np
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import Cells, as_cell, as_flag, as_number, as_pose, listed
 from ddqn_planner.grid.grid_map import check_grid
-from ddqn_planner.model import ModelMetadata, QNetwork, load_model
+from ddqn_planner.model import ModelMetadata, QNetwork, load_model, save_model
 from ddqn_planner.planning import unknown_space
 from ddqn_planner.planning.field import DistanceField, FieldCache, Goals, QField
 from ddqn_planner.planning.paths import keep_or_switch, search, way_and_ends
@@ -64,6 +64,10 @@ class Planner:
         A ModelFileError says that there is none, or why it cannot be used.
         """
         return cls(*load_model(model))
+
+    def save(self, path: str | Path) -> None:
+        """Save the model to a file for `load`; after an OSError, an old file is unchanged."""
+        save_model(path, self.network, self.metadata)
 
     def q_field(self, grid: GridMap, goal: Cell, move_rule: MoveRule | str | None = None) -> QField:
         """Return the Q field of a map toward a goal, a free cell, computed or from the cache.

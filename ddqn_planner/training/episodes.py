@@ -6,7 +6,7 @@ from enum import Enum
 from pathlib import Path
 from typing import NamedTuple
 
-from ddqn_planner.files import Appender, as_path, write_atomically
+from ddqn_planner.files import Appender, as_path, read_rows, write_atomically
 from ddqn_planner.grid import Cell, MoveRule, path_length
 
 HEADER = b"episode,step,scenario,outcome,moves,length,total_reward,average_reward,cells\r\n"
@@ -43,9 +43,8 @@ def open_record(path: Path, episodes: int) -> Appender:
     """Open an ``episodes.csv`` to append to its first `episodes`; its later rows are dropped."""
     lines = [HEADER]
     if path.exists():
-        with path.open("rb") as file:
-            rows = map(ROW.fullmatch, file)
-            lines += [row[0] for row in rows if row and int(row[1]) <= episodes]
+        rows = map(ROW.fullmatch, read_rows(path))
+        lines += [row[0] for row in rows if row and int(row[1]) <= episodes]
     write_atomically(path, b"".join(lines))
     return Appender(path)
 
@@ -61,8 +60,7 @@ def record(episode: Episode, move_rule: MoveRule) -> bytes:
 
 def read_cells(path: str | Path, every: int) -> Iterator[tuple[Cell, ...]]:
     """Yield the cells of each `every`-th complete row; an OSError without a file."""
-    with as_path(path).open("rb") as file:
-        for row in map(ROW.fullmatch, file):
-            if row and int(row[1]) % every == 0:
-                x_y = (cell.split(b":") for cell in row[2].split())
-                yield tuple((int(x), int(y)) for x, y in x_y)
+    for row in map(ROW.fullmatch, read_rows(as_path(path))):
+        if row and int(row[1]) % every == 0:
+            x_y = (cell.split(b":") for cell in row[2].split())
+            yield tuple((int(x), int(y)) for x, y in x_y)

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from safetensors import safe_open
 
-from ddqn_planner.files import as_path, differences, write_atomically
+from ddqn_planner.files import as_path, differences, open_regular, write_atomically
 from ddqn_planner.grid import MOVES
 from ddqn_planner.grid.arguments import as_seed, listed
 from ddqn_planner.model import (
@@ -177,6 +177,7 @@ class Trainer:
     def restore(self, path: Path) -> None:
         """Take over a checkpoint of this training, whatever its `steps`, or a CheckpointError."""
         try:
+            open_regular(as_path(path)).close()  # safe_open would wait for a pipe
             with safe_open(as_path(path), framework="np") as file:
                 metadata, now = file.metadata(), self._description()
                 saved = json.loads(metadata[CHECKPOINT_KEY])
