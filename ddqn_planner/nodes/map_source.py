@@ -189,8 +189,6 @@ class MapSource:
             for received in filter(None, (self._waiting, self._used)):
                 received.grid = self._read(received.message)
             self._on_directions()
-        if "experience" in changed:
-            self.times.read()
 
     def change(self) -> None:
         """Plan on what is new."""
@@ -317,6 +315,7 @@ class ExpectedTimes:
         self._node, self._report, self._worker, self._on_change = node, report, worker, on_change
         self._experience: Experience | None = None
         self._layout: Any = None  # of the message that it came in
+        self._loaded: Experience | None = None  # from the file that was set last
         self._spread_on: GridMap | None = None
         # What the worker was asked last, and its answer.
         self._outcome, self._forecast = NO_REQUEST, Future()
@@ -327,6 +326,11 @@ class ExpectedTimes:
         if node.value("follow_trainer"):
             sent = UInt8MultiArray, "trainer/experience", self.on_sent, LATCHED
             node.create_subscription(*sent, callback_group=group)
+
+    def use(self, experience: Experience | None) -> None:
+        """Plan by the experience of the file that was set, or by none."""
+        self._loaded = experience
+        self.read()
 
     async def on_sent(self, message: UInt8MultiArray | None = None) -> None:
         """Plan by what drives taught, or refuse the trainer's message, or the file that is set."""
@@ -354,7 +358,7 @@ class ExpectedTimes:
                 return False
             newer = Experience.from_bytes(data)
         elif file := self._node.value("experience"):
-            newer = Experience.load(file)
+            newer, self._loaded = self._loaded or Experience.load(file), None
         if newer is not None and self._experience is not None:
             newer.take_over(self._experience)
         self._experience, self._layout = newer, layout

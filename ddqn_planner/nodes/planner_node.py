@@ -12,6 +12,7 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallb
 from rclpy.parameter import Parameter
 from std_msgs.msg import UInt8MultiArray
 
+from ddqn_planner.experience import Experience
 from ddqn_planner.memory import give_back, llvm_was_used, reuse_small_arrays
 from ddqn_planner.model import model_of
 from ddqn_planner.nodes.conversions import along, bytes_of, path_bytes, path_message
@@ -153,12 +154,15 @@ class PlannerNode(ManagedNode):
     # Parameters
 
     def check_parameters(self, new: dict[str, Any]) -> None:
-        """Check new values as `BaseNode` does, whether TF can be used, and load a new model."""
+        """Check new values as `BaseNode` does, whether TF can be used, and load new files."""
         super().check_parameters(new)
         check_source("start_source", new.get("start_source", ""), "'initialpose' or 'odometry'")
         check_prefix(self, new.get("other_planners", ""))
         if "model" in new and hasattr(self, "_settings"):  # a worker loads the first one
             self._candidate = read_model(new["model"])
+        if "experience" in new and hasattr(self, "_settings"):  # so does one with the first file
+            file = new["experience"]
+            self._new_experience = Experience.load(file) if file else None
 
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
         self._settings = self.settings()
@@ -170,6 +174,8 @@ class PlannerNode(ManagedNode):
         self._places.listen_to_source()
         self._requests.settings = self._settings
         self._map.apply_parameters(changed)
+        if "experience" in changed:
+            self._map.times.use(self._new_experience)
         self._plan_for(self._active.poses)
 
     def _on_model(self, message: UInt8MultiArray) -> None:

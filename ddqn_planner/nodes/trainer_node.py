@@ -18,6 +18,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.timer import Timer
 from std_msgs.msg import Float32, Header, String, UInt8MultiArray
 
+from ddqn_planner.experience import Experience
 from ddqn_planner.files import as_path
 from ddqn_planner.grid import Cell, MoveRule, read_map_file
 from ddqn_planner.nodes import conversions, runtime
@@ -121,6 +122,8 @@ class TrainerNode(BaseNode):
         check_source("pose_source", new.get("pose_source", ""), "'odometry'")
         if "output_folder" in new:
             as_path(new["output_folder"], "output_folder")
+        if new.get("experience") and self._has_begun:
+            Experience.load(new["experience"])
         self._hyper_parameters(new)
 
     def _hyper_parameters(self, new: dict[str, Any]) -> HyperParameters:

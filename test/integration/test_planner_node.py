@@ -1,6 +1,7 @@
 """The planner as its user sees it: plans, models, parameters, bad input, and what it waits for."""
 
 import math
+import os
 import shutil
 import time
 from collections.abc import Iterator
@@ -180,6 +181,8 @@ def test_a_trapped_or_unfit_model_says_so(
 def test_a_bad_parameter_is_refused_and_a_good_one_holds(robot: Robot, tmp_path: FilePath) -> None:
     broken, missing = tmp_path / "broken.safetensors", tmp_path / "missing.safetensors"
     broken.write_bytes(b"a model")
+    pipe = tmp_path / "pipe.npz"
+    os.mkfifo(pipe)
     for name, bad, reason in (
         ("clearance_weight", 1.5, "clearance_weight is 1.5; give 0 to 1"),
         ("tolerance", math.nan, "tolerance is nan; give 0 to 1000"),
@@ -190,6 +193,10 @@ def test_a_bad_parameter_is_refused_and_a_good_one_holds(robot: Robot, tmp_path:
         ("model", "no_such_model", "there is no shipped model 'no_such_model'"),
         ("model", str(missing), "there is no model file"),
         ("model", str(broken), "cannot be read as safetensors"),
+        ("model", "/dev/zero", "is a device"),
+        ("experience", str(broken), "cannot be read (no experience"),
+        ("experience", str(pipe), "is a named pipe"),
+        ("experience", str(missing), "cannot be read (No such file"),
     ):
         before = robot.client.get_parameter("planner", name)
         assert reason in robot.refuse(**{name: bad})
