@@ -1,5 +1,6 @@
 """Finds the shipped maps and models, and says what to install where a library is missing."""
 
+import difflib
 import os
 from pathlib import Path
 from typing import Final
@@ -51,10 +52,19 @@ def find_map(name: str) -> Path:
         path = as_path(name, "the map")
     except ValueError as error:
         raise FileNotFoundError(str(error)) from None
-    # A file in the working directory has priority. Whoever reads a file reports that it is missing.
-    if path.name != name or os.path.isfile(path):
+    # What is no folder in the working directory has priority. Whoever reads a file reports that it
+    # is missing, or no regular file.
+    if path.name != name or (os.path.exists(path) and not os.path.isdir(path)):
         return path
-    return find_resource("maps", name if path.suffix else f"{name}.yaml")
+    try:
+        return find_resource("maps", name if path.suffix else f"{name}.yaml")
+    except FileNotFoundError:
+        maps = sorted(file.stem for file in (Path(__file__).parent / "maps").glob("*.yaml"))
+        near = difflib.get_close_matches(path.stem, maps, 1)
+        problem = f"there is no map file {name!r}, and no shipped map of that name"
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        remedy = f"{hint}give a path, or one of {', '.join(maps)}"
+        raise FileNotFoundError(f"{problem}; {remedy}") from None
 
 
 def _package_path(url: str) -> Path:

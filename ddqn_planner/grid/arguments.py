@@ -132,9 +132,12 @@ def numbers(
 
 def as_pose(name: str, pose: Any) -> tuple[float, float, float]:
     """Return three finite numbers as floats."""
-    x, y, yaw = numbers(name, pose, (3,)).astype(np.float64).tolist()
+    try:
+        x, y, yaw = numbers(name, pose, (3,)).astype(np.float64).tolist()
+    except ValueError:
+        x = y = yaw = math.nan
     if not all(map(math.isfinite, (x, y, yaw))):
-        raise ValueError(f"{name} is {pose!r}; give three finite numbers x, y, yaw")
+        raise ValueError(f"{name} is {reprlib.repr(pose)}; give three finite numbers x, y, yaw")
     return x, y, yaw
 
 

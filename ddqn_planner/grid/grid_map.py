@@ -22,6 +22,10 @@ MAX_COST_MULTIPLIER = 5.0
 
 LAYERS = "occupancy", "cost", "forbidden", "slowness", "uphill"  # what its moves depend on
 PATCHED = {"occupancy", "cost", "obstacles", "unknown"}  # layers of which patches change some cells
+RESOLUTIONS = 1e-6, 1e6
+METRES_PER_CELL = "metres per cell, {:g} to {:g}".format(*RESOLUTIONS)
+MAX_CELLS_AWAY = 2.0**40  # float64 tells points so far away apart by less than 1/1000 of a cell
+MAX_YAW = 1e6  # radians, of an origin
 MAX_PATCHES = 512  # so many are known of a map, one after the other
 
 # Directions, costs, slowness and climbs of maps without. Not to be written to, as those of maps.
@@ -42,10 +46,10 @@ class GridMap:
     occupancy : (H, W) bool
         True where a cell is occupied. Row y = 0 is the first row of ``OccupancyGrid.data``.
     resolution : float
-        Side of a cell in metres, > 0.
+        Side of a cell in metres, 1e-6 to 1e6.
     origin : (float, float, float)
         Pose of the corner of cell (0, 0) in the map frame, as in ``nav_msgs/MapMetaData``: x and y
-        in metres, and yaw in radians, counter-clockwise.
+        in metres, at most 2^40 cells, and yaw in radians, counter-clockwise.
     cost : (H, W) array of whole numbers, optional
         Cost of each free cell: 0..99, or -1 for an unknown cell; see `cost_multiplier`. Values of
         occupied cells are ignored and become 0. By default all free cells cost the same.
@@ -85,8 +89,9 @@ class GridMap:
 
     def __post_init__(self) -> None:
         occupancy = arguments.as_mask("occupancy", self.occupancy)
-        metres = as_number("resolution", self.resolution, *POSITIVE, "metres per cell, > 0")
+        metres = as_number("resolution", self.resolution, *RESOLUTIONS, METRES_PER_CELL)
         origin, shape = arguments.as_pose("origin", self.origin), occupancy.shape
+        _check_place(origin, metres, shape)
         self._set(occupancy=occupancy, resolution=metres, origin=origin)
         if self.cost is not None:
             self._set(cost=_costs(self.cost, occupancy))
@@ -452,6 +457,19 @@ def check_grid(grid: object, name: str = "grid") -> None:
     """Raise a ValueError for anything else than a map."""
     if not isinstance(grid, GridMap):
         raise ValueError(f"{name} is {grid!r}; give a GridMap")
+
+
+def _check_place(
+    origin: tuple[float, float, float], resolution: float, shape: tuple[int, ...]
+) -> None:
+    """Raise a ValueError for a map so far away that float64 cannot tell its cells apart."""
+    x, y, yaw = origin
+    farthest = MAX_CELLS_AWAY * resolution
+    if math.hypot(x, y) + math.hypot(*shape) * resolution > farthest:
+        problem = f"origin is {origin}, where cells of {resolution:g} m cannot be told apart"
+        raise ValueError(f"{problem}; give x and y in metres, at most {farthest:.3g}")
+    if abs(yaw) > MAX_YAW:
+        raise ValueError(f"origin is {origin}; give its yaw in radians, at most {MAX_YAW:g}")
 
 
 def _costs(cost: ArrayLike, occupancy: Occupancy) -> NDArray[np.int8]:

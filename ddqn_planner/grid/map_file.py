@@ -1,8 +1,10 @@
 """Map files: ROS maps (YAML and an image) and MovingAI maps are read."""
 
+import difflib
 import os
 import re
 import reprlib
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,13 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.files import as_path
+from ddqn_planner.files import as_path, kind_of, read_file
 from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell, as_number, cell_inside, numbers
 from ddqn_planner.grid.grid_map import GridMap
 from ddqn_planner.grid.map_yaml import as_float, as_truth, read_yaml
+from ddqn_planner.resources import find_map
 
 MAX_CELLS = 2**26  # a larger map is refused before its cells are read
 MAX_YAML_BYTES = 2**16
+
+KEYS = {"image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode"}
 
 # In other layouts Pillow drops bits, or map_server takes the fourth byte of a pixel as its opacity.
 LAYOUTS = {"1", "1;I", "L", "L;2", "L;4", "LA", "I;16B", "P", "P;1", "P;2", "P;4"}
@@ -57,6 +62,7 @@ class MapFile:
     start: Cell | None = None
     goal: Cell | None = None
     forbidden: NDArray[np.uint8] | None = None
+    files: tuple[Path, ...] = ()  # from which it was read
 
     def __post_init__(self) -> None:
         values = numbers("the array of values", self.values, between=(UNKNOWN, OCCUPIED))
@@ -97,7 +103,7 @@ def load_map(
     Parameters
     ----------
     path : str or Path
-        A leading ``~`` stands for the home folder.
+        A file, whose leading ``~`` stands for the home folder, or the name of a shipped map.
     occupied_threshold, allow_unknown, use_map_costs
         As for `GridMap.from_occupancy_values`.
 
@@ -110,7 +116,11 @@ def load_map(
     MapDataError
         If the cells of the map cannot be read.
     """
-    return read_map_file(path).grid(occupied_threshold, allow_unknown, use_map_costs)
+    try:
+        file = find_map(path) if isinstance(path, str) else as_path(path)
+    except (FileNotFoundError, ValueError) as error:
+        raise MapNotFoundError(str(error)) from None
+    return read_map_file(file).grid(occupied_threshold, allow_unknown, use_map_costs)
 
 
 def read_map_file(path: str | Path, only_below: bool = False) -> MapFile:
@@ -123,6 +133,8 @@ def read_map_file(path: str | Path, only_below: bool = False) -> MapFile:
         path = as_path(path)
     except ValueError as error:
         raise MapNotFoundError(str(error)) from None
+    if kind := kind_of(path):
+        raise MapNotFoundError(f"{str(path)!r} is {kind}; give the path of a map file")
     if not os.path.isfile(path):
         raise MapNotFoundError(f"{str(path)!r}: no such file; give the path of a map")
     if path.suffix.lower() not in (".yaml", ".yml", ".map"):
@@ -138,13 +150,11 @@ def read_map_file(path: str | Path, only_below: bool = False) -> MapFile:
 
 def _read_bytes(path: Path, limit: int, error_class: type[MapFileError]) -> bytes:
     try:
-        with open(path, "rb") as file:
-            content = file.read(limit + 1)
+        return read_file(path, limit)
     except OSError as error:
         raise error_class(f"{path}: cannot be read ({error.strerror}); check its rights") from error
-    if len(content) > limit:
-        raise error_class(f"{path}: longer than {limit} bytes; give a smaller file")
-    return content
+    except ValueError as error:
+        raise error_class(str(error)) from None
 
 
 def _read_moving_ai(path: Path) -> MapFile:
@@ -165,7 +175,7 @@ def _read_moving_ai(path: Path) -> MapFile:
         right = f"{height} rows of {width}, as its header says"
         raise MapDataError(f"{path}: has {count} rows, {cells.size - count} cells; give {right}")
     free = np.isin(cells.reshape(height, width + 1)[:, :-1], list(b".GS"))
-    return MapFile(np.where(free, np.int8(0), np.int8(OCCUPIED)))
+    return MapFile(np.where(free, np.int8(0), np.int8(OCCUPIED)), files=(path,))
 
 
 def _read_ros(path: Path, only_below: bool) -> MapFile:
@@ -183,22 +193,24 @@ def _read_ros(path: Path, only_below: bool) -> MapFile:
     if not isinstance(ours, dict) or not ours.keys() <= {"start", "goal", "directions"}:
         keys = "{start: , goal: , directions: }"
         raise ValueError(f"ddqn_planner is {_short(ours)}; give some of {keys}")
-    forbidden = None
+    forbidden, files = None, [path, image]
     if "directions" in ours:
         directions = _image_path(path, ours, "directions", only_below)
         forbidden, _ = _read_image(directions, ("PPM", "PNG"), {"L"})
         name = ours.pop("directions")
+        files.append(directions)
         if forbidden.shape != values.shape:
             has, right = (f"{w} x {h}" for h, w in (forbidden.shape, values.shape))
             raise MapDataError(f"{name!r}: has {has} pixels; give {right}, as the map's image")
         forbidden = forbidden[::-1]
     cells = {name: _numbers(ours, name) for name in ours}
-    return MapFile(values[::-1], resolution, origin, **cells, forbidden=forbidden)
+    place = values[::-1], resolution, origin
+    return MapFile(*place, **cells, forbidden=forbidden, files=tuple(files))
 
 
 def _image_path(path: Path, document: dict[str, Any], key: str, only_below: bool) -> Path:
     """Return the path of an image that a YAML file names."""
-    name = document.get(key)
+    name = _value(document, key)
     if not isinstance(name, str) or not name:
         raise ValueError(f"{key} is {_short(name)}; give the path of an image")
     file = path.parent / name
@@ -208,6 +220,8 @@ def _image_path(path: Path, document: dict[str, Any], key: str, only_below: bool
         problem = f"{key} is {name!r}, outside of the folder of the YAML"
         reason = "a service reads no other files"
         raise ValueError(f"{problem}, and {reason}; put it beside")
+    if kind := kind_of(file):
+        raise MapDataError(f"{str(file)!r} is {kind}; give an image as {key!r} in the YAML file")
     if not os.path.isfile(file):
         # Often the absolute path of the computer on which the map was saved.
         beside = re.split(r"[/\\]", name)[-1]
@@ -230,10 +244,19 @@ def _read_image(
     """Return an image's grey values, and which pixels are not opaque."""
     from PIL import Image  # 17 ms, and a planner that is sent its maps reads no image
 
+    too_large = Image.DecompressionBombWarning, Image.DecompressionBombError
     try:
-        with Image.open(file, formats=formats) as image:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            image = Image.open(file, formats=formats)
+        with image:
             _check_layout(image, layouts)
             return _grey(image)
+    except too_large as error:  # Pillow has another limit
+        pixels = re.search(r"\d+", str(error))
+        problem = f"{pixels[0]} pixels" if pixels else "too many pixels"
+        remedy = f"give an image of at most {MAX_CELLS} pixels, as at a coarser resolution"
+        raise MapDataError(f"{str(file)!r}: has {problem}; {remedy}") from None
     except Exception as error:  # Pillow's decoders raise many exceptions on broken bytes
         remedy = f"give a {', '.join(formats)} image of at most {MAX_CELLS} pixels"
         raise MapDataError(f"{str(file)!r}: not readable ({error}); {remedy}") from error
@@ -273,8 +296,17 @@ def _grey(image: Any) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     return grey.astype(np.uint8, copy=False), clear
 
 
+def _value(document: dict[str, Any], key: str) -> Any:
+    """Return the value of a key; a ValueError for a missing one names one that looks like it."""
+    if key in document:
+        return document[key]
+    near = difflib.get_close_matches(key, document.keys() - KEYS, 1)
+    remedy = f"write '{key}:' instead of '{near[0]}:'" if near else f"add '{key}: ...'"
+    raise ValueError(f"{key} is missing; {remedy}")
+
+
 def _choice(document: dict[str, Any], key: str, choices: Sequence[str]) -> str:
-    value = document.get(key)
+    value = _value(document, key)
     if not isinstance(value, str) or value.lower() not in choices:
         raise ValueError(f"{key} is {_short(value)}; give one of {', '.join(choices)}")
     return value.lower()
@@ -282,7 +314,7 @@ def _choice(document: dict[str, Any], key: str, choices: Sequence[str]) -> str:
 
 def _numbers(document: dict[str, Any], key: str) -> Any:
     """Return a number, or a list of them; whoever takes them checks how many there are."""
-    value: Any = document.get(key)
+    value = _value(document, key)
     try:
         return [*map(as_float, value)] if isinstance(value, list) else as_float(value)
     except ValueError:
@@ -295,10 +327,11 @@ def _percent_of_grey(document: dict[str, Any], mode: str) -> NDArray[np.int8]:
     free_thresh, occupied_thresh = (as_number(key, _numbers(document, key), 0, 1) for key in keys)
     if free_thresh > occupied_thresh:
         raise ValueError(f"free_thresh is {free_thresh}; give at most {occupied_thresh}")
+    negate = _value(document, "negate")
     try:
-        is_negated = as_truth(document.get("negate"))
+        is_negated = as_truth(negate)
     except ValueError:
-        problem = f"negate is {_short(document.get('negate'))}"
+        problem = f"negate is {_short(negate)}"
         raise ValueError(f"{problem}; give 0 or 1, or true or false") from None
     grey = np.arange(256)
     if mode == "raw":

@@ -16,6 +16,7 @@ from std_msgs.msg import Header, MultiArrayDimension, MultiArrayLayout, UInt8Mul
 from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.grid.arguments import Cells
 from ddqn_planner.grid.body import grid_from_costmap
+from ddqn_planner.grid.grid_map import METRES_PER_CELL, RESOLUTIONS
 from ddqn_planner.grid.map_file import MAX_CELLS
 from ddqn_planner.grid.rotations import Rotation
 from ddqn_planner.planning.exact_paths import dense
@@ -26,7 +27,6 @@ Float64 = NDArray[np.float64]
 MAP_PARAMETERS = ("occupied_threshold", "allow_unknown", "use_map_costs", "map_type")
 MAX_TILT = 0.01  # sine of half an angle: two decimals of a quaternion round to less
 AS_SENT = 1e-6  # a norm so near to 1 is left as it is
-MIN_RESOLUTION = 1e-6  # metres per cell
 LABEL = "ddqn_planner {} 1 sha256:{}"  # of bytes: their kind, its version and their digest
 BLANK_POSES = pickle.dumps(
     [
@@ -42,10 +42,10 @@ def grid_from_message(message: OccupancyGrid, *rules: Any) -> GridMap:
     info = message.info
     size = f"{info.width} x {info.height} cells"
     needs, has = info.width * info.height, len(message.data)
-    metres = f"give metres per cell, finite and above {MIN_RESOLUTION}"
+    (finest, coarsest), metres = RESOLUTIONS, f"give {METRES_PER_CELL}"
     for is_right, wrong in (
         (message.header.frame_id, "frame is ''; name one in header.frame_id"),
-        (MIN_RESOLUTION < info.resolution < math.inf, f"resolution is {info.resolution}; {metres}"),
+        (finest <= info.resolution <= coarsest, f"resolution is {info.resolution}; {metres}"),
         (needs, f"size is {size}; give at least one row and column"),
         (needs <= MAX_CELLS, f"size is {size}; give at most {MAX_CELLS}, or a coarser resolution"),
         (has == needs, f"data has {has} values; its {size} need {needs}"),

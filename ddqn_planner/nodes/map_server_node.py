@@ -14,7 +14,7 @@ from ddqn_planner.grid import OCCUPIED, Cell, GridMap, MapFile, MoveRule, read_m
 from ddqn_planner.grid.map_file import MapDataError, MapMetadataError, MapNotFoundError
 from ddqn_planner.grid.moves import shortest_path
 from ddqn_planner.grid.noise import scatter_obstacles
-from ddqn_planner.nodes.conversions import MIN_RESOLUTION, occupancy_message
+from ddqn_planner.nodes.conversions import occupancy_message
 from ddqn_planner.nodes.declared import Declared
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, spin_until_shutdown
 from ddqn_planner.resources import PACKAGE, find_map
@@ -72,10 +72,6 @@ class MapServerNode(BaseNode):
         try:
             path = find_map(url)
             loaded = read_map_file(path, only_below)
-            if not MIN_RESOLUTION < loaded.resolution < np.finfo(np.float32).max:
-                bounds = f"more than {MIN_RESOLUTION}, and no more than a float32 holds"
-                wrong = f"resolution is {loaded.resolution}; a map message needs {bounds}"
-                raise MapMetadataError(f"{path}: {wrong}")
         except Exception as error:  # anything, of a library that reads a broken file
             kept = "the map before it stays" if self._loaded else "no map is served"
             self.get_logger().error(f"cannot load {url!r}, {kept}: {error}")
