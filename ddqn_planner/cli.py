@@ -18,11 +18,13 @@ import ddqn_planner as api
 from ddqn_planner.files import (
     WorkFolder,
     as_path,
+    check_distinct,
     check_writable,
     differences,
     write_atomically,
     write_csv,
 )
+from ddqn_planner.output import unless_cut_off
 from ddqn_planner.resources import find_map, with_remedy
 
 # A command imports what it needs, and no other command's libraries: the names of `api` do so, too.
@@ -40,7 +42,7 @@ MODEL: Final = "name or file (default: %(default)s)"
 def exit_code(program: str, run: Callable[[], int]) -> int:
     """Return what a program returns, or 2 after a line that names its error; 130 after Ctrl-C."""
     try:
-        return run()
+        return unless_cut_off(run)
     except KeyboardInterrupt:
         print(f"{program}: interrupted", file=sys.stderr)
         return 130
@@ -51,6 +53,8 @@ def exit_code(program: str, run: Callable[[], int]) -> int:
 
 def plan(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     """Plan a path on a map file, and print it."""
+    from ddqn_planner.model import find_model
+    from ddqn_planner.pictures import picture_format
     from ddqn_planner.warm_up import warm_up
 
     _add_map_options(parser, None)
@@ -80,7 +84,11 @@ def plan(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     for option in ("csv", "picture"):
         if file := getattr(options, option):
             check_writable(file, f"--{option}")
+    if options.picture:
+        picture_format(options.picture, "--picture")
     map_file, start, goal = _read_map(options)
+    outputs = {"--csv": options.csv, "--picture": options.picture}
+    check_distinct(outputs, {"--model": find_model(options.model), **_files_of(map_file)})
     planner = api.Planner.load(options.model)
     has_body = planner.pose_planner is not None
     others, kind = (OF_CELLS, "without") if has_body else (OF_BODIES, "with")
@@ -204,6 +212,11 @@ def _add_map_options(parser: argparse.ArgumentParser, move_rule: str | None) -> 
     _add_options(parser, ("move-rule", [rule.value for rule in api.MoveRule], move_rule, words))
 
 
+def _files_of(map_file: MapFile) -> dict[str, Path | None]:
+    """Return the files of a map by what errors call them."""
+    return {f"the map's file {path.name}": path for path in map_file.files}
+
+
 def _read_map(options: Any) -> tuple[MapFile, Cell, Cell]:
     """Return the map file, the start and the goal that the options give."""
     from ddqn_planner.grid import read_map_file
@@ -272,6 +285,7 @@ def train_robot(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> in
     options = parser.parse_args(arguments)
     out = as_path(options.out, "--out")
     check_writable(out, "--out")
+    check_distinct({"--out": out}, {"--lattice": options.lattice})
     how = options.turning_radius, options.resolution, options.lattice, options.seed, options.padding
     trainer = RobotTrainer(options.footprint, options.motion, *how)
     with tqdm(total=options.steps, disable=None) as bar:
@@ -350,6 +364,7 @@ def certify(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
 def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     """Learn from a robot's recorded drives how long places take, and what of it the map tells."""
     from ddqn_planner.experience.drives import EXPERIENCE, LOCK, RECORD, Drive, read_recording
+    from ddqn_planner.grid import read_map_file
 
     words = "trainers' folders, bags, MCAP files, or CSV files with the columns seconds, x, y"
     parser.add_argument("drives", type=file_of, nargs="+", help=words)
@@ -368,7 +383,10 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     first = options.drives[0]
     out = options.out or (first if first.is_dir() else first.parent) / EXPERIENCE
     check_writable(out, "--out")
-    grid = api.load_map(find_map(options.map))
+    map_file = read_map_file(find_map(options.map))
+    recordings = {f"the recording {path}": path for path in options.drives}
+    check_distinct({"--out": out}, {**recordings, **_files_of(map_file)})
+    grid = map_file.grid()
     of_robot = {"nominal_speed": options.nominal_speed, "robot_width": options.robot_width}
     given = {name: value for name, value in of_robot.items() if value is not None}
     if options.experience:
@@ -428,6 +446,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # machine several are ten times as slow.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     arguments = sys.argv[1:] if arguments is None else arguments
+    return exit_code("ddqn-planner", lambda: _run_command(arguments))
+
+
+def _run_command(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(prog="ddqn-planner", description=str(__doc__).replace("`", ""))
     names = parser.add_subparsers(required=True, metavar="|".join(COMMANDS))
     parsers = {}
@@ -437,4 +459,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not arguments or arguments[0] not in COMMANDS:
         parser.parse_args(arguments)  # ends with the help, or an error
     name, *others = arguments
-    return exit_code(parser.prog, lambda: COMMANDS[name](parsers[name], others))
+    return COMMANDS[name](parsers[name], others)

@@ -1,5 +1,6 @@
 """Plans to look at: as text, in a terminal's colours, and as a picture file. No ROS is needed."""
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.files import as_path
+from ddqn_planner.files import as_path, write_atomically
 from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap
 from ddqn_planner.grid.footprint import placed
 
@@ -52,12 +53,17 @@ def save_picture(
     value_label: str = "value: max Q(s, a)",
     body: tuple[Array, Array, Array] | None = None,  # see `draw_body`
 ) -> None:
-    """Draw the map, the value where it is finite, and the path or the body along it into a file."""
+    """Draw the map, the value where it is finite, and the path or the body along it into a file.
+
+    The ending of its name says in which format. A ValueError lists the formats.
+    """
     from matplotlib.colors import LinearSegmentedColormap
     from matplotlib.figure import Figure
     from matplotlib.patheffects import withStroke
     from matplotlib.ticker import MaxNLocator
 
+    file = as_path(path)
+    picture_format(file)  # before the work
     tall = min(max(grid.height / grid.width, 0.4), 1.0)
     figure = Figure(figsize=(7.2, 1.5 + 5.1 * tall), dpi=120, layout="constrained")
     axes = figure.subplots()
@@ -83,7 +89,21 @@ def save_picture(
             axes.scatter(x[end], y[end], size, label=label, marker=marker, **style)
     if cells or body is not None:
         figure.legend(loc="outside lower center", ncols=4, frameon=False)
-    figure.savefig(as_path(path))
+    content = io.BytesIO()  # so that an old file stays complete, and no pipe is waited for
+    figure.savefig(content, format=picture_format(file))
+    write_atomically(file, content.getvalue())
+
+
+def picture_format(path: Path, option: str = "the picture") -> str:
+    """Return the format of a picture by its file's name; a ValueError lists those there are."""
+    from matplotlib.figure import Figure
+
+    formats = sorted(Figure().canvas.get_supported_filetypes())
+    ending = path.suffix.lower().removeprefix(".")
+    if ending not in formats:
+        problem = f"ends in {path.suffix!r}" if ending else "has no ending"
+        raise ValueError(f"{option} is {path}, which {problem}; give one of .{', .'.join(formats)}")
+    return ending
 
 
 def draw_body(axes: Any, footprint: Array, poses: Array, ends: Array) -> None:

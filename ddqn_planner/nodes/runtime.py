@@ -47,6 +47,7 @@ from ddqn_planner.nodes.overrides import (
     unread_sections,
     wrong_argument,
 )
+from ddqn_planner.output import unless_cut_off
 
 # Late subscribers receive the last message too: for maps, plans, saved models.
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -360,18 +361,23 @@ qos_overrides.TOPIC.subscription.POLICY, where POLICY is history, depth, durabil
 SYNTAX = "write --ros-args [-p NAME:=VALUE] [--params-file FILE] [-r NAME:=NEW_NAME]"
 
 
+def print_help(make_node: Callable[[], Node], parameters: Parameters) -> int:
+    """Print what a node does, and its parameters."""
+    summary = (make_node.__doc__ or "").replace("``", "")
+    print(HELP.format(program=Path(sys.argv[0]).name, summary=summary))
+    for name, (default, description, _, read_only) in parameters.items():
+        kind = Parameter.Type.from_parameter_value(default).name.lower()
+        value = repr(default) if isinstance(default, str) else json.dumps(default)
+        limits = parameters[name].limits
+        words = filter(None, (f"{kind}, default {value}", limits, "read-only" * read_only))
+        print(f"  {name}: {'; '.join(words)}\n      {description}")
+    return 0
+
+
 def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | None = None) -> int:
     """Run one node until SIGINT or SIGTERM, or print help; return 1 if it cannot start."""
     if parameters and {"-h", "--help"} & {*sys.argv[1:]}:
-        summary = (make_node.__doc__ or "").replace("``", "")
-        print(HELP.format(program=Path(sys.argv[0]).name, summary=summary))
-        for name, (default, description, _, read_only) in parameters.items():
-            kind = Parameter.Type.from_parameter_value(default).name.lower()
-            value = repr(default) if isinstance(default, str) else json.dumps(default)
-            limits = parameters[name].limits
-            words = filter(None, (f"{kind}, default {value}", limits, "read-only" * read_only))
-            print(f"  {name}: {'; '.join(words)}\n      {description}")
-        return 0
+        return unless_cut_off(lambda: print_help(make_node, parameters))
     stop = StopSignal()
     try:
         # With rclpy's handlers, nothing could be published any more when the node ends.
