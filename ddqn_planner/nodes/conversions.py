@@ -25,7 +25,7 @@ Origin = tuple[float, float, float]
 Float64 = NDArray[np.float64]
 
 MAP_PARAMETERS = ("occupied_threshold", "allow_unknown", "use_map_costs", "map_type")
-MAX_TILT = 0.01  # sine of half an angle: two decimals of a quaternion round to less
+MAX_TILT = math.sin(math.radians(1) / 2)  # of one degree: two decimals of a quaternion tilt less
 AS_SENT = 1e-6  # a norm so near to 1 is left as it is
 LABEL = "ddqn_planner {} 1 sha256:{}"  # of bytes: their kind, its version and their digest
 BLANK_POSES = pickle.dumps(
@@ -235,12 +235,21 @@ def with_unit_quaternion(stamped: PoseStamped) -> PoseStamped:
 
     Whoever reads a path may refuse others, as Nav2 does.
     """
-    sent = rotation(stamped.pose.orientation)
-    if abs(sent.norm - 1) <= AS_SENT:
+    sent = stamped.pose.orientation
+    unit = unit_quaternion(sent)
+    if unit is sent:
         return stamped
-    x, y, z, w = sent.normalised()
-    pose = Pose(position=stamped.pose.position, orientation=Quaternion(x=x, y=y, z=z, w=w))
+    pose = Pose(position=stamped.pose.position, orientation=unit)
     return PoseStamped(header=stamped.header, pose=pose)
+
+
+def unit_quaternion(message: Quaternion) -> Quaternion:
+    """Return a quaternion with the norm 1: itself if it has that already."""
+    sent = rotation(message)
+    if abs(sent.norm - 1) <= AS_SENT:
+        return message
+    x, y, z, w = sent.normalised()
+    return Quaternion(x=x, y=y, z=z, w=w)
 
 
 def quaternion(yaw: float) -> Quaternion:

@@ -1,6 +1,7 @@
 """The map that the planner plans on: the last one, with updates, directions and expected times."""
 
 import math
+import re
 import time
 from collections import deque
 from collections.abc import Callable
@@ -21,7 +22,7 @@ from ddqn_planner.grid.body import Inflation
 from ddqn_planner.grid.copies import boxes_of
 from ddqn_planner.nodes import conversions
 from ddqn_planner.nodes.conversions import MAP_PARAMETERS, grid_from_message
-from ddqn_planner.nodes.directions import Directions, Forbidden
+from ddqn_planner.nodes.directions import PUBLISHER_WAIT, Directions, Forbidden
 from ddqn_planner.nodes.report import NO_REQUEST, Outcome, Report, RequestError, seconds
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker, apt_install
 
@@ -41,6 +42,9 @@ CHANGED_SHARE = 0.02  # of cells: with more, experience is spread anew over the 
 ONE_WAY_ZONES = "one-way zones"  # what is refused of directions that do not hold on a map
 
 UPDATE_WAIT = 1.0  # seconds to wait for a costmap without a known period, as Nav2's planners do
+# Each map may be turned by another number: only another kind of reason is news.
+NUMBER = re.compile(r"-?\d[\d.]*(e[+-]?\d+)?")
+
 INTERVALS = 8  # so many of the last ones tell the period of a costmap
 
 
@@ -91,6 +95,8 @@ class MapSource:
         self.arrivals = Arrivals()
         self._used: Received | None = None
         self._waiting: Received | None = None  # a newer one, whose directions may be under way
+        self._waiting_since = math.inf
+        self._logged_reason = ""  # why a map waits, without the numbers
         self._size = ""  # of the one in use, in words
         self._began = time.monotonic()
         self._updates = self._applied_updates = 0
@@ -243,10 +249,10 @@ class MapSource:
             return
         missing = self._directions.missing or self._direct(received)
         if missing:
-            if missing != self._report.refused.get("map"):
-                self._report.refuse("map", missing, log=False)
+            self._keep_waiting(missing)
             return
         self._used, self._waiting = received, None
+        self._waiting_since, self._logged_reason = math.inf, ""
         grid = received.grid
         size = f"{grid.width} x {grid.height} cells of {grid.resolution:.6g} m"
         before, self._size = self._size, f"{size} in frame {self.frame!r}"
@@ -254,6 +260,18 @@ class MapSource:
             self._node.get_logger().info(f"map of {self._size}")
         self._report.accept("map")
         self.change()
+
+    def _keep_waiting(self, reason: str) -> None:
+        """Refuse the map that has come; log the reason once, if it is more than a late message."""
+        now = time.monotonic()
+        self._waiting_since = min(self._waiting_since, now)
+        is_lasting = now - self._waiting_since >= PUBLISHER_WAIT
+        kind = NUMBER.sub("", reason)
+        if is_lasting and kind != self._logged_reason:
+            self._logged_reason = kind
+            self._node.get_logger().warning(f"map refused: {reason}")
+        if reason != self._report.refused.get("map"):
+            self._report.refuse("map", reason, log=False)
 
     def _on_directions(self) -> None:
         """Obey other directions on the map in use, or plan on it no more if some are required."""

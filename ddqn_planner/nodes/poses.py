@@ -15,7 +15,13 @@ from rclpy.subscription import Subscription
 from rclpy.time import Time
 
 from ddqn_planner.grid.rotations import Rotation
-from ddqn_planner.nodes.conversions import check_pose, quaternion, rotation, with_unit_quaternion
+from ddqn_planner.nodes.conversions import (
+    check_pose,
+    quaternion,
+    rotation,
+    unit_quaternion,
+    with_unit_quaternion,
+)
 from ddqn_planner.nodes.report import Refusals, RequestError
 from ddqn_planner.nodes.runtime import STEADY, BaseNode, apt_install
 
@@ -37,6 +43,41 @@ def check_source(parameter: str, value: str, others: str) -> None:
     if value == "tf" and not has_tf():
         missing = f"needs tf2_ros, and that is not installed: {apt_install('tf2-ros-py')}"
         raise RuntimeError(f"{parameter} is 'tf', which {missing}, or set {parameter} to {others}")
+
+
+class CheckedTransforms:
+    """Hands transforms to a buffer of tf2, with quaternions of norm 1, or refuses them.
+
+    tf2 refuses those of another norm, or takes them as they are, by its release.
+    """
+
+    def __init__(self, buffer: Any, node: BaseNode) -> None:
+        self._buffer, self._node = buffer, node
+        self.refused: dict[tuple[str, str], str] = {}
+        """Why the last transform between two frames was refused."""
+
+    def set_transform(self, transform: TransformStamped, authority: str) -> None:
+        """Hand on what `tf` brings."""
+        if self._is_good(transform):
+            self._buffer.set_transform(transform, authority)
+
+    def set_transform_static(self, transform: TransformStamped, authority: str) -> None:
+        """Hand on what `tf_static` brings."""
+        if self._is_good(transform):
+            self._buffer.set_transform_static(transform, authority)
+
+    def _is_good(self, stamped: TransformStamped) -> bool:
+        frames = stamped.header.frame_id, stamped.child_frame_id
+        wrong = transform_problem(stamped)
+        if not wrong:
+            self.refused.pop(frames, None)
+            turn = stamped.transform.rotation
+            stamped.transform.rotation = unit_quaternion(turn)
+            return True
+        if frames not in self.refused:
+            self._node.get_logger().warning(f"transform refused: {wrong}")
+        self.refused[frames] = wrong
+        return False
 
 
 class Frames:
@@ -89,7 +130,7 @@ class Frames:
                 later = (Time.from_msg(newest.header.stamp) - stamp).nanoseconds / 1e9
                 if 0 < later <= AGE_OF_FIRST_POSE:  # the pose is from before the node listened
                     return newest
-            why = str(error)
+            why = "; ".join([str(error), *self._checked.refused.values()])
         raise ValueError(f"no transform leads from {source!r} to {target!r} ({why}); publish one")
 
     def listen(self) -> None:
@@ -98,7 +139,8 @@ class Frames:
             import tf2_ros  # it takes a while
 
             self._tf2_ros, self._buffer, self.began = tf2_ros, tf2_ros.Buffer(), time.monotonic()
-            self._listener = tf2_ros.TransformListener(self._buffer, self._node, qos=TF_DEPTH)
+            self._checked = CheckedTransforms(self._buffer, self._node)
+            self._listener = tf2_ros.TransformListener(self._checked, self._node, qos=TF_DEPTH)
             # No executor wakes for them, a hundred a second: they are read when they are needed.
             self._listener.group.can_execute = lambda _: False
             self._node.create_timer(READ_PERIOD, self._read, clock=STEADY)
@@ -113,20 +155,36 @@ class Frames:
 
     def _forget(self) -> None:
         self._read()
+        self._checked.refused.clear()
         self._buffer.clear()  # tf2 takes no transform that is older than those it has
         self.began = time.monotonic()
+
+
+def transform_problem(stamped: TransformStamped) -> str:
+    """Return what is wrong with the numbers of a transform, and what to do; empty if nothing is."""
+    of_frames = f"the transform from {stamped.child_frame_id!r} to {stamped.header.frame_id!r}"
+    turn = rotation(stamped.transform.rotation)
+    if not turn.is_rounded:
+        numbers = ", ".join(f"{number:.6g}" for number in turn)
+        wrong = f"{of_frames} has the quaternion ({numbers}) of norm {turn.norm:.6g}"
+        return f"{wrong}; publish one of norm 1"
+    shift = stamped.transform.translation
+    metres = shift.x, shift.y, shift.z
+    if not all(map(math.isfinite, metres)):
+        numbers = ", ".join(f"{number:.6g}" for number in metres)
+        return f"{of_frames} has the translation ({numbers}); publish finite numbers"
+    return ""
 
 
 def transformed(stamped: PoseStamped, transform: TransformStamped) -> PoseStamped:
     """Return a pose in the transform's frame, projected to the plane: z is 0, and yaw is left.
 
-    A ValueError if the transform has no rotation.
+    A ValueError if the numbers are those of no transform.
     """
+    wrong = transform_problem(transform)
+    if wrong:
+        raise ValueError(wrong)
     turn = rotation(transform.transform.rotation)
-    if not turn.is_rounded:
-        frames = f"{transform.child_frame_id!r} to {transform.header.frame_id!r}"
-        wrong = f"the transform from {frames} has a quaternion of norm {turn.norm:.6g}"
-        raise ValueError(f"{wrong}; publish one of norm 1")
     turn = turn.normalised()
     facing = rotation(stamped.pose.orientation).normalised()
     position, shift = stamped.pose.position, transform.transform.translation

@@ -96,7 +96,8 @@ def reason_of(
             remedy = remedy.replace("on a free cell", "where the robot's body has room")
         to = f"goal: {_place(goal, goals[0])}"
         if len(goals) > 1:
-            status = f"no path to any of {len(goals)} goals: {status}"
+            each = status if is_unknown else plan.reason
+            status = f"no path to any of {len(goals)} goals: {each}"
             remedy = remedy.removesuffix(TOLERANCE)
             to = f"goals: cells {', '.join(map(str, goals[:5]))}{', ...' * (len(goals) > 5)}"
         of_map = f"map: {grid.width} x {grid.height} cells"
@@ -125,7 +126,7 @@ def reason_of(
         reason += f", kept: its cost is {plan.extra_cost:+.1%} beside that of a new one"
     if plan.goal is not None and plan.goal not in goals and not several:
         metres = math.dist(plan.goal, goals[0]) * grid.resolution  # as the tolerance counts
-        why = "is cut off" if grid.is_free(goals[0]) else "is occupied"
+        why = unknown_space.goal_in_words(grid, goals[0]) or "is cut off"
         reason += f"; the goal {why} and moved {metres:.3g} m"
     if grid.is_obstacle(plan.path[0]):
         reason += f"; the start is occupied: obstacles within {cleared} of it were ignored"

@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Coroutine, Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from copy import copy
-from itertools import product
 from pathlib import Path
 from types import SimpleNamespace, coroutine
 from typing import Any
@@ -280,21 +279,31 @@ class BaseNode(Node):
                 for each in self.get_publishers_info_by_topic(topic)
             ]
             effect = EFFECTS_OF_SEVERAL_PUBLISHERS.get(subscription.msg_type)
-            if effect and len(publishers) > 1:
-                names = ", ".join(sorted(name for name, _ in publishers))
+            wanted_quality = subscription.qos_profile
+            heard = [name for name, offered in publishers if not _misfits(offered, wanted_quality)]
+            if effect and len(heard) > 1:
+                names = ", ".join(sorted(heard))
                 yield (
-                    f"{topic} has {len(publishers)} publishers ({names}), so {effect}; let one "
+                    f"{topic} has {len(heard)} publishers ({names}), so {effect}; let one "
                     "publish, or remap the others"
                 )
-            for (name, offered), (policy, *misfit) in product(publishers, MISFITS):
-                both = offered, subscription.qos_profile
-                has, wanted = (getattr(quality, policy).name.lower() for quality in both)
-                if [has, wanted] == misfit:
+            for name, offered in publishers:
+                for policy, has, wanted in _misfits(offered, wanted_quality):
                     yield (
                         f"nothing of {name} is received on {topic}: its {policy} is {has}, and "
                         f"{wanted} is asked for; let it publish so, or start this node with the "
                         f"parameter qos_overrides.{topic}.subscription.{policy}:={has}"
                     )
+
+
+def _misfits(offered: QoSProfile, asked: QoSProfile) -> list[tuple[str, str, str]]:
+    """Return why a publisher is not heard: policies, what they are and what is asked for."""
+    misfits = []
+    for policy, *misfit in MISFITS:
+        has, wanted = (getattr(quality, policy).name.lower() for quality in (offered, asked))
+        if [has, wanted] == misfit:
+            misfits.append((policy, has, wanted))
+    return misfits
 
 
 class Worker:

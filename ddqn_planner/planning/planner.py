@@ -281,10 +281,10 @@ class Planner:
             began = time.perf_counter()
 
     def _explain(self, request: PlanRequest) -> Generator[None, None, Plan]:
-        """Return a plan; without a path, its reason names unknown space where that closes it."""
+        """Return a plan; without a path, it says why, of several goals for each."""
         find = self._explore if request.grid.exploration else self._find
         plan = yield from find(request)
-        if unknown_space.may_be_the_reason(request.grid, plan):
+        if unknown_space.has_more_to_say(request.grid, plan, len(request.goals) > 1):
             yield
             plan = replace(plan, reason=unknown_space.reason_of(request, plan))
         return plan

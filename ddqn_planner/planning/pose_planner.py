@@ -100,7 +100,7 @@ class PosePlanner:
         has_path = len(request.under_way) > 0 and not is_outside
         if has_path:
             plan = self._keep_or_switch(request, plan)
-        if unknown_space.may_be_the_reason(request.grid, plan):
+        if unknown_space.has_more_to_say(request.grid, plan, len(request.goals) > 1):
             yield None
             reason = yield from self._reason(request, plan)
             plan = replace(plan, reason=reason)
@@ -139,25 +139,29 @@ class PosePlanner:
     def _reason(self, request: PoseRequest, plan: PosePlan) -> Generator[None, None, str]:
         """Return why there is no path, after None before each slow step."""
         status: str = plan.status.value
+        several = len(request.goals) > 1
+        start_cell, *cells = request.cells
+        if not any(map(request.grid.contains, cells)):
+            return unknown_space.reason_of_goals([unknown_space.OUTSIDE] * len(cells), "")
         grid = with_unknown_free(request.grid)
         world = world_of(grid, self.body)
         starts = self._at(grid, request.start, world)
-        start_cell, *cells = request.cells
-        if not len(starts):
+        if not len(starts) and not several:
             return status
         if plan.status is PlanStatus.START_OCCUPIED:
+            if not len(starts):
+                return status
             return f"the start {self._place(request, start_cell)}; {unknown_space.REMEDY}"
-        inside = [goal for goal in request.goals if grid.contains(grid.world_to_cell(*goal[:2]))]
-        if plan.status is PlanStatus.GOAL_OCCUPIED:
-            has_room = [
-                goal in inside and len(self._at(grid, goal, world)) for goal in request.goals
-            ]
-            if any(has_room):
-                both = zip(cells, has_room, strict=True)
-                places = [self._place(request, cell) if room else "" for cell, room in both]
-                return f"{unknown_space.goals_in_words(places)}; {unknown_space.REMEDY}"
+        places = [self._goal_in_words(request, goal, world) for goal in request.goals]
+        if several and (all(places) or request.grid.unknown is None or not len(starts)):
+            return unknown_space.reason_of_goals(places, "")
+        if not several and unknown_space.UNKNOWN_SPACE in places[0]:
+            return f"the goal {places[0]}; {unknown_space.REMEDY}"
         start: State = tuple(starts[0].tolist())
-        states = np.concatenate([self._at(grid, goal, world) for goal in inside])
+        # Of several goals those count at which the body has room.
+        ends = [goal for goal, place in zip(request.goals, places, strict=True) if not place]
+        ends = ends or [*request.goals]
+        states = np.concatenate([self._at(grid, goal, world) for goal in ends])
         if any(request.tolerance):
             states = self._around(replace(request, grid=grid), start, world)
         if not len(states):
@@ -170,7 +174,27 @@ class PosePlanner:
                 words = unknown_space.THROUGH_UNKNOWN_SPACE
                 break
             yield
-        return status if bound == math.inf else f"{status}, {words}; {unknown_space.REMEDY}"
+        words = "" if bound == math.inf else words
+        if several:
+            return unknown_space.reason_of_goals(places, words)
+        return f"{status}, {words}; {unknown_space.REMEDY}" if words else status
+
+    def _goal_in_words(self, request: PoseRequest, goal: Pose, possible: World) -> str:
+        """Return why no path can end at a pose; empty if the body has room there.
+
+        `possible` is the world whose unknown cells are free.
+        """
+        grid = request.grid
+        cell = grid.world_to_cell(*goal[:2])
+        if not grid.contains(cell):
+            return unknown_space.OUTSIDE
+        with self._lock:
+            world = self._world(grid)
+        if len(self._at(grid, goal, world)):
+            return ""
+        if len(self._at(with_unknown_free(grid), goal, possible)):
+            return self._place(request, cell)
+        return unknown_space.OCCUPIED
 
     def _place(self, request: PoseRequest, cell: Cell) -> str:
         """Return how a pose lies in whose cell the body touches unknown space."""

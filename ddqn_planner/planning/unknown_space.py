@@ -1,4 +1,4 @@
-"""Names unknown space where it is the reason that a plan has no path."""
+"""Says why a plan has no path: where unknown space is the reason, and of several goals each."""
 
 from __future__ import annotations
 
@@ -13,17 +13,23 @@ from ddqn_planner.planning.paths import way_and_ends
 from ddqn_planner.planning.plan import Plan, PlanRequest, PlanStatus
 
 REMEDY = "set allow_unknown, or map it"
+UNKNOWN_SPACE = "unknown space"
 IN_UNKNOWN_SPACE = "lies in unknown space"
+OUTSIDE = "lies outside the map"
+OCCUPIED = "is occupied"
 THROUGH_UNKNOWN_SPACE = "but a path leads through unknown space"
 MAYBE_THROUGH_UNKNOWN_SPACE = "but a path may lead through unknown space"
 
 MOST_NAMED = 5  # goals
 
 
-def may_be_the_reason(grid: GridMap, plan: Plan) -> bool:
-    """Return whether to look if unknown space is the reason that there is no path."""
+def has_more_to_say(grid: GridMap, plan: Plan, several: bool) -> bool:
+    """Return whether to look for more than the status: unknown space, or each goal's own reason."""
+    of_goals = PlanStatus.GOAL_OUTSIDE_MAP, PlanStatus.GOAL_OCCUPIED, PlanStatus.NO_PATH
     possible = PlanStatus.START_OCCUPIED, PlanStatus.GOAL_OCCUPIED, PlanStatus.NO_PATH
-    return grid.unknown is not None and plan.status in possible
+    return plan.status in (of_goals if several else ()) or (
+        grid.unknown is not None and plan.status in possible
+    )
 
 
 def reason_of(request: PlanRequest, plan: Plan) -> str:
@@ -33,18 +39,41 @@ def reason_of(request: PlanRequest, plan: Plan) -> str:
     if plan.status is PlanStatus.START_OCCUPIED:
         place = place_in_words(grid, request.start)
         return f"the start {place}; {REMEDY}" if place else status
+    if len(request.goals) > 1:
+        places = [goal_in_words(grid, goal) for goal in request.goals]
+        free = tuple(goal for goal in request.goals if grid.is_free(goal))
+        is_through = bool(free) and _leads_through_unknown_space(replace(request, goals=free))
+        return reason_of_goals(places, THROUGH_UNKNOWN_SPACE if is_through else "")
     if plan.status is PlanStatus.GOAL_OCCUPIED:
-        places = [place_in_words(grid, goal) for goal in request.goals]
-        if any(places):
-            return f"{goals_in_words(places)}; {REMEDY}"
+        place = place_in_words(grid, request.goals[0])
+        if place:
+            return f"the goal {place}; {REMEDY}"
         if request.reach < 1:
             return status
-    for possible in _grids_without_unknown(grid):
+    if _leads_through_unknown_space(request):
+        return f"{status}, {THROUGH_UNKNOWN_SPACE}; {REMEDY}"
+    return status
+
+
+def _leads_through_unknown_space(request: PlanRequest) -> bool:
+    """Return whether there is a path if the unknown cells are free."""
+    if request.grid.unknown is None:
+        return False
+    for possible in _grids_without_unknown(request.grid):
         goals = tuple(sorted({goal for goal in request.goals if possible.is_free(goal)}))
         found = way_and_ends(replace(request, grid=possible), goals)
         if isinstance(found, PlanStatus):
-            return status
-    return f"{status}, {THROUGH_UNKNOWN_SPACE}; {REMEDY}"
+            return False
+    return True
+
+
+def goal_in_words(grid: GridMap, cell: Cell) -> str:
+    """Return why no path can end in a cell; empty if it is free."""
+    if not grid.contains(cell):
+        return OUTSIDE
+    if grid.is_free(cell):
+        return ""
+    return place_in_words(grid, cell) or OCCUPIED
 
 
 def place_in_words(grid: GridMap, cell: Cell) -> str:
@@ -65,13 +94,30 @@ def place_in_words(grid: GridMap, cell: Cell) -> str:
     return "is nearer to unknown space than the robot's body allows"
 
 
-def goals_in_words(places: Sequence[str]) -> str:
-    """Return how the goals lie of which something is known, by their numbers if there are more."""
-    if len(places) == 1:
-        return f"the goal {places[0]}"
-    named = [f"goal {number} {place}" for number, place in enumerate(places, 1) if place]
-    more = ", ..." if len(named) > MOST_NAMED else ""
-    return ", ".join(named[:MOST_NAMED]) + more
+def reason_of_goals(places: Sequence[str], through: str) -> str:
+    """Return why no path leads to any of several goals, by their numbers.
+
+    Parameters
+    ----------
+    places : sequence of str
+        Why no path can end at each goal; empty for a goal to which none leads.
+    through : str
+        What is said of a path through unknown space; empty if there is none.
+    """
+    is_unknown = [UNKNOWN_SPACE in place for place in places]
+    # Of many, those that the remedy is for are named first of all.
+    named = sorted(range(len(places)), key=lambda index: not is_unknown[index])[:MOST_NAMED]
+    reasons = [f"goal {index + 1} {places[index]}" for index in sorted(named) if places[index]]
+    cut_off = [str(index + 1) for index in sorted(named) if not places[index]]
+    if cut_off:
+        goals = "goals" if len(cut_off) > 1 else "goal"
+        reasons.append(f"no path leads to {goals} {', '.join(cut_off)}")
+    if len(places) > MOST_NAMED:
+        reasons.append("...")
+    if through:
+        reasons.append(through)
+    words = ", ".join(reasons)
+    return f"{words}; {REMEDY}" if through or any(is_unknown) else words
 
 
 def _grids_without_unknown(grid: GridMap) -> Iterator[GridMap]:

@@ -203,11 +203,14 @@ def test_goals_none_of_which_can_be_reached_have_an_empty_plan(docks: Robot) -> 
     assert docks.plans.wait(lambda path: not path.poses).header.frame_id == "map"
     where = r"\(start: .*; goals: cells \(15, 10\), \(99, 5\); map: 31 x 11 cells\)"
     none = "^no path to any of {} goals: "
-    occupied = rf"the goal is occupied {where}; set the goal on a free cell$"
+    own = "goal 1 is occupied, goal 2 lies outside the map"
+    occupied = rf"{own} {where}; set the goal on a free cell$"
     docks.wait_for_reason(none.format(2) + occupied)
     docks.set_map(docks.map_with(np.s_[:, (5, 25)], 100))
     send_goals(docks, WALL, LEFT, RIGHT)
-    cut_off = "no path leads .*; set the goal where free cells lead to$"
+    cut_off = (
+        "goal 1 is occupied, no path leads to goals 2, 3 .*; set the goal where free cells lead to$"
+    )
     docks.wait_for_reason(none.format(3) + cut_off)
     docks.clear()
     docks.send_map(docks.stamped_map())

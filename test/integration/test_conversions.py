@@ -38,7 +38,7 @@ from ddqn_planner.nodes.conversions import (
     rotation,
     with_unit_quaternion,
 )
-from ddqn_planner.nodes.poses import Frames, Places, transformed
+from ddqn_planner.nodes.poses import CheckedTransforms, Frames, Places, transformed
 from ddqn_planner.nodes.report import Refusals, RequestError
 
 HEADER = Header(frame_id="map")
@@ -229,10 +229,58 @@ def test_a_pose_is_turned_and_moved_in_space_and_projected_to_the_plane(
         assert complex(rotation.w, rotation.z) ** 2 == pytest.approx(ahead / abs(ahead), abs=1e-6)
 
 
+NAN = math.nan
+
+
+@pytest.mark.parametrize(
+    ("numbers", "problem"),
+    [
+        ((0.0, 0.0, 0.707, 0.707), ""),
+        ((0.0, 0.0, 0.65, 0.65), ""),
+        ((0.0, 0.0, 0.0, 1.09), ""),
+        ((0.0, 0.0, 0.0, 0.5), r"quaternion \(0, 0, 0, 0.5\) of norm 0.5; publish one of norm 1"),
+        ((0.0, 0.0, 3.0, 4.0), r"quaternion \(0, 0, 3, 4\) of norm 5"),
+        ((0.0, 0.0, 0.0, 0.0), r"of norm 0;"),
+        ((0.0, 0.0, NAN, 1.0), r"of norm nan;"),
+    ],
+)
+@pytest.mark.parametrize("method", ["set_transform", "set_transform_static"])
+def test_tf2_gets_unit_quaternions_and_others_are_refused_and_logged_once(
+    numbers: tuple[float, ...], problem: str, method: str
+) -> None:
+    buffer, node = Mock(), Mock()
+    checked = CheckedTransforms(buffer, node)
+    warning = node.get_logger().warning
+    for _ in range(3):
+        getattr(checked, method)(transform((1.0, 2.0, 0.0), Quaternion(**zipped(numbers))), "robot")
+    handed = [call.args for call in getattr(buffer, method).call_args_list]
+    assert len(buffer.method_calls) == len(handed) == (0 if problem else 3)
+    for stamped, authority in handed:
+        turn = rotation(stamped.transform.rotation)
+        assert turn == pytest.approx([it / math.hypot(*numbers) for it in numbers], abs=1e-12)
+        assert authority == "robot"
+    assert warning.call_count == len(checked.refused) == bool(problem)
+    if problem:
+        (said,) = warning.call_args.args
+        assert re.search(
+            f"^transform refused: the transform from 'odom' to 'map' .*{problem}", said
+        )
+        getattr(checked, method)(transform((1.0, 2.0, 0.0), Quaternion(w=1.0)), "robot")
+        assert not checked.refused
+        getattr(checked, method)(transform((NAN, 2.0, 0.0), Quaternion(w=1.0)), "robot")
+        assert "translation (nan, 2, 0); publish finite" in warning.call_args.args[0]
+        assert warning.call_count == 2
+
+
+def zipped(numbers: tuple[float, ...]) -> dict[str, float]:
+    """Return the fields of a quaternion."""
+    return dict(zip("xyzw", numbers, strict=True))
+
+
 @pytest.mark.parametrize("w", [0.0, 0.8, math.nan, math.inf])
 def test_a_transform_without_a_rotation_is_named(w: float) -> None:
     bad = transform((1.0, 2.0, 0.0), Quaternion(w=w))
-    with pytest.raises(ValueError, match=f"from 'odom' to 'map' has a quaternion of norm {w:.6g}"):
+    with pytest.raises(ValueError, match=f"'odom' to 'map' has the .* of norm {w:.6g}; pub"):
         transformed(stamped_pose((2.0, 0.0, 0.0), Quaternion()), bad)
 
 

@@ -376,6 +376,51 @@ def test_directions_are_required_once(source: Source, set_parameters: SetParamet
 OTHERS = [({"frame": "odom"}, "frame is 'map', the map's is 'odom'"), ({"yaw": 0.1}, "one yaw")]
 
 
+def test_why_a_map_waits_for_directions_is_logged_once(
+    source: Source, set_parameters: SetParameters, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [100.0]
+    clock = SimpleNamespace(monotonic=lambda: now[0])
+    monkeypatch.setattr("ddqn_planner.nodes.map_source.time", clock)
+    logged = list[str]()
+    logger = SimpleNamespace(warning=logged.append, error=logged.append, info=lambda _: None)
+    monkeypatch.setattr(source._node, "get_logger", lambda: logger)
+
+    def reasons_for(*changes: dict[str, Any]) -> list[str]:
+        """Return what is logged while maps come for 3 s, and then none for 2 s."""
+        logged.clear()
+        for stamp in range(10, 16):
+            source.on_map(stamp, **changes[stamp % len(changes)])
+            assert "map" in source.report.refused
+            now[0] += 0.5
+        now[0] += 2.0
+        source.look()
+        return logged
+
+    set_parameters(require_directions=True)
+    (late,) = reasons_for({})
+    assert late.startswith("map refused: the map's directions were not received on ")
+    assert source.on_directions(1) == (15, EAST)
+    (frames,) = reasons_for({"frame": "odom"})
+    assert frames.startswith("map refused: ")
+    assert "their frame is 'map', the map's is 'odom'; give both one frame, or set" in frames
+    (turned,) = reasons_for({"yaw": 0.1}, {"yaw": 0.2})
+    assert "give both one yaw, or set require_directions to false" in turned
+    assert source.on_map(20) == (20, EAST)
+    # Directions that come moments after their map are no reason to warn.
+    logged.clear()
+    assert source.on_map(21, frame="odom") == (20, EAST)
+    now[0] += 0.5
+    source.look()
+    assert source.on_map(22) == (22, EAST)
+    now[0] += 5.0
+    assert source.on_map(23, frame="odom") == (22, EAST)
+    assert not logged
+    now[0] += 1.0
+    source.look()
+    assert len(logged) == 1
+
+
 @pytest.mark.parametrize(("changes", "reason"), OTHERS)
 def test_directions_that_cannot_hold_are_named_or_their_map_is_refused(
     source: Source, set_parameters: SetParameters, changes: dict[str, Any], reason: str

@@ -202,6 +202,9 @@ class Buffer:
     def __init__(self):
         self.transforms = {}
 
+    def set_transform(self, transform, authority):
+        self.transforms[transform.header.frame_id, transform.child_frame_id] = transform
+
     def lookup_transform(self, target_frame, source_frame, time):
         if (target_frame, source_frame) not in self.transforms:
             raise TransformException(f'"{source_frame}" does not exist')
@@ -210,7 +213,7 @@ class Buffer:
 class TransformListener:
     def __init__(self, buffer, node, qos):
         def hear(transform):
-            buffer.transforms[transform.header.frame_id, transform.child_frame_id] = transform
+            buffer.set_transform(transform, "")
 
         self.group = ReentrantCallbackGroup()
         self.tf_sub, self.tf_static_sub = (

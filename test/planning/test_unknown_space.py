@@ -37,6 +37,7 @@ def grid_of(radius: float = 0.0, **values: int) -> GridMap:
 
 
 THROUGH = "no path leads from the start to the goal, but a path leads through unknown space"
+IN_UNKNOWN, BUT = "lies in unknown space", ", but a path leads through unknown space"
 NEAR = "the goal is nearer to unknown space than the robot's body allows"
 
 
@@ -104,8 +105,10 @@ def test_each_of_several_goals_is_named(planner: Planner) -> None:
     grid = grid_of(goal=UNKNOWN, start=WALL)
     goals = [(3, 5), GOAL, (99, 5), (26, 5)]
     plan = planner.plan_nearest(grid, (10, 5), goals)
-    named = "goal 2 lies in unknown space, goal 4 lies in unknown space"
-    assert plan.reason == f"{named}; {REMEDY}"
+    assert plan.reason == (
+        "goal 1 is occupied, goal 2 lies in unknown space, goal 3 lies outside the map, "
+        f"goal 4 lies in unknown space; {REMEDY}"
+    )
     through = planner.plan_through(grid, (10, 5), [(12, 5), GOAL])
     assert through.reason == f"goal 2 of 2: the goal lies in unknown space; {REMEDY}"
     assert through.goal == GOAL
@@ -113,6 +116,31 @@ def test_each_of_several_goals_is_named(planner: Planner) -> None:
     many = planner.plan_nearest(grid, (10, 5), [GOAL] * 7)
     assert many.reason.startswith("goal 1 lies")
     assert "goal 5 lies in unknown space, ...;" in many.reason
+    late = planner.plan_nearest(grid, (10, 5), [*5 * [(3, 5)], GOAL, (3, 5)])
+    occupied = ", ".join(f"goal {number} is occupied" for number in range(1, 5))
+    assert late.reason == f"{occupied}, goal 6 lies in unknown space, ...; {REMEDY}"
+
+
+@pytest.mark.parametrize(
+    ("across", "goals", "reason"),
+    [
+        (UNKNOWN, [(15, 2), GOAL], f"goal 1 {IN_UNKNOWN}, no path leads to goal 2{BUT}; {REMEDY}"),
+        (WALL, [(15, 2), GOAL], "goal 1 is occupied, no path leads to goal 2"),
+        (WALL, [GOAL, (15, 2), (28, 2)], "goal 2 is occupied, no path leads to goals 1, 3"),
+        (WALL, [(99, 5), (15, 2)], "goal 1 lies outside the map, goal 2 is occupied"),
+        (WALL, [(99, 5), (-1, 2)], "goal 1 lies outside the map, goal 2 lies outside the map"),
+    ],
+)
+def test_each_of_several_goals_has_its_own_reason(
+    planner: Planner, across: int, goals: list[tuple[int, int]], reason: str
+) -> None:
+    plan = planner.plan_nearest(grid_of(across=across), START, goals)
+    assert plan.reason == reason
+    grid = GridMap(np.array(hall(across=across) != FREE))  # it does not know what is unknown
+    occupied = (
+        reason.replace(IN_UNKNOWN, "is occupied").replace(BUT, "").removesuffix(f"; {REMEDY}")
+    )
+    assert planner.plan_nearest(grid, START, goals).reason == occupied
 
 
 def test_a_start_that_leaves_an_obstacle(planner: Planner) -> None:
@@ -235,7 +263,7 @@ def test_unknown_space_that_a_body_touches_is_named(
 def test_the_goals_of_a_body_are_numbered(car: Planner) -> None:
     grid = body_hall(goal=UNKNOWN)
     plan = car.plan_poses(grid, POSES[0], [(99.0, 2.0, 0.0), POSES[1], (6.9, 2.0, 0.0)])
-    assert plan.reason.startswith("goal 2 is so near to unknown space")
+    assert plan.reason.startswith("goal 1 lies outside the map, goal 2 is so near to unknown space")
     assert "goal 3 lies in unknown space" in plan.reason
 
 
