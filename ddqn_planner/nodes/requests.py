@@ -258,8 +258,7 @@ class Requests:
             elif began >= deadline:
                 break
             if not await self._wait_for_costmap(costmap, deadline):
-                if self.map.arrivals.number == first:
-                    self.map.arrivals.awaited_in_vain = first
+                self.map.arrivals.awaited_in_vain = first  # unless others have come
                 break
         self.retries.note(goals, costmap, outcome)
         return outcome

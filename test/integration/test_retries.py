@@ -178,7 +178,7 @@ def test_the_last_costmap_in_time_counts_though_it_is_planned_on_later(
         if costmaps:  # comes while the plan is made
             asked.send(costmaps.pop(0))
             asked.set_period(1000.0)
-            late[0] += 1500.0
+            late[0] += 2500.0
         return outcome
 
     monkeypatch.setattr(asked.node._requests, "plan_now", slow_plan)
