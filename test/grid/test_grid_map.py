@@ -16,7 +16,7 @@ from hypothesis.extra import numpy as numpy_st
 from scipy.spatial.distance import cdist
 from strategies import Data, grids_with_directions, occupancies, shapes
 
-from ddqn_planner.grid import UNKNOWN, GridMap, MoveRule, clearance, copies, inflate
+from ddqn_planner.grid import UNKNOWN, GridMap, MoveRule, clearance, copies, grid_map, inflate
 from ddqn_planner.grid.arguments import as_cell
 from ddqn_planner.grid.body import Inflation, grid_from_costmap
 from ddqn_planner.grid.copies import boxes_of, cells_in, replaced
@@ -134,7 +134,8 @@ def full_grids(draw: st.DrawFn) -> GridMap:
     slowness = draw(st.none() | numpy_st.arrays(np.float32, shape, elements=st.integers(1, 100)))
     known = draw(st.none() | numpy_st.arrays(np.bool_, shape))
     obstacles = None if known is None else known & grid.occupancy
-    layers = {"forbidden": grid.forbidden, "slowness": slowness}
+    uphill = draw(st.none() | numpy_st.arrays(np.uint8, shape))
+    layers = {"forbidden": grid.forbidden, "slowness": slowness, "uphill": uphill}
     return GridMap(grid.occupancy, 0.5, (1.0, 2.0, 3.0), grid.cost, obstacles, **layers)
 
 
@@ -178,7 +179,7 @@ def test_patches_are_exact(
 
 @given(full_grids(), full_grids())
 def test_maps_of_the_same_fingerprint_have_the_same_layers(a: GridMap, b: GridMap) -> None:
-    names = "occupancy", "cost", "forbidden", "slowness"
+    names = "occupancy", "cost", "forbidden", "slowness", "uphill"
     for changed in (None, *names):
         layers = {name: getattr(a, name) for name in names}
         if changed is not None and getattr(b, changed) is not None:
@@ -206,7 +207,8 @@ def test_a_wrong_patch_is_named_and_the_remedy_too() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("slowness", np.float32(2)), ("forbidden", np.uint8(2))]
+    ("name", "value"),
+    [("slowness", np.float32(2)), ("forbidden", np.uint8(2)), ("uphill", np.uint8(2))],
 )
 def test_maps_tell_their_patches_where_all_else_is_the_same(name: str, value: Any) -> None:
     grid = GridMap(ZEROS, cost=ZEROS)
@@ -218,6 +220,18 @@ def test_maps_tell_their_patches_where_all_else_is_the_same(name: str, value: An
         assert after.patches_since(other) is None
     for name in ("occupancy", "cost"):
         assert after.with_layers(**{name: getattr(after, name)}).patches_since(before) is None
+
+
+def test_a_map_knows_so_many_patches_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(grid_map, "MAX_PATCHES", 3)
+    maps = [GridMap(ZEROS)]
+    for x, y in ((0, 0), (1, 0), (2, 0), (0, 1), (1, 1)):
+        maps.append(maps[-1].with_patch([[1]], x, y))
+    boxes = [(slice(y, y + 1), slice(x, x + 1)) for x, y in ((2, 0), (0, 1), (1, 1))]
+    since = [maps[-1].patches_since(older) for older in maps]
+    assert since == [None, None, boxes, boxes[1:], boxes[2:], []]
+    assert maps[0].patches_since(maps[1]) is None
+    assert not any(maps[-1].same_cells(older) for older in maps[:-1])
 
 
 RESOLUTION = 0.05

@@ -263,9 +263,10 @@ def test_a_retry_has_the_goal_of_a_recent_failure(monkeypatch: pytest.MonkeyPatc
     def outcome(status: str) -> Outcome:
         return Outcome(status, "", None, request, Plan(PlanStatus.NO_PATH))
 
-    def at(x: float, frame: str = "map") -> PoseStamped:
+    def at(x: float, frame: str = "map", y: float = 0.0) -> PoseStamped:
         stamped = pose(GRID, (0, 0))
-        stamped.pose.position.x, stamped.header.frame_id = x, frame
+        stamped.pose.position.x, stamped.pose.position.y = x, y
+        stamped.header.frame_id = frame
         return stamped
 
     retries, resolution = Retries(), 0.1
@@ -275,6 +276,7 @@ def test_a_retry_has_the_goal_of_a_recent_failure(monkeypatch: pytest.MonkeyPatc
         ([at(1.09)], 8, True),  # as TF moves a goal
         ([at(1.11)], 7, False),
         ([at(9.0)], 7, False),
+        ([at(1.0, y=0.11)], 7, False),
         ([at(1.0, "odom")], 7, False),
     ):
         assert retries.is_retry(goals, costmap, resolution) is is_retry

@@ -392,7 +392,7 @@ def test_maps_are_compared_where_one_is_the_other_shifted_by_whole_cells() -> No
         (0.05, (0.0, 0.0, 0.0), (0, 0)),
         (float(np.float32(0.05)), (-1.0, 0.5, 0.0), (20, -10)),
         *((0.05, (0.0, 0.0, yaw), None) for yaw in (0.1, 0.005)),
-        *((0.05, (x, 0.0, 0.0), None) for x in (0.02, 1e308)),
+        *((0.05, (x, 0.0, 0.0), None) for x in (0.02, 5e10 + 0.02)),
         (0.1, (0.0, 0.0, 0.0), None),
     ):
         assert fields.shift_between(old, GridMap(cells, resolution, origin)) == shift
@@ -574,6 +574,27 @@ def test_a_request_on_a_new_map_looks_at_a_bounded_number_of_others(
         assert compared <= 3 * most
         assert repaired <= fields.ALWAYS_KEPT
     assert len(planner.fields._kept) <= most
+
+
+def test_the_last_64_fields_are_kept_and_3_whatever_their_size() -> None:
+    planner, grid = new_planner(), GridMap(np.zeros((10, 10)))
+    *goals, last = grid.free_cells()[:80]
+    for goal in goals:
+        planner.q_field(grid, goal)
+    assert [field.goal for field in planner.fields._kept] == goals[-64:]
+    planner.q_field(grid, goals[-5])  # used last by now
+    planner.fields.nbytes = 0
+    planner.q_field(grid, last)
+    assert [field.goal for field in planner.fields._kept] == [goals[-1], goals[-5], last]
+
+
+def test_fields_toward_other_goals_or_by_other_rules_are_not_repaired() -> None:
+    grid = GridMap(np.zeros((9, 9)), cost=np.zeros((9, 9)))
+    for goal, rule in (((8, 8), MoveRule.ROBOT_SAFE), ((0, 0), MoveRule.UNIT)):
+        planner = new_planner()
+        _ = planner.q_field(grid, (0, 0), MoveRule.ROBOT_SAFE).value
+        for changed in (grid, grid.with_patch([[True]], 4, 4)):
+            assert_same(planner.q_field(changed, goal, rule), fresh_field(changed, goal, rule))
 
 
 def test_arrays_that_fields_share_count_once() -> None:
