@@ -34,6 +34,11 @@ class Rows:
         self.grid, self.first, self.end = grid, first, end
         self.lock = threading.Lock()
 
+    def on(self, grid: GridMap) -> Rows:
+        """Return the same rows as read of another map."""
+        with self.lock:
+            return Rows(grid, self.first, self.end)
+
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy has: it reads anew, under a lock of its own."""
         return {"grid": self.grid}
@@ -79,10 +84,16 @@ class MoveCosts(NamedTuple):
         if grid.forbidden is not None:  # its patches are others
             return None
         after, shape = self, grid.occupancy.shape
+        # Before the first copy: it has what was read until then. And so are the rows counted then,
+        # as another thread may read more meanwhile.
+        for box in boxes:
+            rows, _ = wider(box, 1, shape)
+            self.read(rows.start, rows.stop)
+        if self.rows is not None:
+            after = after._replace(rows=self.rows.on(grid))
         for box in boxes:
             # The patches of the cells around see the box, too.
             around, seen = (wider(box, by, shape) for by in (1, 2))
-            self.read(around[0].start, around[0].stop)
             layers = [(name, getattr(grid, name)) for name in LAYERS]
             parts = {name: layer[seen].copy() for name, layer in layers if layer is not None}
             part = grid.with_layers(**parts)
@@ -96,8 +107,6 @@ class MoveCosts(NamedTuple):
                     new = new[within(around, seen, 1)]
                     layer = replaced(layer, within(around, ORIGIN, 1), new)
                     after = after._replace(**{name: layer.ravel()})
-        if self.rows is not None:
-            after = after._replace(rows=Rows(grid, self.rows.first, self.rows.end))
         return after
 
     def on(

@@ -474,6 +474,32 @@ def test_where_rows_are_read_ends_lie_in_the_first_and_the_last_rows(
         np.testing.assert_array_equal(by_rows.value, field_at_once.value)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_where_rows_are_read_several_patches_lie_between_two_requests(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Rows that the costs of a map read for its second patch must be in what the first one changed.
+    height, width, goal = 60, 12, (0, 0)
+    random = np.random.default_rng(seed)
+    monkeypatch.setattr(kernels, "MARGIN", 0)
+    for _ in range(20):
+        cells = random.random((height, width)) < 0.3
+        cells[0, 0] = False
+        grid, by_rows = GridMap(cells), new_planner()
+        with monkeypatch.context() as patch:
+            patch.setattr(move_costs_module, "LARGE", 0)
+            by_rows.plan(grid, goal, goal)  # the first rows alone are read
+            for _ in range(3):
+                x, y = random.integers((width - 2, height - 2)).tolist()
+                box = random.random((2, 2)) < 0.3
+                if (x, y) == goal:
+                    box[0, 0] = False
+                grid = grid.with_patch(box, x, y)
+            starts = random.choice(grid.free_cells(), size=4).tolist()
+            plans = [by_rows.plan(grid, start, goal) for start in starts]
+        assert plans == [new_planner().plan(grid, start, goal) for start in starts]
+
+
 def test_few_rows_of_a_large_map_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(move_costs_module, "LARGE", 2**16)
     side = 1000
