@@ -9,6 +9,7 @@ from nav_msgs.msg import OccupancyGrid
 from nav_msgs.srv import GetMap, LoadMap
 from numpy.typing import NDArray
 from rclpy.duration import Duration
+from rclpy.exceptions import NameValidationException
 
 from ddqn_planner.grid import OCCUPIED, Cell, GridMap, MapFile, MoveRule, read_map_file
 from ddqn_planner.grid.map_file import MapDataError, MapMetadataError, MapNotFoundError
@@ -53,10 +54,11 @@ class MapServerNode(BaseNode):
         # First, so that whoever receives a map knows that its directions come too.
         self._directions = self.create_publisher(OccupancyGrid, f"{topic}_directions", LATCHED)
         self._publisher = self.create_publisher(OccupancyGrid, topic, LATCHED)
-        if name := self.value("yaml_filename"):
+        name = self.value("yaml_filename")
+        if name.strip():
             self._load(name)
         else:
-            self.get_logger().info(f"yaml_filename is '': {NO_MAP}")
+            self.get_logger().info(f"yaml_filename is {name!r}: {NO_MAP}")
         self.create_service(GetMap, "~/map", self._on_get_map)
         self.create_service(LoadMap, "~/load_map", self._on_load_map)
         with suppress(ImportError):
@@ -66,6 +68,16 @@ class MapServerNode(BaseNode):
             self.create_service(Nav2LoadMap, "~/load_map_nav2", self._on_load_map)
         self.create_trigger("~/scatter_obstacles", self._on_scatter_obstacles)
         self.create_trigger("~/restore_map", self._on_restore_map)
+
+    def check_parameters(self, new: dict[str, Any]) -> None:
+        """Check new values as `BaseNode` does, and whether the topic can be one."""
+        super().check_parameters(new)
+        topic = new.get("topic_name", "map")
+        try:
+            self.resolve_topic_name(topic)
+        except (NameValidationException, RuntimeError, ValueError) as error:
+            wrong = f"topic_name is {topic!r} ({str(error).splitlines()[0].rstrip(':')})"
+            raise ValueError(f"{wrong}; give letters, digits, _ and /, such as map") from None
 
     def _load(self, url: str, only_below: bool = False) -> int:
         """Load a map and serve it, or log why not; return the result code of LoadMap."""

@@ -251,16 +251,23 @@ def test_arguments_that_ros_reads_are_not_wrong(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("setting", "reason"),
+    ("name", "setting", "reason"),
     [
-        ("model:=", "cannot start: -p model:= has no value"),
-        ("qos_overrides./map.subscription.depth:=-3", "depth is -3; give 0 to 2147483647"),
+        ("planner_node", "model:=", "cannot start: -p model:= has no value"),
+        (
+            "planner_node",
+            "qos_overrides./map.subscription.depth:=-3",
+            "depth is -3; give 0 to 2147483647",
+        ),
+        ("map_server_node", "topic_name:=my map", "cannot start: topic_name is 'my map' ("),
+        ("map_server_node", "topic_name:=''", "cannot start: topic_name is '' ("),
+        ("map_server_node", "topic_name:='/'", "cannot start: topic_name is '/' ("),
     ],
 )
 def test_a_node_that_cannot_start_names_the_setting(
-    run_node: Any, setting: str, reason: str
+    run_node: Any, name: str, setting: str, reason: str
 ) -> None:
-    with run_node("planner_node", settings=["--ros-args", "-p", setting], exit_code=1) as node:
+    with run_node(name, settings=["--ros-args", "-p", setting], exit_code=1) as node:
         assert node.process.wait(TIMEOUT) == 1
     assert reason in node.log
     assert node.log.count("FATAL") == 1
@@ -314,9 +321,12 @@ def test_a_map_server_without_a_map_waits_for_one(run_node: Any, make_client: An
         answer = client.call(LoadMap, "map_server/load_map", LoadMap.Request(map_url=""))
         assert answer.result == LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
         node.wait_for_log("cannot load '', no map is served: the map is ''; give a path")
+        answer = client.call(LoadMap, "map_server/load_map", LoadMap.Request(map_url="/"))
+        assert answer.result == LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
+        node.wait_for_log("'/' is a folder; give the path of a map file")
         answer = client.call(LoadMap, "map_server/load_map", LoadMap.Request(map_url="dilemma"))
         assert answer.result == LoadMap.Response.RESULT_SUCCESS
-        assert node.log.count("ERROR") == 1
+        assert node.log.count("ERROR") == 2
 
 
 @pytest.mark.parametrize(("robots", "spaces"), [([], [""]), (["/r1", "r2/", "r1"], ["r1/", "r2/"])])
