@@ -267,8 +267,9 @@ def train_robot(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> in
     """Train a model of a robot with a body and a heading. Exit code 1 if it cannot be proved."""
     from tqdm import tqdm
 
+    from ddqn_planner.grid.arguments import as_whole
     from ddqn_planner.model import save_model
-    from ddqn_planner.training.robot import ROBOT, RobotTrainer
+    from ddqn_planner.training.robot import MOST_STEPS, ROBOT, RobotTrainer
 
     _add_options(
         parser,
@@ -283,6 +284,7 @@ def train_robot(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> in
         ("steps", int, ROBOT.steps, "transitions after which to give up"),
     )
     options = parser.parse_args(arguments)
+    as_whole("--steps", options.steps, 1, MOST_STEPS)
     out = as_path(options.out, "--out")
     check_writable(out, "--out")
     check_distinct({"--out": out}, {"--lattice": options.lattice})
@@ -404,10 +406,14 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
             name, found = read_recording(source, grid, *how)
             print(f"{source}: {name}")
             drives += found
+        reasons = []
         for number, drive in enumerate(drives, 1):
             learned = drive.teach(experience, grid)
             if not learned:
+                reasons.append(learned.reason)
                 print(f"drive {number} taught nothing: {learned.reason}")
+        if len(reasons) == len(drives):
+            raise ValueError(f"no drive taught anything, and {out} is as before; {reasons[0]}")
         try:
             from ddqn_planner.training.prior import prior_of
 

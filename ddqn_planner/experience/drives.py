@@ -101,7 +101,7 @@ class Drive(NamedTuple):
         if grid is not None:  # its time, compared with the expected one, tells how sure that is
             experience.apply(grid)
         learned = experience.record(self.seconds, self.positions)
-        if self.outcome is DriveEnd.ABORTED:
+        if self.outcome is DriveEnd.ABORTED and learned.is_possible:
             experience.record_failure(self.positions[-1])
             learned = learned._replace(places=learned.places + 1, reason="")
         return learned
@@ -230,12 +230,13 @@ class DriveFolder(WorkFolder):
                 for drive in read_drives(self.record_path):
                     drive.teach(self.experience)
 
-    def add(self, drive: Drive, grid: GridMap | None = None) -> None:
-        """Record a drive, learn from it, and save."""
+    def add(self, drive: Drive, grid: GridMap | None = None) -> Learned:
+        """Record a drive, learn from it, and save; return what it taught."""
         self.drives += 1
         self._record.append(drive.row(self.drives))
-        drive.teach(self.experience, grid)
+        learned = drive.teach(self.experience, grid)
         self.try_to_save()
+        return learned
 
     def forget(self) -> Path | None:
         """Forget all that was learned; return the file that keeps it, if there was one."""

@@ -20,7 +20,7 @@ from ddqn_planner.experience.evidence import FARTHEST, Evidence, Visits
 from ddqn_planner.experience.prior import Prior
 from ddqn_planner.files import as_path, differences, locked, read_file, write_atomically
 from ddqn_planner.grid import GridMap
-from ddqn_planner.grid.arguments import POSITIVE, Cells, as_number, cells_inside, numbers
+from ddqn_planner.grid.arguments import MAX_SLOWNESS, Cells, as_number, cells_inside, numbers
 from ddqn_planner.grid.grid_map import Exploration
 from ddqn_planner.grid.moves import MOVES, UPHILL, actions_along, cells_along
 
@@ -32,9 +32,18 @@ VERSION = 3  # 2 was never released
 PRIOR = "prior_"  # before the names of its arrays in a file
 EXPERIENCE = "experience.npz"  # the name of the file in a folder
 ARRAYS = "evidence", "directed", "driven", "errors", "surprises"  # see `Evidence.restore`
-OPTIONS = ("nominal_speed", "robot_width", "half_life", "max_pause")
+SPEEDS = 0.001, 1000.0  # metres per second
+WIDTHS = 0.01, 100.0  # metres
+# The range of each option, and its unit.
+OPTIONS = {
+    "nominal_speed": (*SPEEDS, "metres per second"),
+    "robot_width": (*WIDTHS, "metres"),
+    "half_life": (1.0, 1e12, "seconds"),
+    "max_pause": (0.1, 1e6, "seconds"),
+}
 
 LATEST = 1e12  # seconds of a clock: a pose of a later time is not believed
+MOST_SPEED = 10.0  # times the nominal speed: a robot that usually drives faster is not believed
 WINDOW, LONGEST_WINDOW = 0.15, 0.3  # metres at nominal speed, in whose time poses are averaged
 LEFT_NOISE = 0.015  # metres: the deviation of these means; more would hide slowness
 STAND_DISTANCE = 0.1  # metres within which a robot stands
@@ -63,6 +72,7 @@ class Learned(NamedTuple):
     places: int  # that were passed, or waited at
     seconds: float  # that were spent there
     reason: str = ""  # why nothing was learned, and what to do
+    is_possible: bool = True  # no robot with the nominal speed can have driven so, if False
 
     def __bool__(self) -> bool:
         return self.places > 0
@@ -82,13 +92,15 @@ class Experience:
     Parameters
     ----------
     nominal_speed : float
-        Metres per second in the open: a first guess, see `learned_speed`.
+        Metres per second in the open, 0.001 to 1,000: a first guess, see `learned_speed`. A drive
+        whose median speed is more than 10 times that teaches nothing, nor does one that is never
+        faster than a hundredth of it.
     robot_width : float
-        Metres: the size of a place is half of it.
+        Metres, 0.01 to 100: the size of a place is half of it.
     half_life : float
-        Seconds of driving after which evidence counts half.
+        Seconds of driving, 1 to 1e12, after which evidence counts half.
     max_pause : float
-        Seconds: a robot that stands for longer waits for nothing, which is left out.
+        Seconds, 0.1 to 1e6: a robot that stands for longer waits for nothing, which is left out.
     """
 
     def __init__(
@@ -98,10 +110,9 @@ class Experience:
         half_life: float = 36_000.0,
         max_pause: float = 90.0,
     ) -> None:
-        given = nominal_speed, robot_width, half_life, max_pause
+        values = nominal_speed, robot_width, half_life, max_pause
         self.nominal_speed, self.robot_width, self.half_life, self.max_pause = (
-            as_number(name, value, *POSITIVE, "more than 0, and finite")
-            for name, value in zip(OPTIONS, given, strict=True)
+            _as_option(name, value) for name, value in zip(OPTIONS, values, strict=True)
         )
         self.evidence = Evidence(self.nominal_speed, self.robot_width, self.half_life)
         # The file that holds this experience, less what is new.
@@ -146,9 +157,18 @@ class Experience:
         fresh = np.diff(time, prepend=np.nan) != 0  # a repeated time adds nothing
         time, position = time[fresh], position[fresh]
         if len(time) >= 2:
-            visits = self._measured(time, position)
+            window = _window(time, position, self.learned_speed)
+            speeds = _speeds(time, position, window)
+            usual_speed = float(np.median(speeds)) if len(speeds) else 0.0
+            if usual_speed > self.nominal_speed * MOST_SPEED:
+                return Learned(0, 0.0, self._too_fast(usual_speed), is_possible=False)
+            visits = self._measured(time, position, window, usual_speed)
+            places = len(visits.seconds) + len(visits.waits)
+            fastest = float(speeds.max(initial=0))
+            if places and fastest < self.nominal_speed / MAX_SLOWNESS:
+                return Learned(0, 0.0, self._too_slow(fastest), is_possible=False)
             self._learn(partial(Evidence.add, visits=visits))
-            if places := len(visits.seconds) + len(visits.waits):
+            if places:
                 return Learned(places, float(visits.seconds.sum() + visits.waits[:, 2].sum()))
         return Learned(0, 0.0, self._why_nothing(time, position, count))
 
@@ -167,19 +187,24 @@ class Experience:
             )
         fastest = float((metres / elapsed).max())
         if fastest > self.max_speed:
-            slowest = f"the robot moves at {fastest:.3g} m/s"
-            return f"{slowest}; give metres and seconds, or a greater nominal_speed"
+            return self._too_fast(fastest)
         extent = float(np.hypot(*(position - position[0]).T).max())
         return f"the robot comes no farther than {extent:.2g} m; give a longer drive"
 
-    def _measured(self, time: Float64, position: Float64) -> Visits:
+    def _too_fast(self, speed: float) -> str:
+        remedy = f"give metres and seconds, or a nominal_speed greater than {self.nominal_speed:g}"
+        return f"the robot moves at {speed:.3g} m/s; {remedy} m/s"
+
+    def _too_slow(self, speed: float) -> str:
+        remedy = f"give metres and seconds, or a nominal_speed less than {self.nominal_speed:g}"
+        return f"the robot moves at most at {speed:.3g} m/s; {remedy} m/s"
+
+    def _measured(
+        self, time: Float64, position: Float64, window: float, usual_speed: float
+    ) -> Visits:
         """Return the visits of a drive."""
         speed, side = self.learned_speed, self.evidence.side
-        window = _window(time, position, speed)
-        seconds, at = averaged(time, position, window)
-        speeds = np.hypot(*np.diff(at, axis=0).T) / np.abs(np.diff(seconds))
-        usual = float(np.median(speeds)) if len(speeds) else 0.0
-        max_speed, step = max(self.max_speed, 3 * usual), max(side, WINDOW) / 2
+        max_speed, step = max(self.max_speed, 3 * usual_speed), max(side, WINDOW) / 2
         steps, waits = [np.zeros((0, 5))], [np.zeros((0, 3))]
         for part in _believed_parts(time, position, max_speed, self.max_pause):
             seconds, at = averaged(time[part], position[part], window)
@@ -222,6 +247,8 @@ class Experience:
         ValueError
             If the two have other parameters.
         """
+        if not isinstance(other, Experience):
+            raise ValueError(f"the other experience is {other!r}; give an Experience")
         self._check_kind(other)
         self._learn(partial(Evidence.merge, other=copy.deepcopy(other.evidence)))
 
@@ -421,6 +448,11 @@ class Experience:
         return experience
 
 
+def _as_option(name: str, value: Any) -> float:
+    lowest, highest, unit = OPTIONS[name]
+    return as_number(name, value, lowest, highest, f"{unit}, {lowest:g} to {highest:g}")
+
+
 def _believed_parts(
     time: Float64, position: Float64, max_speed: float, max_pause: float
 ) -> Iterator[slice]:
@@ -433,6 +465,15 @@ def _believed_parts(
         if end - first > 1 and math.dist(position[first], position[last]) <= way:
             last = end - 1
             yield slice(first, end)
+
+
+def _speeds(time: Float64, position: Float64, window: float) -> Float64:
+    """Return the speeds of a drive from window to window, in metres per second."""
+    seconds, at = averaged(time, position, window)
+    elapsed = np.abs(np.diff(seconds))
+    metres = np.hypot(*np.diff(at, axis=0).T)
+    speeds: Float64 = metres[elapsed > 0] / elapsed[elapsed > 0]
+    return speeds
 
 
 def _window(time: Float64, position: Float64, speed: float) -> float:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import reprlib
 import sys
-from collections.abc import Sequence
-from enum import Enum
+from collections.abc import Hashable, Sequence
+from enum import Enum, EnumMeta
 from numbers import Integral, Real
 from typing import Any, TypeAlias
 
@@ -24,19 +24,33 @@ MAX_SLOWNESS = 100.0  # the time and memory of a field grow with the costliest m
 POSITIVE = math.ulp(0.0), sys.float_info.max  # the range of finite numbers above 0
 
 
-class Choice(str, Enum):
+class _ByHash(EnumMeta):
+    """Finds the member of a value. Enum compares values without a hash, as arrays, one by one."""
+
+    def __call__(cls, value: Any, *args: Any, **options: Any) -> Any:
+        if not isinstance(value, Hashable):
+            return cls._missing_(value)  # type: ignore[attr-defined]
+        return super().__call__(value, *args, **options)
+
+
+class Choice(str, Enum, metaclass=_ByHash):
     """An enum whose members can be given by value: ``MoveRule("unit")``."""
 
     @classmethod
     def _missing_(cls, value: object) -> Choice:
         known = ", ".join(member.value for member in cls)
-        raise ValueError(f"{cls.__name__} {value!r} is unknown; give one of {known}")
+        raise ValueError(f"{cls.__name__} {reprlib.repr(value)} is unknown; give one of {known}")
+
+
+def is_flag(value: Any) -> bool:
+    """Return whether a value is True or False, which Python counts as the numbers 1 and 0."""
+    return isinstance(value, (bool, np.bool_))
 
 
 def as_cell(cell: Any, name: str = "the cell") -> Cell:
     """Return a pair of whole numbers of any type (a list, an array, ...) as Python ints."""
     try:
-        if len(cell) == 2:
+        if len(cell) == 2 and not any(map(is_flag, cell)):
             x, y = int(cell[0]), int(cell[1])
             if (x, y) == (cell[0], cell[1]):
                 return x, y
@@ -73,8 +87,9 @@ def listed(values: Any, name: str, remedy: str = "give a list") -> list[Any]:
 
 def real(value: Any) -> float:
     """Return a number of any type as a float; NaN, which no range contains, for anything else."""
+    is_number = isinstance(value, Real) and not is_flag(value)
     try:
-        return float(value) if isinstance(value, Real) else math.nan
+        return float(value) if is_number else math.nan
     except OverflowError:
         return math.copysign(math.inf, value > 0 or -1)
 
@@ -83,12 +98,29 @@ def as_number(name: str, value: Any, lowest: float, highest: float, remedy: str 
     """Return a number from `lowest` to `highest` as a float."""
     if lowest <= (number := real(value)) <= highest:
         return number
-    raise ValueError(f"{name} is {value!r}; give {remedy or f'{lowest:g} to {highest:g}'}")
+    raise ValueError(f"{name} is {_short(value)}; give {remedy or f'{lowest:g} to {highest:g}'}")
+
+
+def as_whole(name: str, value: Any, lowest: int, highest: int) -> int:
+    """Return a whole number from `lowest` to `highest`, of any type, as a Python int."""
+    number = real(value)
+    if lowest <= number <= highest and number.is_integer():
+        return int(value)
+    raise ValueError(f"{name} is {_short(value)}; give a whole number, {lowest} to {highest}")
+
+
+def _short(value: Any) -> str:
+    """Return what an error shows of a value: its beginning and its end, if it is long."""
+    try:
+        text = repr(value)
+    except ValueError:  # Python writes no number of more than 4,300 digits
+        return "a number of thousands of digits"
+    return text if len(text) <= 60 else f"{text[:30]}...{text[-20:]}"
 
 
 def as_seed(seed: Any) -> int:
     """Return a whole number of any type, 0 to 2^63 - 1, as a Python int."""
-    is_whole = isinstance(seed, Integral) and not isinstance(seed, bool)
+    is_whole = isinstance(seed, Integral) and not is_flag(seed)
     if is_whole and 0 <= seed < 2**63:
         return int(seed)
     raise ValueError(f"the seed is {seed!r}; give a whole number, 0 to {2**63 - 1}")
@@ -117,6 +149,8 @@ def numbers(
         raise ValueError(f"{name}: no array ({error}); give rows of one length") from None
     if shape is not None and array.shape != shape:
         raise ValueError(f"{name} has shape {array.shape}; give {shape}")
+    if "b" not in kinds and not isinstance(values, np.ndarray):
+        _refuse_flags(name, values)
     if array.dtype.kind not in kinds:
         raise ValueError(f"{name}: the elements are of type {array.dtype}; give numbers")
     if between is None or array.dtype.kind == "b" or array.size == 0:
@@ -128,6 +162,14 @@ def numbers(
         remedy = remedy or f"{'whole numbers ' if whole else ''}{lowest:g} to {highest:g}"
         raise ValueError(f"{name} holds {array[~right].flat[0]}; give {remedy}")
     return array
+
+
+def _refuse_flags(name: str, values: ArrayLike) -> None:
+    """Refuse lists that hold True or False, which NumPy takes for 1 and 0 beside other numbers."""
+    elements = np.asarray(values, dtype=object).ravel().tolist()
+    flag = next(filter(is_flag, elements), None)
+    if flag is not None:
+        raise ValueError(f"{name} holds {flag}; give numbers")
 
 
 def as_pose(name: str, pose: Any) -> tuple[float, float, float]:

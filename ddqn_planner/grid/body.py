@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Occupancy, as_number
+from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Occupancy, as_mask, as_number
 from ddqn_planner.grid.copies import Box, cells_in, hull, wider, within
 from ddqn_planner.grid.grid_map import MAX_COST_MULTIPLIER, GridMap, check_grid
 
@@ -28,6 +28,7 @@ _COSTS = np.append(_COSTS.clip(0, OCCUPIED - 1), UNKNOWN).astype(np.int8)
 
 def clearance(obstacles: Occupancy) -> NDArray[np.float64]:
     """Return (H, W) float64: cells from each centre to the nearest obstacle's; inf without any."""
+    obstacles = as_mask("obstacles", obstacles)
     if not obstacles.any():
         return np.full(obstacles.shape, np.inf)
     import scipy.ndimage

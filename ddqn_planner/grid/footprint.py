@@ -115,8 +115,6 @@ def _is_scalar(value: Any) -> bool:
 def _around_circle(value: Any) -> Corners:
     """Return the polygon around a circle."""
     value = value[()] if isinstance(value, np.ndarray) else value
-    if isinstance(value, (bool, np.bool_)):
-        raise ValueError("True and False are no radius")
     radius = as_number("the radius", value, 1e-3, FARTHEST, f"0.001 to {FARTHEST:g} metres")
     turn = 2 * math.pi * (np.arange(CORNERS) + 0.5) / CORNERS
     around = np.column_stack([np.cos(turn), np.sin(turn)])
@@ -128,9 +126,6 @@ def _points(value: Any) -> Corners:
     points = numbers("the points", value)
     if points.ndim != 2 or points.shape[1] != 2:
         raise ValueError(f"it has shape {points.shape}, and not three or more points (x, y)")
-    is_list = not isinstance(value, np.ndarray)
-    if is_list and any(isinstance(axis, (bool, np.bool_)) for point in value for axis in point):
-        raise ValueError("True and False are no metres")
     points = points.astype(np.float64)
     if not (np.abs(points) <= FARTHEST).all():  # or NaN
         raise ValueError(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.files import as_path, read_file
-from ddqn_planner.grid.arguments import POSITIVE, Choice, as_number
+from ddqn_planner.grid.arguments import Choice, as_number, as_whole, numbers
 
 Array = NDArray[np.float64]
 
@@ -26,6 +26,15 @@ MAX_LATTICE_BYTES = 2**26  # Nav2's own files have up to 1 MB
 STRIDE = 0.4  # metres of a long step straight ahead
 BEHIND = 2.0  # what a metre counts that is not driven ahead; Nav2's reverse_penalty
 TURN = 0.5  # metres that a turn on the spot by one radian counts
+CELL_SIZES: Final = 0.001, 10.0  # metres: with finer cells a body covers too many to be learned
+MOST_CELLS: Final = 100  # of a turning radius
+FARTHEST: Final = 100.0  # metres from the begin of a lattice's primitive, and of its length
+MOST_TURNED: Final = 100.0  # radians of a yaw in a lattice
+MOST_POSES: Final = 10_000  # of a lattice's primitive
+OFF_CENTRE: Final = 0.01  # cells by which a lattice's primitive may miss the centre of a cell
+LEAST_LENGTH: Final = 0.9  # of the straight distance: a shorter trajectory_length is wrong
+LEAST_COST: Final = 1e-6
+OF_GENERATOR: Final = "give a file of Nav2's lattice generator"
 SPACING, ANGLE = 0.5, math.radians(5)  # between the poses of a primitive: at most so many cells
 
 
@@ -58,15 +67,17 @@ def turn_between(before: Any, after: Any) -> Any:
 def make_motions(motion: Motion | str, turning_radius: float, resolution: float) -> Motions:
     """Make primitives: ahead, bends, behind; turns on the spot, or sideways, where it can."""
     motion = Motion(motion)
-    cell = as_number("the resolution", resolution, *POSITIVE, "metres per cell, > 0")
-    limits = 0, math.inf, "metres, 0 or more"
-    radius = as_number("the turning radius", turning_radius, *limits) / cell
+    cell = _cell_size("the resolution", resolution)
+    metres = as_number("the turning radius", turning_radius, 0, math.inf, "metres, 0 or more")
+    radius = metres / cell
     if motion is Motion.ACKERMANN and radius < 1:
         problem = f"the turning radius is {turning_radius} m; a car cannot turn on the spot"
         raise ValueError(f"{problem}: give at least the resolution, {cell} m")
-    if radius > 100:
+    if radius > MOST_CELLS:
+        most = f"{MOST_CELLS} cells of {cell:g} m, {MOST_CELLS * cell:g} m"
         raise ValueError(
-            f"the turning radius is {radius:.0f} cells; give at most 100, or a lattice"
+            f"the turning radius is {metres:g} m; give at most {most}, or a coarser resolution, "
+            "or a lattice"
         )
     angles = np.arctan2(DIRECTIONS[:, 1], DIRECTIONS[:, 0]) % (2 * math.pi)
     found: list[tuple[int, int, Array, float]] = []
@@ -88,45 +99,117 @@ def make_motions(motion: Motion | str, turning_radius: float, resolution: float)
     return _motions(cell, angles, found)
 
 
+def _cell_size(name: str, metres: Any) -> float:
+    lowest, highest = CELL_SIZES
+    remedy = f"metres per cell, {lowest:g} to {highest:g}"
+    return as_number(name, metres, lowest, highest, remedy)
+
+
 def read_lattice(file: str | Path) -> Motions:
     """Read the motion primitives of a state lattice in Nav2's JSON format; else a ValueError."""
     file = as_path(file, "the lattice")
     try:
-        lattice = json.loads(read_file(file, MAX_LATTICE_BYTES))
-        about = lattice["lattice_metadata"]
-        cell = as_number("grid_resolution", about["grid_resolution"], *POSITIVE, "metres, > 0")
-        angles = np.array(about["heading_angles"], float)
-        if angles.shape != (HEADINGS,) or not np.isfinite(angles).all():
-            raise ValueError(f"it has {angles.size} headings; give {HEADINGS}")
-        found = []
-        for primitive in lattice["primitives"]:
-            start, end = (_heading_in(primitive, name) for name in ("start", "end"))
-            length = float(primitive["trajectory_length"]) / cell
-            poses = np.array(primitive["poses"], np.float64).reshape(-1, 3) / (cell, cell, 1)
-            poses[-1, 2] = angles[end]
-            first = np.array([0, 0, angles[start]])
-            if np.abs(poses[0] - first).max() > 1e-6:  # only old files begin with it
-                poses = np.vstack([first, poses])
-            poses[:, 2] = np.unwrap(poses[:, 2])
-            turn = float(np.abs(np.diff(poses[:, 2])).sum())
-            poses, cost = closer(poses, SPACING, SPACING / ANGLE), length or turn * TURN / cell
-            found.append((start, end, poses, cost))
-        motions = _motions(cell, angles, found)
-        misses = max(np.abs(one[-1, :2] - np.rint(one[-1, :2])).max() for one in motions.poses)
-    except (OSError, LookupError, TypeError, ValueError, RecursionError) as error:
-        reason = error if type(error) is ValueError else repr(error)
-        problem = f"{file}: cannot be read as a lattice ({reason})"
-        raise ValueError(f"{problem}; give a file of Nav2's lattice generator") from None
-    if not misses <= 0.01:
-        problem = f"a primitive ends {misses:.2g} cells off the centres of cells"
-        raise ValueError(f"{file}: {problem}; give a file of the same grid_resolution")
+        content = read_file(file, MAX_LATTICE_BYTES)
+    except OSError as error:
+        problem = f"the lattice {file}: it cannot be read ({error.strerror})"
+        raise ValueError(f"{problem}; {OF_GENERATOR}") from None
+    try:
+        return _motions_in(_json_of(content))
+    except ValueError as error:
+        raise ValueError(f"the lattice {file}: {error}") from None
+
+
+def _json_of(content: bytes) -> Any:
+    try:
+        return json.loads(content)
+    except RecursionError:
+        problem = "its brackets are nested too deeply"
+    except ValueError as error:
+        problem = f"it is no JSON ({error})"
+    raise ValueError(f"{problem}; {OF_GENERATOR}")
+
+
+def _field(owner: Any, field: str, name: str) -> Any:
+    """Return a field of a lattice; `name` says whose."""
+    if not isinstance(owner, dict) or field not in owner:
+        raise ValueError(f"{name} has no {field}; {OF_GENERATOR}")
+    return owner[field]
+
+
+def _motions_in(lattice: Any) -> Motions:
+    """Return the motion primitives of a lattice's JSON."""
+    about = _field(lattice, "lattice_metadata", "it")
+    cell = _cell_size("grid_resolution", _field(about, "grid_resolution", "lattice_metadata"))
+    if "num_of_headings" in about:  # which not every lattice has
+        as_number("num_of_headings", about["num_of_headings"], HEADINGS, HEADINGS, f"{HEADINGS}")
+    angles = _angles(_field(about, "heading_angles", "lattice_metadata"))
+    primitives = _field(lattice, "primitives", "it")
+    if not isinstance(primitives, list) or not primitives:
+        raise ValueError(f"its primitives are no list of one or more; {OF_GENERATOR}")
+    found = [
+        _primitive(f"primitive {number}", primitive, cell, angles)
+        for number, primitive in enumerate(primitives)
+    ]
+    motions = _motions(cell, angles, found)
+    for headings, verb in ((motions.start, "starts"), (motions.end, "ends")):
+        if missing := sorted(set(range(HEADINGS)) - set(headings.tolist())):
+            remedy = f"give primitives that start and end with each of the {HEADINGS}"
+            raise ValueError(f"no primitive {verb} with the headings {missing}; {remedy}")
     return motions
 
 
-def _heading_in(primitive: Any, name: str) -> int:
-    """Return the number of the heading with which a lattice's primitive starts or ends."""
-    key = f"{name}_angle_index"
-    return int(as_number(key, primitive[key], 0, HEADINGS - 1))
+def _angles(values: Any) -> Array:
+    """Return the yaws of a lattice's headings, (16,)."""
+    angles = numbers("heading_angles", values)
+    if angles.shape != (HEADINGS,):
+        raise ValueError(f"it has {angles.size} headings; give {HEADINGS}")
+    turned = -MOST_TURNED, MOST_TURNED
+    numbers("heading_angles", angles, between=turned, whole=False, remedy="finite radians")
+    return angles.astype(np.float64)
+
+
+def _primitive(
+    name: str, primitive: Any, cell: float, angles: Array
+) -> tuple[int, int, Array, float]:
+    """Return headings before and after, poses and cost of a primitive in a lattice."""
+    start, end = (
+        as_whole(f"{field} of {name}", _field(primitive, field, name), 0, HEADINGS - 1)
+        for field in ("start_angle_index", "end_angle_index")
+    )
+    field, metres = "trajectory_length", f"metres, 0 to {FARTHEST:g}"
+    length = as_number(f"{field} of {name}", _field(primitive, field, name), 0, FARTHEST, metres)
+    poses = _poses(f"the poses of {name}", _field(primitive, "poses", name)) / (cell, cell, 1)
+    poses[-1, 2] = angles[end]
+    first = np.array([0, 0, angles[start]])
+    if np.abs(poses[0] - first).max() > 1e-6:  # only old files begin with it
+        poses = np.vstack([first, poses])
+    poses[:, 2] = np.unwrap(poses[:, 2])
+    misses = np.abs(poses[-1, :2] - np.rint(poses[-1, :2])).max()
+    if misses > OFF_CENTRE:
+        problem = f"{name} ends {misses:.2g} cells off the centres of cells"
+        raise ValueError(f"{problem}; give a file of the same grid_resolution")
+    turn = float(np.abs(np.diff(poses[:, 2])).sum())
+    cost = length / cell or turn * TURN / cell
+    distance = float(np.hypot(*poses[-1, :2])) * cell
+    if length < LEAST_LENGTH * distance or cost < LEAST_COST:
+        problem = f"{field} of {name} is {length:g}, and its poses lead {distance:.3g} m far"
+        raise ValueError(f"{problem}; give the metres that it drives, or leave it out")
+    return start, end, closer(poses, SPACING, SPACING / ANGLE), cost
+
+
+def _poses(name: str, values: Any) -> Array:
+    """Return the poses of a lattice's primitive, (N, 3): metres, metres and radians."""
+    poses = numbers(name, values)
+    if poses.ndim != 2 or poses.shape[1] != 3 or not 0 < len(poses) <= MOST_POSES:
+        raise ValueError(f"{name} have shape {poses.shape}; give 1 to {MOST_POSES} of [x, y, yaw]")
+    for column, unit, most in (
+        (0, "metres", FARTHEST),
+        (1, "metres", FARTHEST),
+        (2, "radians", MOST_TURNED),
+    ):
+        remedy = f"{unit}, {-most:g} to {most:g}"
+        numbers(name, poses[:, column], between=(-most, most), whole=False, remedy=remedy)
+    return poses.astype(np.float64)
 
 
 def closer(poses: Array, spacing: float, lever: float) -> Array:

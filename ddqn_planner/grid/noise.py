@@ -8,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid.arguments import UNKNOWN, Cell, Occupancy
-from ddqn_planner.grid.grid_map import GridMap
+from ddqn_planner.grid.arguments import UNKNOWN, Cell, Occupancy, as_cell, as_whole, listed
+from ddqn_planner.grid.grid_map import GridMap, check_grid
 from ddqn_planner.grid.moves import MoveRule
 
 MAX_NEW_OBSTACLES = 5  # the paper adds 1 to 5
 MAX_TRIES = 1000
+MAX_REACH = 1000
 
 
 def scatter_obstacles(
@@ -24,12 +25,18 @@ def scatter_obstacles(
     reach: int = 1,  # cells beside the path: section 5.3 can be read as 0 or 1
 ) -> tuple[GridMap, int]:
     """Return the map with 1 to 5 obstacles more, which leave a path, and the rejected draws."""
+    check_grid(grid)
+    path = [as_cell(cell) for cell in listed(path, "the path", "give cells (x, y)")]
+    if not path:
+        raise ValueError("the path has no cells; give one of two or more")
+    move_rule, reach = MoveRule(move_rule), as_whole("reach", reach, 0, MAX_REACH)
     start, goal, offsets = path[0], path[-1], range(-reach, reach + 1)
     near = {(x + dx, y + dy) for x, y in path for dx in offsets for dy in offsets}
     candidates = sorted(cell for cell in near - {start, goal} if grid.is_free(cell))
     if not candidates:
         where = f"within {reach} cells of" if reach else "on"
-        raise ValueError(f"no free cell lies {where} the path from {start} to {goal}")
+        problem = f"no free cell lies {where} the path from {start} to {goal}"
+        raise ValueError(f"{problem}; give another path, or a greater reach")
     for rejected in range(MAX_TRIES):
         count = min(int(random.integers(1, MAX_NEW_OBSTACLES + 1)), len(candidates))
         occupancy = grid.occupancy.copy()

@@ -139,13 +139,17 @@ class Driving:
         if place is None or folder is None:
             return
         try:
-            folder.add(drive, place.grid)
+            learned = folder.add(drive, place.grid)
         except Exception as error:  # the node must survive
             self._node.fail("a drive taught nothing", error)
             return
         last = f"{folder.drives}{by_robot}: {drive.metres:.1f} m, {drive.outcome.value}"
+        if learned:
+            self._node.get_logger().info(f"drive {last}")
+        else:
+            last = f"{last}; it taught nothing: {learned.reason}"
+            self._node.get_logger().warning(f"drive {last}")
         self._values["last drive"] = last
-        self._node.get_logger().info(f"drive {last}")
         self._node.draw(place.frame, drive.positions)
 
     def _tell_saved(self, folder: DriveFolder) -> None:

@@ -19,6 +19,7 @@ from rclpy.timer import Timer
 from std_msgs.msg import Float32, Header, String, UInt8MultiArray
 
 from ddqn_planner.experience import Experience
+from ddqn_planner.experience.experience import SPEEDS, WIDTHS
 from ddqn_planner.files import as_path
 from ddqn_planner.grid import Cell, MoveRule, read_map_file
 from ddqn_planner.nodes import conversions, runtime
@@ -64,8 +65,8 @@ PARAMETERS: Final = {
     "robots": Declared(
         [""], "Driving: namespaces of robots; []: its own", NAMESPACES, read_only=True
     ),
-    "nominal_speed": Declared(0.5, "Driving: m/s where nothing slows it down", (0.01, 100.0)),
-    "robot_width": Declared(0.5, "Driving: metres; places are squares of half of it", (0.05, 10.0)),
+    "nominal_speed": Declared(0.5, "Driving: m/s where nothing slows it down", SPEEDS),
+    "robot_width": Declared(0.5, "Driving: metres; places are squares of half of it", WIDTHS),
     "experience": Declared("", "Driving: older experience with which a new folder begins"),
     **HYPER_PARAMETERS,
 }

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import GridMap, MoveRule
-from ddqn_planner.grid.arguments import as_seed
+from ddqn_planner.grid.arguments import as_seed, as_whole
 from ddqn_planner.grid.footprint import read_footprint
-from ddqn_planner.grid.motions import HEADINGS, make_motions, read_lattice
+from ddqn_planner.grid.motions import HEADINGS, Motion, make_motions, read_lattice
 from ddqn_planner.model import ModelMetadata, RobotNetwork, package_version
 from ddqn_planner.model.robot import BodyCertificate
 from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions, double_dqn_gradient
@@ -41,6 +41,7 @@ PER_UNIT: Final = ("batch_size", "learning_starts", "environments")
 SHRINKS: Final = 3e-5  # what each weight loses per update: an obstacle is harmless unless seen
 CAREFUL: Final = 0.1  # of a step is what a threshold moves
 CHECKED: Final = 100  # updates between two proofs
+MOST_STEPS: Final = 10**12
 MARGIN: Final = 0.02  # of the proof, with which the training ends
 
 
@@ -62,7 +63,9 @@ class RobotTrainer:
         elif lattice is not None and motion is None:
             motions = read_lattice(lattice)
         else:
-            raise ValueError(f"motion is {motion}, lattice is {lattice}; give one of the two")
+            count = "neither motion nor lattice is" if motion is None else "motion and lattice are"
+            remedy = f"give one of the two: motion {', '.join(Motion)}, or lattice FILE"
+            raise ValueError(f"{count} given; {remedy}")
         self.network = RobotNetwork.untrained(read_footprint(footprint, padding), motions)
         self.seed = seed = as_seed(seed)
         tensors, units = self.network.tensors, self.network.sizes["units"]
@@ -109,13 +112,19 @@ class RobotTrainer:
             self._place[quarter][np.ix_(near, near)] = np.rot90(seen, -quarter)
 
     def run(self, until: int) -> Iterator[BodyCertificate]:
-        """Train until all is proved, or so many steps are done; yield what is proved so far."""
+        """Train until all is proved, or so many steps are done; yield what is proved so far.
+
+        A step is one transition of one robot.
+        """
+        until = as_whole("the number of steps", until, 1, MOST_STEPS)
         self._settle()
         certificate = self.network.certificate()
         yield certificate
         while certificate.margin < MARGIN and self.steps < until:
             for _ in range(CHECKED):
-                self._step()
+                if self.steps >= until:
+                    break
+                self._step(min(self.parameters.environments, until - self.steps))
                 if self.steps >= self.parameters.learning_starts:
                     self._update()
             weight = self.network.tensors["weight"]
@@ -131,14 +140,14 @@ class RobotTrainer:
         of_training = GridMap(occupancy).fingerprint, self.steps, self.seed, package_version()
         return ModelMetadata(self.network.name, sizes, MoveRule.ROBOT_SAFE, p.gamma, *of_training)
 
-    def _step(self) -> None:
-        """Let each robot try a random primitive, and remember what came of it."""
+    def _step(self, robots: int) -> None:
+        """Let so many robots try a random primitive, and remember what came of it."""
         p, maps = self.parameters, len(self.goal_M)
-        scenario = self._initial.integers(maps, size=p.environments)
-        count = np.full(p.environments, len(self._first) // maps)
+        scenario = self._initial.integers(maps, size=robots)
+        count = np.full(robots, len(self._first) // maps)
         places = self._first, scenario * count, count
         cell = initial_cells(self.goal_M[scenario], *places, p.p_r, self._initial)
-        actions = self._exploration.integers(len(self.primitive_KN), size=p.environments)
+        actions = self._exploration.integers(len(self.primitive_KN), size=robots)
         unit_BK, place_B = self._observed(scenario, cell)
         legal = ~self._swept[unit_BK[np.arange(len(cell)), actions], place_B]
         next_cell = np.where(legal, self.next_KC[actions, cell], cell)
@@ -147,7 +156,7 @@ class RobotTrainer:
         goes_on = legal & (next_cell != self.goal_M[scenario])
         discount = np.where(goes_on, p.gamma, 0.0).astype(np.float32)
         self._replay.add(Transitions(scenario, cell, actions, reward, next_cell, discount))
-        self.steps += p.environments
+        self.steps += robots
 
     def _update(self) -> None:
         """Make one Double DQN update with a batch from the replay buffer."""

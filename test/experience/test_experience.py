@@ -210,9 +210,9 @@ def test_the_cost_of_a_plan_is_its_expected_time_and_no_path_is_faster(seed: int
 
 
 @pytest.mark.parametrize("name", ["nominal_speed", "robot_width", "half_life", "max_pause"])
-@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf, 1e300, 1e-300, True])
 def test_a_wrong_option_is_named(name: str, value: float) -> None:
-    with pytest.raises(ValueError, match=name):
+    with pytest.raises(ValueError, match=f"{name} is .*; give (metres|seconds)"):
         Experience(**{"nominal_speed": SPEED, name: value})
     with pytest.raises(ValueError, match="position"):
         Experience(SPEED).record_failure((value or math.nan, math.inf))
@@ -369,6 +369,9 @@ TIMES = np.linspace(0, 20, 41)
         (TIMES[::-1], LINE, "40 times are earlier than those before; sort them"),
         (TIMES * 100, LINE, "the times are up to 50 s apart; give at most"),
         (TIMES / 1000, LINE, r"the robot moves at 500 m/s; give metres"),
+        (TIMES, LINE * 60, r"at 30 m/s; give metres and seconds, or a nominal_speed greater than"),
+        (TIMES, LINE * 1000, "the robot moves at 500 m/s; give metres"),
+        (np.arange(410) * 20, np.c_[np.arange(410) / 100, np.zeros(410)], "at most at 0.0005 m/s"),
         (TIMES, LINE * 0.001, "no farther than 0.01 m; give a longer drive"),
     ],
 )
@@ -379,6 +382,16 @@ def test_a_drive_that_teaches_nothing_says_why(seconds: Any, positions: Any, rea
     assert not learned
     assert re.search(reason, learned.reason), learned
     assert experience.to_bytes() == before
+
+
+def test_a_robot_may_drive_ten_times_as_fast_as_its_nominal_speed() -> None:
+    experience = Experience(nominal_speed=0.5)
+    assert not experience.record(TIMES, LINE * 10.2)
+    assert experience.learned_speed == 0.5
+    for _ in range(2):  # also after a fast drive
+        assert experience.record(TIMES, LINE * 9.8)
+        assert experience.learned_speed == pytest.approx(4.9)
+        assert not experience.record(TIMES, LINE * 10.2)
 
 
 def test_a_drive_says_how_much_it_taught() -> None:

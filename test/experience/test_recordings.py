@@ -295,3 +295,35 @@ def test_a_recording_of_hours_has_a_drive_for_each_way(tmp_path: Path) -> None:
     _, drives = read_recording(tmp_path / "drive.csv", GRID)
     assert [drive.outcome.value for drive in drives] == ["paused", "paused"]
     assert [round(drive.metres) for drive in drives] == [10, 10]
+
+
+@pytest.mark.parametrize("outcome", [DriveEnd.ARRIVED, DriveEnd.ABORTED])
+def test_a_drive_too_fast_is_kept_and_teaches_nothing(tmp_path: Path, outcome: DriveEnd) -> None:
+    folder = DriveFolder(tmp_path / "drives", 0.5, 0.5)
+    before = folder.experience.to_bytes()
+    seconds = np.arange(0, 20, 0.1)
+    positions = np.column_stack([500 * seconds, 0 * seconds])  # millimetres
+    learned = folder.add(Drive(outcome, seconds, positions), GRID)
+    assert not learned
+    assert "at 500 m/s; give metres and seconds" in learned.reason
+    assert folder.experience.to_bytes() == before
+    folder.close()
+    assert folder.drives == 1
+
+
+def test_drives_that_teach_nothing_leave_the_older_experience(
+    tmp_path: Path, map_file: Path, console: Any
+) -> None:
+    slow, fast = tmp_path / "slow.csv", tmp_path / "fast.csv"
+    rows = [(t / 10, 5 + t / 60, 5.0) for t in range(600)]
+    for file, factor in ((slow, 1.0), (fast, 0.001)):
+        lines = [f"{t * factor},{x},{y}" for t, x, y in rows]
+        file.write_text("\n".join(["seconds,x,y", *lines]))
+    learn = "learn --map", map_file, "--out", tmp_path / "e.npz"
+    console(*learn, slow)
+    before = (tmp_path / "e.npz").read_bytes()
+    said = console(*learn, fast, status=2).err
+    assert "no drive taught anything" in said
+    assert re.search(r"moves at 1\d\d m/s; give metres and seconds", said)
+    assert (tmp_path / "e.npz").read_bytes() == before
+    assert "drive 2 taught nothing" in console(*learn, slow, fast).out

@@ -4,6 +4,8 @@ import json
 import math
 import os
 import pickle
+import re
+import reprlib
 from dataclasses import fields
 from fractions import Fraction
 from typing import Any
@@ -48,7 +50,7 @@ def test_a_cell_owns_its_lower_edges_and_the_origin_turns_the_map_counter_clockw
 
 @pytest.mark.parametrize(
     "cell",
-    [(2, 1), [2, 1], np.array([2, 1]), (np.int64(2), np.uint8(1)), (2.0, 1), (Fraction(2), True)],
+    [(2, 1), [2, 1], np.array([2, 1]), (np.int64(2), np.uint8(1)), (2.0, 1), (Fraction(2), 1.0)],
 )
 def test_a_cell_is_any_pair_of_whole_numbers(cell: Any) -> None:
     assert json.dumps(as_cell(cell)) == "[2, 1]"
@@ -56,8 +58,10 @@ def test_a_cell_is_any_pair_of_whole_numbers(cell: Any) -> None:
         grid = GridMap(ZEROS).with_patch([[occupied]], 2, 1)
         assert grid.contains(cell)
         assert (grid.is_free(cell), grid.is_obstacle(cell)) == (not occupied, occupied)
-    with pytest.raises(ValueError, match=r"the cell is \(0, None\); give two whole numbers"):
-        grid.contains((0, None))
+    for wrong in ((0, None), (0, True), [np.True_, 0]):
+        said = re.escape(f"the cell is {reprlib.repr(wrong)}; give two whole numbers")
+        with pytest.raises(ValueError, match=said):
+            grid.contains(wrong)
 
 
 MALFORMED: list[tuple[str, list[Any], str]] = [
@@ -119,7 +123,7 @@ def test_a_wrong_occupancy_value_is_named() -> None:
     for values, threshold, named in (
         *(([[0, wrong]], 65, f"holds {wrong}") for wrong in (65536, 128, -129, 0.4)),
         ([[0.0, 1.0]], 65, "of type float64; give integers, percent"),
-        ([[True, False]], 65, "of type bool"),
+        ([[True, False]], 65, "holds True; give numbers"),
         ([[0, 1], [0]], 65, "no array"),
         *(([[0, 1]], n, f"occupied_threshold is {n}; give 1 to 100") for n in (0, 101, math.nan)),
     ):
@@ -409,3 +413,10 @@ def test_changes_that_lie_apart_have_small_boxes() -> None:
     assert sum(cells_in(box) for box in boxes_of(is_set)) == 12 + 4 + 2
     is_set[::50, ::50] = True
     assert boxes_of(is_set) == [(slice(0, 151), slice(0, 251))]
+
+
+@pytest.mark.parametrize("wrong", [np.array([1, 2]), np.array(["unit"]), ["unit"], {}, None])
+def test_what_is_no_choice_is_named_whatever_its_kind(wrong: Any) -> None:
+    with pytest.raises(ValueError, match=r"(?s)MoveRule .* is unknown; give one of robot_safe"):
+        MoveRule(wrong)
+    assert MoveRule(np.str_("unit")) is copy.deepcopy(MoveRule.UNIT) is MoveRule.UNIT

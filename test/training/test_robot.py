@@ -66,7 +66,7 @@ def test_a_robot_bumps_where_its_body_touches_an_obstacle() -> None:
     swept = trainer.network.of_primitives(trainer.network.swept_by_unit)
     reach, collisions = swept.shape[1] // 2, 0
     for _ in range(20):
-        trainer._step()
+        trainer._step(trainer.parameters.environments)
     made = (values[: trainer.steps] for values in trainer._replay.transitions)
     for number, cell, action, reward, after, discount in zip(*made, strict=True):
         (y, x), heading = divmod(cell // 16, width), cell % 16
@@ -91,16 +91,31 @@ def test_a_robot_bumps_where_its_body_touches_an_obstacle() -> None:
 WRONG = {
     "--motion differential --resolution nan": "resolution is nan",
     "--motion differential --lattice x.json": "one of the two",
-    "": "one of the two",
-    "--lattice none.json": "none.json",
+    "": "neither motion nor lattice is given; give one of the two: motion differential",
+    "--lattice none.json": "none.json: it cannot be read (No such file or directory); give a file",
     "--motion differential --padding -0.1": "padding is -0.1",
-    "--motion differential --steps 0": "give more --steps",
+    "--motion differential --steps 0": "--steps is 0; give a whole number, 1 to",
+    "--motion differential --steps -5": "--steps is -5; give a whole number, 1 to",
+    "--motion differential --resolution 1e-9": "resolution is 1e-09; give metres per cell, 0.001",
+    "--motion differential --resolution 1e6": "resolution is 1000000.0; give metres per cell",
+    "--motion differential --turning-radius 1e300": "radius is 1e+300 m; give at most 100 cells",
+    "--motion differential --padding 1e300": "padding is 1e+300; give 0 to 10 metres",
 }
 
 
 @pytest.mark.parametrize("options", WRONG)
 def test_what_is_no_robot_is_refused(console: Any, tmp_path: Path, options: str) -> None:
     given = "--out", tmp_path / "robot.safetensors", *options.split()
-    status = 1 if "steps" in options else 2
-    assert WRONG[options] in console("train-robot --footprint 0.2", *given, status=status).err
+    assert WRONG[options] in console("train-robot --footprint 0.2", *given, status=2).err
     assert not any(tmp_path.iterdir())
+
+
+def test_a_training_makes_as_many_transitions_as_it_may() -> None:
+    trainer = RobotTrainer(*TINY, 0)
+    for steps in (1000, 1001):
+        for _ in trainer.run(steps):
+            pass
+        assert trainer.steps == len(trainer._replay) == steps
+    for wrong in (0, -5, 0.5, True, 1e300, None):
+        with pytest.raises(ValueError, match=r"number of steps is .* give a whole number, 1 to"):
+            next(trainer.run(wrong))  # type: ignore[arg-type]
