@@ -34,11 +34,6 @@ class Rows:
         self.grid, self.first, self.end = grid, first, end
         self.lock = threading.Lock()
 
-    def on(self, grid: GridMap) -> Rows:
-        """Return the same rows as read of another map."""
-        with self.lock:
-            return Rows(grid, self.first, self.end)
-
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy has: it reads anew, under a lock of its own."""
         return {"grid": self.grid}
@@ -84,13 +79,11 @@ class MoveCosts(NamedTuple):
         if grid.forbidden is not None:  # its patches are others
             return None
         after, shape = self, grid.occupancy.shape
-        # Before the first copy: it has what was read until then. And so are the rows counted then,
-        # as another thread may read more meanwhile.
-        for box in boxes:
-            rows, _ = wider(box, 1, shape)
-            self.read(rows.start, rows.stop)
+        # A map that changes is read as a whole, once: its fields are repaired, and each repair
+        # may look at cells anywhere.
         if self.rows is not None:
-            after = after._replace(rows=self.rows.on(grid))
+            self.read(0, self.rows.grid.height)
+            after = after._replace(rows=None)
         for box in boxes:
             # The patches of the cells around see the box, too.
             around, seen = (wider(box, by, shape) for by in (1, 2))

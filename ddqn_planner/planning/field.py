@@ -206,13 +206,7 @@ class DistanceField(QField):
         most = max(REPAIRED, int(REPAIRED_SHARE * self.grid.occupancy.size))
         limit = most if start is None else REPAIRED
         with old._lock:
-            if old.costs.rows is not None:
-                # It knows cells of these rows alone: what changed elsewhere supports none.
-                first, end = old.costs.rows.first, old.costs.rows.end
-                changed = changed[(changed // width > first) & (changed // width <= end)]
-                self.costs.read(first, end)
-            else:
-                self.costs.read(0, self.grid.height)
+            self.costs.read(0, self.grid.height)
             taken = old._take()
             while (repaired := kernels.take_back(taken, self.costs, changed, limit)) is None:
                 limit *= 4

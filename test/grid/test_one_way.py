@@ -84,7 +84,7 @@ def test_maps_that_are_turned_have_no_common_directions() -> None:
     assert forbidden_on(whole_turn, GridMap(free)) is None
 
 
-@pytest.mark.parametrize("x", [1e30, -1e30, 1e308, -1e308])
+@pytest.mark.parametrize("x", [1e9, -1e9])
 def test_maps_far_apart_have_no_zones(x: float) -> None:
     zones = zones_of(np.full((3, 3), EAST, dtype=np.uint8), 1e-3)
     assert forbidden_on(GridMap(np.zeros((3, 3), np.bool_), 1e-3, (x, 0.0, 0.0)), zones) is None
