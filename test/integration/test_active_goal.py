@@ -85,7 +85,7 @@ def test_a_shortcut_that_opens_is_taken(robot: Robot) -> None:
     robot.plans.wait(lambda plan: len(plan.poses) == 30)
     # A map far away has nothing of the path.
     robot.clear()
-    far = robot.grid_of(robot.values, (1e12, 0.0, 0.0))
+    far = robot.grid_of(robot.values, (1e11, 0.0, 0.0))
     robot.send_map(map_message(robot.values, far, next(NUMBERS)))
     robot.wait_for_reason("the start lies outside the map")
     assert robot.plans.wait().poses == []
