@@ -420,3 +420,24 @@ def test_what_is_no_choice_is_named_whatever_its_kind(wrong: Any) -> None:
     with pytest.raises(ValueError, match=r"(?s)MoveRule .* is unknown; give one of robot_safe"):
         MoveRule(wrong)
     assert MoveRule(np.str_("unit")) is copy.deepcopy(MoveRule.UNIT) is MoveRule.UNIT
+
+
+@pytest.mark.parametrize("layer", ["occupancy", "cost", "forbidden", "slowness", "uphill"])
+@pytest.mark.parametrize("row", range(20))
+def test_maps_that_differ_in_one_cell_are_not_the_same(layer: str, row: int) -> None:
+    ones = np.ones((20, 3), np.uint8)
+    layers = {"cost": ones, "forbidden": ones, "slowness": ones, "uphill": ones}
+    grid = GridMap(np.zeros((20, 3), np.bool_), **layers)
+    changed = grid.occupancy.copy() if layer == "occupancy" else layers[layer].copy()
+    changed[row, 1] = 1 - changed[row, 1] if layer == "occupancy" else 2
+    other = GridMap(**{"occupancy": grid.occupancy, **layers, layer: changed})
+    assert not grid.same_cells(other)
+    assert np.argwhere(grid.differs(other, np.s_[:, :])).tolist() == [[row, 1]]
+
+
+def test_a_map_with_two_patches_is_the_same_only_if_both_change_nothing() -> None:
+    grid = GridMap(np.zeros((9, 9), np.bool_))
+    for x, y in ((1, 1), (7, 7)):
+        closed = grid.with_patch([[True]], x, y)
+        assert not closed.with_patch([[False]], 8 - x, 8 - y).same_cells(grid)
+        assert closed.with_patch([[False]], x, y).same_cells(grid)
