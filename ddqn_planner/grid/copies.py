@@ -28,7 +28,9 @@ class _File(list["_Pages"]):
 
     def __init__(self, array: NDArray[Any]) -> None:
         super().__init__()
-        self.io, self.shape = os.fdopen(os.memfd_create("array"), "r+b", buffering=0), array.shape
+        self.shape = array.shape
+        self.io = os.fdopen(os.memfd_create("array"), "r+b", buffering=0)
+        finalize(self, self.io.close)  # Python warns of files that are left to be closed
         array.tofile(self.io)
 
 
