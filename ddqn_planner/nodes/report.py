@@ -96,8 +96,8 @@ def reason_of(
             remedy = remedy.replace("on a free cell", "where the robot's body has room")
         to = f"goal: {_place(goal, goals[0])}"
         if len(goals) > 1:
-            each = status if is_unknown else plan.reason
-            status = f"no path to any of {len(goals)} goals: {each}"
+            why_not = status if is_unknown else plan.reason
+            status = f"no path to any of {len(goals)} goals: {why_not}"
             remedy = remedy.removesuffix(TOLERANCE)
             to = f"goals: cells {', '.join(map(str, goals[:5]))}{', ...' * (len(goals) > 5)}"
         of_map = f"map: {grid.width} x {grid.height} cells"

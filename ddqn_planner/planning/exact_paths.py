@@ -126,15 +126,21 @@ def _touches_none(
 ) -> bool:
     """Return whether no cell is in the way of a piece, see `_is_clear`."""
     height, width = occupancy.shape
-    column, row = math.floor(x + 0.5), math.floor(y + 0.5)
-    to_column, to_row = math.floor(to_x + 0.5), math.floor(to_y + 0.5)
-    dx, dy = to_x - x, to_y - y
-    step_x, step_y = (dx > MARGIN) - (dx < -MARGIN), (dy > MARGIN) - (dy < -MARGIN)
+    column = math.floor(x + 0.5)
+    row = math.floor(y + 0.5)
+    to_column = math.floor(to_x + 0.5)
+    to_row = math.floor(to_y + 0.5)
+    dx = to_x - x
+    dy = to_y - y
+    step_x = (dx > MARGIN) - (dx < -MARGIN)
+    step_y = (dy > MARGIN) - (dy < -MARGIN)
     # It lies between a diagonal move and one along its longer axis.
     actions = BITS[step_y + 1, step_x + 1]
     actions |= BITS[step_y * (abs(dy) >= abs(dx)) + 1, step_x * (abs(dx) >= abs(dy)) + 1]
-    left, right = min(x, to_x), max(x, to_x)
-    bottom, top = min(y, to_y), max(y, to_y)
+    left = min(x, to_x)
+    right = max(x, to_x)
+    bottom = min(y, to_y)
+    top = max(y, to_y)
     slope = dy / dx if step_x != 0 else 0.0
     for at_x in range(math.floor(left + 0.5 - MARGIN), math.floor(right + 0.5 + MARGIN) + 1):
         # The part of the piece within this column, from one edge to the other.

@@ -206,6 +206,7 @@ class DistanceField(QField):
         most = max(REPAIRED, int(REPAIRED_SHARE * self.grid.occupancy.size))
         limit = most if start is None else REPAIRED
         with old._lock:
+            # A repair may look at cells anywhere, also where the older field has read no rows.
             self.costs.read(0, self.grid.height)
             taken = old._take()
             while (repaired := kernels.take_back(taken, self.costs, changed, limit)) is None:
