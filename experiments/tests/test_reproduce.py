@@ -140,6 +140,7 @@ def test_the_optimal_value_is_what_the_best_policy_earns(small: Scenario, alpha:
     for x, y in small.grid.free_cells():
         returns = []
         for action in range(len(MOVES)):
+            environment.reset()
             environment.cell = np.array([y * 5 + x])
             reward, terminated, _ = environment.move(np.array([action]))
             onward = 0.0 if terminated[0] else parameters.gamma * value[environment.cell[0]]
