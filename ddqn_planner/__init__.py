@@ -6,7 +6,14 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ddqn_planner.experience import Experience
     from ddqn_planner.grid import GridMap, MoveRule, inflate, load_map
-    from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanStatus, QField, simplify
+    from ddqn_planner.planning import (
+        Plan,
+        PlanMethod,
+        Planner,
+        PlanStatus,
+        QField,
+        simplify,
+    )
 
 __all__ = [
     "Experience",

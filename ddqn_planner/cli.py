@@ -63,13 +63,43 @@ def plan(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
         parser,
         ("model", str, "any_map", "name or file; that of train-robot has a body"),
         ("mode", modes, "greedy", "astar_fallback: search if steps get stuck"),
-        ("occupied-threshold", int, 65, "a cell of this value or more is occupied, percent"),
+        (
+            "occupied-threshold",
+            int,
+            65,
+            "a cell of this value or more is occupied, percent",
+        ),
         ("allow-unknown", bool, False, "treat unknown cells as free"),
-        ("use-map-costs", bool, False, "free cells cost by their values, unknown ones most"),
-        ("robot-radius", float, 0.0, "distance that the path keeps from obstacles, metres"),
-        ("clearance-weight", float, 0.0, "how strongly to avoid cells near obstacles, 0 to 1"),
-        ("tolerance", float, 0.0, "how far a goal that is occupied or cut off may move, metres"),
-        ("start-clearing-radius", float, 0.0, "obstacles so near to a start do not count, metres"),
+        (
+            "use-map-costs",
+            bool,
+            False,
+            "free cells cost by their values, unknown ones most",
+        ),
+        (
+            "robot-radius",
+            float,
+            0.0,
+            "distance that the path keeps from obstacles, metres",
+        ),
+        (
+            "clearance-weight",
+            float,
+            0.0,
+            "how strongly to avoid cells near obstacles, 0 to 1",
+        ),
+        (
+            "tolerance",
+            float,
+            0.0,
+            "how far a goal that is occupied or cut off may move, metres",
+        ),
+        (
+            "start-clearing-radius",
+            float,
+            0.0,
+            "obstacles so near to a start do not count, metres",
+        ),
         ("yaw-tolerance", float, 0.0, "body: how far such a goal may turn, radians"),
         ("bound", float, 1.0, "body: how many times the least cost a path may have"),
         ("cells", bool, False, "print each cell of the path, as X Y"),
@@ -88,21 +118,33 @@ def plan(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
         picture_format(options.picture, "--picture")
     map_file, start, goal = _read_map(options)
     outputs = {"--csv": options.csv, "--picture": options.picture}
-    check_distinct(outputs, {"--model": find_model(options.model), **_files_of(map_file)})
+    check_distinct(
+        outputs, {"--model": find_model(options.model), **_files_of(map_file)}
+    )
     planner = api.Planner.load(options.model)
     has_body = planner.pose_planner is not None
     others, kind = (OF_CELLS, "without") if has_body else (OF_BODIES, "with")
     given = parser.parse_args(arguments, argparse.Namespace(**dict.fromkeys(others)))
     if wrong := [name for name in others if getattr(given, name) is not None]:
         problem = f"--{wrong[0].replace('_', '-')} is for models {kind} a body, unlike "
-        raise ValueError(f"{problem}{options.model}; leave it out, or give another --model")
-    grid = map_file.grid(options.occupied_threshold, options.allow_unknown, options.use_map_costs)
+        raise ValueError(
+            f"{problem}{options.model}; leave it out, or give another --model"
+        )
+    grid = map_file.grid(
+        options.occupied_threshold, options.allow_unknown, options.use_map_costs
+    )
     grid = api.inflate(grid, options.robot_radius, options.clearance_weight)
-    next(warm_up(planner))  # so that the time leaves out how long compiled code takes to load
-    return (_plan_poses if has_body else _plan_cells)(options, planner, grid, start, goal)
+    next(
+        warm_up(planner)
+    )  # so that the time leaves out how long compiled code takes to load
+    return (_plan_poses if has_body else _plan_cells)(
+        options, planner, grid, start, goal
+    )
 
 
-def _plan_cells(options: Any, planner: api.Planner, grid: GridMap, start: Cell, goal: Cell) -> int:
+def _plan_cells(
+    options: Any, planner: api.Planner, grid: GridMap, start: Cell, goal: Cell
+) -> int:
     import numpy as np
 
     from ddqn_planner.grid import path_length
@@ -111,15 +153,23 @@ def _plan_cells(options: Any, planner: api.Planner, grid: GridMap, start: Cell, 
 
     metres = 0, np.inf, "metres, 0 or more"
     tolerance = as_number("--tolerance", options.tolerance, *metres)
-    radius = as_number("--start-clearing-radius", options.start_clearing_radius, *metres)
+    radius = as_number(
+        "--start-clearing-radius", options.start_clearing_radius, *metres
+    )
     asked = options.move_rule, options.mode, tolerance / grid.resolution
     radius /= grid.resolution
     plan = planner.plan(grid, start, goal, *asked, start_clearing_radius=radius)
     rule, optimum, value = plan.move_rule, None, None
     if plan.cells and grid.is_free(plan.cells[0]):
         no_costs = api.GridMap(grid.occupancy, forbidden=grid.forbidden)
-        optimum = path_length(search(plan.cells[0], plan.cells[-1], no_costs, rule), rule)
-    if options.picture and plan.cells and planner.network.supports((grid.height, grid.width)):
+        optimum = path_length(
+            search(plan.cells[0], plan.cells[-1], no_costs, rule), rule
+        )
+    if (
+        options.picture
+        and plan.cells
+        and planner.network.supports((grid.height, grid.width))
+    ):
         value = planner.q_field(grid, plan.cells[-1], rule).value
     lines = [f"{x} {y}" for x, y in plan.cells if options.cells]
     if plan.cells:
@@ -128,7 +178,11 @@ def _plan_cells(options: Any, planner: api.Planner, grid: GridMap, start: Cell, 
         known = "" if optimum is None else f"optimum {optimum:.2f} under {rule.value}, "
         known += "" if plan.cost is None else f"cost {plan.cost:.2f}, "
         lines.append(f"length {plan.length:.2f} cells, {known}{plan.method.value}")
-    answer: Any = {"cells": plan.cells, "method": plan.method.value, "length": plan.length}
+    answer: Any = {
+        "cells": plan.cells,
+        "method": plan.method.value,
+        "length": plan.length,
+    }
     answer |= {"optimum": optimum, "move_rule": rule.value}
     rows = [(*cell, *np.round(grid.cell_to_world(cell), 6)) for cell in plan.cells]
     table = ("x", "y", "x_metres", "y_metres"), rows
@@ -136,7 +190,9 @@ def _plan_cells(options: Any, planner: api.Planner, grid: GridMap, start: Cell, 
     return _show(options, grid, plan, answer, lines, table, title=title, value=value)
 
 
-def _plan_poses(options: Any, planner: api.Planner, grid: GridMap, start: Cell, goal: Cell) -> int:
+def _plan_poses(
+    options: Any, planner: api.Planner, grid: GridMap, start: Cell, goal: Cell
+) -> int:
     import numpy as np
 
     from ddqn_planner.planning.pose_paths import in_cells
@@ -155,11 +211,26 @@ def _plan_poses(options: Any, planner: api.Planner, grid: GridMap, start: Cell, 
     footprint = planner.pose_planner.footprint / grid.resolution
     body = footprint, in_cells(plan.poses, grid), in_cells(ends, grid)
     table = ("x", "y", "yaw"), np.round(plan.poses, 6).tolist()
-    return _show(options, grid, plan, answer, [f"{title}, {known}"], table, title=title, body=body)
+    return _show(
+        options,
+        grid,
+        plan,
+        answer,
+        [f"{title}, {known}"],
+        table,
+        title=title,
+        body=body,
+    )
 
 
 def _show(
-    options: Any, grid: GridMap, plan: Any, answer: Any, lines: list[str], table: Any, **drawn: Any
+    options: Any,
+    grid: GridMap,
+    plan: Any,
+    answer: Any,
+    lines: list[str],
+    table: Any,
+    **drawn: Any,
 ) -> int:
     """Print JSON, or a map and lines, or why there is no path; write and draw what is asked for."""
     from ddqn_planner.pictures import MAX_TEXT_WIDTH, draw_text, save_picture
@@ -174,7 +245,9 @@ def _show(
         print(*lines, sep="\n", end=f", planned in {ms:.1f} ms\n")
     else:
         is_plain = plan.reason == plan.status.value
-        hint = " for the body; --picture shows it" if "body" in drawn and is_plain else ""
+        hint = (
+            " for the body; --picture shows it" if "body" in drawn and is_plain else ""
+        )
         print(f"no path: {plan.reason}{hint}", file=sys.stderr)
     if options.csv:
         write_csv(options.csv, *table)
@@ -191,12 +264,16 @@ def file_of(argument: str) -> Path:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
-def _add_options(parser: argparse.ArgumentParser, *options: tuple[str, Any, Any, str]) -> None:
+def _add_options(
+    parser: argparse.ArgumentParser, *options: tuple[str, Any, Any, str]
+) -> None:
     """Add options of a name, a type or choices, a default and words; a flag's type is bool."""
     for name, kind, default, words in options:
         if kind is Path:
             kind = file_of
-        how = {"action": "store_true"} if kind is bool else {"type": kind, "metavar": "X"}
+        how = (
+            {"action": "store_true"} if kind is bool else {"type": kind, "metavar": "X"}
+        )
         how = {"choices": kind} if isinstance(kind, Sequence) else how
         if kind is not bool and default not in (None, ""):
             words += " (default: %(default)s)"
@@ -204,12 +281,20 @@ def _add_options(parser: argparse.ArgumentParser, *options: tuple[str, Any, Any,
 
 
 def _add_map_options(parser: argparse.ArgumentParser, move_rule: str | None) -> None:
-    parser.add_argument("map", help="ROS map YAML, MovingAI .map, or name of a shipped map")
+    parser.add_argument(
+        "map", help="ROS map YAML, MovingAI .map, or name of a shipped map"
+    )
     for name in ("start", "goal"):
         words = f"the {name}'s cell, by default the map file's"
-        parser.add_argument(f"--{name}", type=int, nargs=2, metavar=("X", "Y"), help=words)
-    words = "which diagonal moves are legal" + ("" if move_rule else ", by default as in training")
-    _add_options(parser, ("move-rule", [rule.value for rule in api.MoveRule], move_rule, words))
+        parser.add_argument(
+            f"--{name}", type=int, nargs=2, metavar=("X", "Y"), help=words
+        )
+    words = "which diagonal moves are legal" + (
+        "" if move_rule else ", by default as in training"
+    )
+    _add_options(
+        parser, ("move-rule", [rule.value for rule in api.MoveRule], move_rule, words)
+    )
 
 
 def _files_of(map_file: MapFile) -> dict[str, Path | None]:
@@ -224,7 +309,9 @@ def _read_map(options: Any) -> tuple[MapFile, Cell, Cell]:
     map_file = read_map_file(find_map(options.map))
     start, goal = options.start or map_file.start, options.goal or map_file.goal
     if start is None or goal is None:
-        raise ValueError(f"{options.map} names no start and goal; give --start X Y and --goal X Y")
+        raise ValueError(
+            f"{options.map} names no start and goal; give --start X Y and --goal X Y"
+        )
     return map_file, tuple(start), tuple(goal)
 
 
@@ -241,7 +328,10 @@ def train(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     scenario = Scenario(map_file.grid(), start, goal, api.MoveRule(options.move_rule))
     trainer = _run_training(options, lambda: [scenario]).trainer
     field = trainer.planner().q_field(scenario.grid, goal)
-    evaluation, plan = evaluate(field, scenario.grid, field.move_rule), field.rollout(start)
+    evaluation, plan = (
+        evaluate(field, scenario.grid, field.move_rule),
+        field.rollout(start),
+    )
     print(
         f"the greedy rollout solves {evaluation.solved} of {evaluation.starts} starts, mean length "
         f"{evaluation.mean_ratio:.4f} of the optimum; from the start "
@@ -273,12 +363,27 @@ def train_robot(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> in
 
     _add_options(
         parser,
-        ("footprint", str, None, "'[[x, y], ...]', metres, or a radius, as in Nav2's costmaps"),
-        ("padding", float, 0.0, "metres by which the body counts as larger: room for a controller"),
+        (
+            "footprint",
+            str,
+            None,
+            "'[[x, y], ...]', metres, or a radius, as in Nav2's costmaps",
+        ),
+        (
+            "padding",
+            float,
+            0.0,
+            "metres by which the body counts as larger: room for a controller",
+        ),
         ("motion", str, None, "differential, ackermann or omnidirectional"),
         ("turning-radius", float, 0.0, "of its bends, metres; ackermann needs it"),
         ("resolution", float, 0.05, "of the maps, metres per cell"),
-        ("lattice", Path, None, "a file of Nav2's lattice generator, instead of these three"),
+        (
+            "lattice",
+            Path,
+            None,
+            "a file of Nav2's lattice generator, instead of these three",
+        ),
         ("out", Path, "my_robot.safetensors", "the model's file"),
         ("seed", int, 0, "seed of the training"),
         ("steps", int, ROBOT.steps, "transitions after which to give up"),
@@ -288,21 +393,34 @@ def train_robot(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> in
     out = as_path(options.out, "--out")
     check_writable(out, "--out")
     check_distinct({"--out": out}, {"--lattice": options.lattice})
-    how = options.turning_radius, options.resolution, options.lattice, options.seed, options.padding
+    how = (
+        options.turning_radius,
+        options.resolution,
+        options.lattice,
+        options.seed,
+        options.padding,
+    )
     trainer = RobotTrainer(options.footprint, options.motion, *how)
     with tqdm(total=options.steps, disable=None) as bar:
         for certificate in trainer.run(options.steps):
             bar.update(trainer.steps - bar.n)
-            bar.set_postfix(weak=certificate.weak, forbidden=certificate.forbidden, refresh=False)
+            bar.set_postfix(
+                weak=certificate.weak, forbidden=certificate.forbidden, refresh=False
+            )
     print(f"{trainer.steps:,} transitions: {certificate}")
     if certificate.proved:
         save_model(out, trainer.network, trainer.metadata())
     else:
-        print("not saved; give more --steps, or another --seed or --resolution", file=sys.stderr)
+        print(
+            "not saved; give more --steps, or another --seed or --resolution",
+            file=sys.stderr,
+        )
     return int(not certificate.proved)
 
 
-def _add_training_options(parser: argparse.ArgumentParser, out: str, parameters: Any) -> None:
+def _add_training_options(
+    parser: argparse.ArgumentParser, out: str, parameters: Any
+) -> None:
     _add_options(parser, ("out", Path, out, "folder of the run"))
     _add_options(parser, ("seed", int, 0, "seed of the training"))
     for entry in fields(parameters):
@@ -311,7 +429,9 @@ def _add_training_options(parser: argparse.ArgumentParser, out: str, parameters:
         _add_options(parser, (entry.name.replace("_", "-"), kind, default, words))
 
 
-def _run_training(options: Any, scenarios: Callable[[], Sequence[Scenario]]) -> TrainingRun:
+def _run_training(
+    options: Any, scenarios: Callable[[], Sequence[Scenario]]
+) -> TrainingRun:
     """Train into ``--out`` until ``--steps`` or a signal to stop; return the closed run."""
     from ddqn_planner.grid.arguments import as_seed
 
@@ -323,8 +443,12 @@ def _run_training(options: Any, scenarios: Callable[[], Sequence[Scenario]]) -> 
     from ddqn_planner.training.hyper_parameters import HyperParameters
     from ddqn_planner.training.run import TrainingRun
 
-    torch.set_num_threads(1)  # as fast as two for such small networks, and always the same result
-    values = {entry.name: getattr(options, entry.name) for entry in fields(HyperParameters)}
+    torch.set_num_threads(
+        1
+    )  # as fast as two for such small networks, and always the same result
+    values = {
+        entry.name: getattr(options, entry.name) for entry in fields(HyperParameters)
+    }
     parameters = HyperParameters(**values)
     with TrainingRun(options.out, scenarios(), parameters, options.seed) as run:
         trainer = run.trainer
@@ -338,7 +462,10 @@ def _run_training(options: Any, scenarios: Callable[[], Sequence[Scenario]]) -> 
             for finished in run.steps():
                 bar.update(trainer.steps - bar.n)
                 for episode in finished:
-                    figures = {"episode": episode.number, "average reward": episode.average_reward}
+                    figures = {
+                        "episode": episode.number,
+                        "average reward": episode.average_reward,
+                    }
                     bar.set_postfix(figures, refresh=False)
         if run.asked:
             print(f"stopped at step {trainer.steps}; run the same command to resume")
@@ -365,19 +492,47 @@ def certify(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
 
 def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     """Learn from a robot's recorded drives how long places take, and what of it the map tells."""
-    from ddqn_planner.experience.drives import EXPERIENCE, LOCK, RECORD, Drive, read_recording
+    from ddqn_planner.experience.drives import (
+        EXPERIENCE,
+        LOCK,
+        RECORD,
+        Drive,
+        read_recording,
+    )
     from ddqn_planner.grid import read_map_file
 
     words = "trainers' folders, bags, MCAP files, or CSV files with the columns seconds, x, y"
     parser.add_argument("drives", type=file_of, nargs="+", help=words)
-    parser.add_argument("--map", required=True, help="ROS map YAML, or name of a shipped map")
+    parser.add_argument(
+        "--map", required=True, help="ROS map YAML, or name of a shipped map"
+    )
     _add_options(
         parser,
-        ("out", Path, None, "by default experience.npz in the first folder, or beside the file"),
-        ("experience", Path, None, "older file that the drives add to; else all is learned anew"),
-        ("nominal-speed", float, None, "a first guess, m/s; by default 0.5, or --experience's"),
+        (
+            "out",
+            Path,
+            None,
+            "by default experience.npz in the first folder, or beside the file",
+        ),
+        (
+            "experience",
+            Path,
+            None,
+            "older file that the drives add to; else all is learned anew",
+        ),
+        (
+            "nominal-speed",
+            float,
+            None,
+            "a first guess, m/s; by default 0.5, or --experience's",
+        ),
         ("robot-width", float, None, "metres; by default 0.5, or --experience's"),
-        ("topic", str, "", "MCAP: of poses or transforms, by default that with most of them"),
+        (
+            "topic",
+            str,
+            "",
+            "MCAP: of poses or transforms, by default that with most of them",
+        ),
         ("frame", str, "map", "MCAP: the map's frame"),
         ("robot-frame", str, "", "MCAP: by default any that ends in base_link"),
     )
@@ -389,19 +544,26 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     recordings = {f"the recording {path}": path for path in options.drives}
     check_distinct({"--out": out}, {**recordings, **_files_of(map_file)})
     grid = map_file.grid()
-    of_robot = {"nominal_speed": options.nominal_speed, "robot_width": options.robot_width}
+    of_robot = {
+        "nominal_speed": options.nominal_speed,
+        "robot_width": options.robot_width,
+    }
     given = {name: value for name, value in of_robot.items() if value is not None}
     if options.experience:
         experience = api.Experience.load(options.experience)
         if changed := differences(experience.options, given):
-            raise ValueError(f"{options.experience} has {changed}; leave those options out")
+            raise ValueError(
+                f"{options.experience} has {changed}; leave those options out"
+            )
     else:
         experience = api.Experience(**{"nominal_speed": 0.5, **given})
     drives: list[Drive] = []
     with ExitStack() as stack:
         for source in options.drives:
             if (source / RECORD).is_file():
-                stack.enter_context(WorkFolder(source, [LOCK, RECORD], "drives", "records"))
+                stack.enter_context(
+                    WorkFolder(source, [LOCK, RECORD], "drives", "records")
+                )
             how = options.topic, options.frame, options.robot_frame
             name, found = read_recording(source, grid, *how)
             print(f"{source}: {name}")
@@ -413,16 +575,24 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
                 reasons.append(learned.reason)
                 print(f"drive {number} taught nothing: {learned.reason}")
         if len(reasons) == len(drives):
-            raise ValueError(f"no drive taught anything, and {out} is as before; {reasons[0]}")
+            raise ValueError(
+                f"no drive taught anything, and {out} is as before; {reasons[0]}"
+            )
         try:
             from ddqn_planner.training.prior import prior_of
 
-            experience.prior = prior_of(grid, experience.evidence.table, experience.prior)
+            experience.prior = prior_of(
+                grid, experience.evidence.table, experience.prior
+            )
         except ImportError as error:
             print(f"the map's prior is not trained: {with_remedy(error)}")
-        write_atomically(out, experience.to_bytes())  # not `save`, which adds to an older file
+        write_atomically(
+            out, experience.to_bytes()
+        )  # not `save`, which adds to an older file
     minutes = sum(drive.seconds[-1] - drive.seconds[0] for drive in drives) / 60
-    print(f"{len(drives)} drives, {sum(d.metres for d in drives):.0f} m, {minutes:.1f} min")
+    print(
+        f"{len(drives)} drives, {sum(d.metres for d in drives):.0f} m, {minutes:.1f} min"
+    )
     print(f"speed in the open: {experience.learned_speed:.2f} m/s")
     print(f"saved {out}")
     return 0
@@ -433,14 +603,19 @@ def warm_up(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     from ddqn_planner.warm_up import warm_up as stages
 
     parser.add_argument("model", nargs="?", default="any_map", help=MODEL)
-    planner, began = api.Planner.load(parser.parse_args(arguments).model), time.perf_counter()
+    planner, began = (
+        api.Planner.load(parser.parse_args(arguments).model),
+        time.perf_counter(),
+    )
     list(stages(planner, learns=True))
     print(f"compiled, or loaded, in {time.perf_counter() - began:.1f} s")
     return 0
 
 
 FUNCTIONS: Final = plan, train, train_any_map, train_robot, certify, warm_up, learn
-COMMANDS: Final = {function.__name__.replace("_", "-"): function for function in FUNCTIONS}
+COMMANDS: Final = {
+    function.__name__.replace("_", "-"): function for function in FUNCTIONS
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -456,12 +631,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run_command(arguments: Sequence[str]) -> int:
-    parser = argparse.ArgumentParser(prog="ddqn-planner", description=str(__doc__).replace("`", ""))
+    parser = argparse.ArgumentParser(
+        prog="ddqn-planner", description=str(__doc__).replace("`", "")
+    )
     names = parser.add_subparsers(required=True, metavar="|".join(COMMANDS))
     parsers = {}
     for name, command in COMMANDS.items():
         words = str(command.__doc__)
-        parsers[name] = names.add_parser(name, help=words.split(".")[0], description=words)
+        parsers[name] = names.add_parser(
+            name, help=words.split(".")[0], description=words
+        )
     if not arguments or arguments[0] not in COMMANDS:
         parser.parse_args(arguments)  # ends with the help, or an error
     name, *others = arguments

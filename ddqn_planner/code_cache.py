@@ -133,7 +133,9 @@ class CheckedCache(FunctionCache):
             raise
         except Exception as error:
             remedy = "make room there, or set NUMBA_CACHE_DIR to a folder that can be written"
-            messages.warn(f"cannot be kept in {self.cache_path} ({_reason(error)}); {remedy}")
+            messages.warn(
+                f"cannot be kept in {self.cache_path} ({_reason(error)}); {remedy}"
+            )
 
 
 def _reason(error: Exception) -> str:

@@ -24,19 +24,29 @@ def compiled(function: Function, **options: Any) -> Function:
             if hasattr(scope.get(name), "dispatcher"):
                 scope[name] = scope[name].dispatcher()
         to_compile = FunctionType(
-            function.__code__, scope, argdefs=function.__defaults__, closure=function.__closure__
+            function.__code__,
+            scope,
+            argdefs=function.__defaults__,
+            closure=function.__closure__,
         )
         to_compile.__kwdefaults__ = function.__kwdefaults__
         # numba looks at the file of a function alone to see whether the code it has kept is old.
         digest = digest_of(to_compile, options)
         to_compile.__qualname__ = f"{function.__name__}_{digest}"
         # Without checks of divisors and entries for C, which none needs, they compile sooner.
-        settings = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, **options}
+        settings = {
+            "nogil": True,
+            "error_model": "numpy",
+            "no_cfunc_wrapper": True,
+            **options,
+        }
         with _importing:
             numba = _import_numba()
             from ddqn_planner.code_cache import CheckedCache
         compiling = numba.njit(**settings)(to_compile)
-        with suppress(RuntimeError, OSError):  # no folder is writable: each process compiles again
+        with suppress(
+            RuntimeError, OSError
+        ):  # no folder is writable: each process compiles again
             compiling._cache = CheckedCache(to_compile)
         return compiling
 

@@ -29,7 +29,9 @@ class _Describer:
     """Turns values into plain ones whose texts differ, the same in each process."""
 
     def __init__(self) -> None:
-        self._functions: set[FunctionType] = set()  # that were described: they may call each other
+        self._functions: set[FunctionType] = (
+            set()
+        )  # that were described: they may call each other
 
     def of(self, value: Any, names: frozenset[str] = frozenset()) -> object:
         """Return the description of a value; of a module or a class, the attributes in `names`."""
@@ -50,14 +52,21 @@ class _Describer:
             case set() | frozenset():
                 return kind, sorted(repr(self.of(item)) for item in value)
             case dict():
-                return kind, [(self.of(key), self.of(item)) for key, item in value.items()]
+                return kind, [
+                    (self.of(key), self.of(item)) for key, item in value.items()
+                ]
             case CodeType():
                 return kind, self._of_code(value)
             case FunctionType():
                 return kind, self._of_function(value)
             case ModuleType() | type():
                 fields = getattr(value, "_fields", ())  # of a NamedTuple
-                return kind, _name_of(value), fields, list(self._attributes(value, names))
+                return (
+                    kind,
+                    _name_of(value),
+                    fields,
+                    list(self._attributes(value, names)),
+                )
         if hasattr(value, "py_func"):  # compiled
             return kind, self.of(value.py_func)
         if hasattr(value, "__name__"):  # built in, or of NumPy
@@ -71,14 +80,23 @@ class _Describer:
         # Not by `getattr` of a module, which may import another one.
         is_module = isinstance(owner, ModuleType)
         for name in sorted(names):
-            value = vars(owner).get(name, owner) if is_module else getattr(owner, name, owner)
+            value = (
+                vars(owner).get(name, owner)
+                if is_module
+                else getattr(owner, name, owner)
+            )
             if value is not owner:
                 yield name, self.of(value, names - {name})
 
     def _of_code(self, code: CodeType) -> object:
         counts = code.co_argcount, code.co_kwonlyargcount, code.co_flags
         names = code.co_names, code.co_freevars
-        return code.co_code, counts, names, [self.of(constant) for constant in code.co_consts]
+        return (
+            code.co_code,
+            counts,
+            names,
+            [self.of(constant) for constant in code.co_consts],
+        )
 
     def _of_function(self, function: FunctionType) -> object:
         if function in self._functions:
@@ -86,7 +104,9 @@ class _Describer:
         self._functions.add(function)
         names = frozenset(global_names(function.__code__))
         scope = function.__globals__
-        constants = [(name, self.of(scope[name], names)) for name in sorted(names & scope.keys())]
+        constants = [
+            (name, self.of(scope[name], names)) for name in sorted(names & scope.keys())
+        ]
         defaults = self.of(function.__defaults__), self.of(function.__kwdefaults__)
         enclosed = [self.of(cell.cell_contents) for cell in function.__closure__ or ()]
         code = self._of_code(function.__code__)

@@ -19,12 +19,16 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
-TEMPORARY = re.compile(r"\..+\.[0-9a-f]{16}")  # the name of a file that is being written
+TEMPORARY = re.compile(
+    r"\..+\.[0-9a-f]{16}"
+)  # the name of a file that is being written
 URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
 # $HOME, ${HOME}, and $(find-pkg-share ...) of launch files.
 VARIABLE = re.compile(r"(?P<name>\$(?:[A-Za-z_]\w*|\{[^/}]*\}|\([^)]*\)))[^/]*")
 MAX_NAME, MAX_PATH = 255, 4095  # bytes that Linux allows for a name, and for a path
-MAX_REST = 2**24  # bytes of records that are kept while a disk is full; those beyond are left out
+MAX_REST = (
+    2**24
+)  # bytes of records that are kept while a disk is full; those beyond are left out
 MAX_RECORD_BYTES = 2**30  # of an ``episodes.csv``: 20,000 of the longest drives
 MAX_ROW = 2**20  # bytes of a row there
 
@@ -41,7 +45,10 @@ class FileWriteError(OSError):
     """A file cannot be written; `strerror` says why."""
 
     def __init__(self, path: Path, error: OSError) -> None:
-        reason, remedy = error.strerror or str(error), "give another path, or allow writing there"
+        reason, remedy = (
+            error.strerror or str(error),
+            "give another path, or allow writing there",
+        )
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             remedy = "make room there, or give another path"
         elif error.errno == errno.EINVAL:
@@ -76,7 +83,9 @@ def open_regular(path: Path, limit: float = math.inf) -> BinaryIO:
         if kind := _kind(status.st_mode):
             raise ValueError(f"{path} is {kind}; give a regular file")
         if status.st_size > limit:
-            raise ValueError(f"{path} has {status.st_size} bytes; give at most {limit:.0f}")
+            raise ValueError(
+                f"{path} has {status.st_size} bytes; give at most {limit:.0f}"
+            )
     except BaseException:
         file.close()
         raise
@@ -132,13 +141,19 @@ def as_path(path: Any, name: str = "path") -> Path:
     text = text.removeprefix("file://")
     _check_name(text, problem)
     if URL.match(text):
-        raise ValueError(f"{problem}, the address of something else than a file; give a path")
+        raise ValueError(
+            f"{problem}, the address of something else than a file; give a path"
+        )
     if text.startswith("~"):
         text = _with_home(text, problem)
     variable = VARIABLE.search(text)
     if variable and not os.path.lexists(text[: variable.end()]):
-        remedy = f"give its value instead of {variable['name']!r}, or ~ for your home folder"
-        raise ValueError(f"{problem}, with a variable that nothing has replaced; {remedy}")
+        remedy = (
+            f"give its value instead of {variable['name']!r}, or ~ for your home folder"
+        )
+        raise ValueError(
+            f"{problem}, with a variable that nothing has replaced; {remedy}"
+        )
     # Path leaves out "./", with which a name that begins with ~ is no home folder.
     return Path(text).absolute() if str(Path(text)).startswith("~") else Path(text)
 
@@ -152,7 +167,9 @@ def _check_name(text: str, problem: str) -> None:
     try:
         sizes = [len(os.fsencode(part)) for part in text.split("/")]
     except UnicodeEncodeError:
-        raise ValueError(f"{problem}, which holds half a character; give another path") from None
+        raise ValueError(
+            f"{problem}, which holds half a character; give another path"
+        ) from None
     if max(sizes) > MAX_NAME or sum(sizes) + len(sizes) > MAX_PATH:
         limits = f"{MAX_NAME} bytes a name, {MAX_PATH} in all"
         raise ValueError(f"{problem}, which is too long; give at most {limits}")
@@ -209,12 +226,18 @@ def check_writable(path: Path, option: str) -> None:
         probe.open("xb").close()
         probe.unlink()
     except OSError as error:
-        raise ValueError(f"{path} cannot be written ({error.strerror}); {remedy}") from None
+        raise ValueError(
+            f"{path} cannot be written ({error.strerror}); {remedy}"
+        ) from None
     except ValueError as error:  # "." has no name, and none has the character of code 0
-        raise ValueError(f"{str(path)!r} is no file's name ({error}); {remedy}") from None
+        raise ValueError(
+            f"{str(path)!r} is no file's name ({error}); {remedy}"
+        ) from None
 
 
-def check_distinct(outputs: Mapping[str, Path | None], inputs: Mapping[str, Path | None]) -> None:
+def check_distinct(
+    outputs: Mapping[str, Path | None], inputs: Mapping[str, Path | None]
+) -> None:
     """Raise a ValueError if an output would replace another one, or a file that is read."""
     taken = [(name, path) for name, path in inputs.items() if path is not None]
     for option, path in outputs.items():
@@ -222,7 +245,9 @@ def check_distinct(outputs: Mapping[str, Path | None], inputs: Mapping[str, Path
             continue
         for name, other in taken:
             if _is_same(path, other):
-                raise ValueError(f"{option} and {name} are one file, {path}; give another {option}")
+                raise ValueError(
+                    f"{option} and {name} are one file, {path}; give another {option}"
+                )
         taken.append((option, path))
 
 
@@ -252,7 +277,9 @@ def locked(path: Path) -> Iterator[None]:
         yield
 
 
-def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+def write_csv(
+    path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]
+) -> None:
     """Write a table with a header row."""
     text = io.StringIO(newline="")
     csv.writer(text).writerows([columns, *rows])
@@ -262,7 +289,9 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object
 def differences(saved: Mapping[str, object], now: Mapping[str, object]) -> str:
     """Return which of the present values were others, for an error; empty if none was."""
     pairs = [(name, saved[name], value) for name, value in now.items()]
-    return ", ".join(f"{name} {value} (now {new})" for name, value, new in pairs if value != new)
+    return ", ".join(
+        f"{name} {value} (now {new})" for name, value, new in pairs if value != new
+    )
 
 
 class WorkFolder(ExitStack):
@@ -271,7 +300,12 @@ class WorkFolder(ExitStack):
     # A folder with one of the files `marks` is the right one; the first of them is the lock. The
     # other arguments are words of errors: what it should hold, what is done there, what then.
     def __init__(
-        self, folder: str | Path, marks: Sequence[str], content: str, works: str, after: str = ""
+        self,
+        folder: str | Path,
+        marks: Sequence[str],
+        content: str,
+        works: str,
+        after: str = "",
     ) -> None:
         folder = as_path(folder, "the folder")
         folder.mkdir(parents=True, exist_ok=True)
@@ -282,7 +316,9 @@ class WorkFolder(ExitStack):
         super().__init__()
         self.folder, self._after = folder, after
         self.save_error = ""  # why the last save failed; empty if it did not
-        self.on_saved: Callable[[Any], None] = lambda _: None  # hears of each save, whatever came
+        self.on_saved: Callable[[Any], None] = lambda _: (
+            None
+        )  # hears of each save, whatever came
         with self.opening():
             # The system closes the file, and so unlocks it, when the process ends.
             file = self.enter_context(open_to_append(folder / marks[0]))
@@ -290,7 +326,9 @@ class WorkFolder(ExitStack):
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 remedy = "wait for its end, stop it, or give another folder"
-                raise ValueError(f"another process {works} in {folder}; {remedy}") from None
+                raise ValueError(
+                    f"another process {works} in {folder}; {remedy}"
+                ) from None
             for path in folder.iterdir():
                 if TEMPORARY.fullmatch(path.name):  # of a process that was killed
                     path.unlink()
@@ -311,7 +349,9 @@ class WorkFolder(ExitStack):
             yield
             self.save_error = ""
         except OSError as error:
-            reason = error.strerror or error  # no file name: it is often that of a temporary file
+            reason = (
+                error.strerror or error
+            )  # no file name: it is often that of a temporary file
             remedy = f"make room or allow writing there: {self._after}"
             self.save_error = f"cannot save to {self.folder} ({reason}); {remedy}"
         self.on_saved(self)

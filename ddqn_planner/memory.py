@@ -23,7 +23,11 @@ def reuse_small_arrays() -> None:
     """
     with suppress(AttributeError):  # another C library
         mallopt = ctypes.CDLL(None).mallopt
-        for option, value in ((TRIM_THRESHOLD, 2**24), (MMAP_THRESHOLD, 2**24), (ARENA_MAX, 1)):
+        for option, value in (
+            (TRIM_THRESHOLD, 2**24),
+            (MMAP_THRESHOLD, 2**24),
+            (ARENA_MAX, 1),
+        ):
             mallopt(option, value)
 
 

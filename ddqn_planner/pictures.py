@@ -21,7 +21,9 @@ VALUE_COLOURS = ("#f4f1de", "#cfe8dc", "#93cfc8", "#4fa3b5")
 
 SIGNS = ".>^<v#*SG"  # of a map as text: where one has to stand for several, it is the last of them
 MAX_TEXT_WIDTH = 64  # signs in a row, two characters for each
-MAX_SIDE_WITH_LINES = 64  # cells of the longest side of a map with lines between its cells
+MAX_SIDE_WITH_LINES = (
+    64  # cells of the longest side of a map with lines between its cells
+)
 MAX_ARROWS = 48  # arrows of one-way zones along the longest side of a map
 OUTLINES = 30  # of a body along its path
 ONE_WAY = 1e-9  # the mean direction of a cell that is not one-way is shorter
@@ -74,7 +76,9 @@ def save_picture(
     if value is not None:
         finite = np.where(np.isfinite(value), value, np.nan)
         colours = LinearSegmentedColormap.from_list("value", VALUE_COLOURS)
-        image = axes.imshow(finite, origin="lower", cmap=colours, interpolation="nearest")
+        image = axes.imshow(
+            finite, origin="lower", cmap=colours, interpolation="nearest"
+        )
         bar = axes.inset_axes((1.02, 0, 0.035, 1))  # as high as the map
         figure.colorbar(image, bar, label=value_label)
     draw_obstacles(axes, grid)
@@ -83,13 +87,25 @@ def save_picture(
     elif cells:
         x, y = np.transpose(cells)
         outline = [withStroke(linewidth=5.5, foreground="white")]
-        axes.plot(x, y, color=PATH_COLOUR, linewidth=3, path_effects=outline, label="path")
-        style: Any = {"color": PATH_COLOUR, "edgecolors": "white", "linewidths": 1.5, "zorder": 3}
-        for label, end, marker, size in (("start", 0, "o", 110), ("goal", -1, "*", 300)):
+        axes.plot(
+            x, y, color=PATH_COLOUR, linewidth=3, path_effects=outline, label="path"
+        )
+        style: Any = {
+            "color": PATH_COLOUR,
+            "edgecolors": "white",
+            "linewidths": 1.5,
+            "zorder": 3,
+        }
+        for label, end, marker, size in (
+            ("start", 0, "o", 110),
+            ("goal", -1, "*", 300),
+        ):
             axes.scatter(x[end], y[end], size, label=label, marker=marker, **style)
     if cells or body is not None:
         figure.legend(loc="outside lower center", ncols=4, frameon=False)
-    content = io.BytesIO()  # so that an old file stays complete, and no pipe is waited for
+    content = (
+        io.BytesIO()
+    )  # so that an old file stays complete, and no pipe is waited for
     figure.savefig(content, format=picture_format(file))
     write_atomically(file, content.getvalue())
 
@@ -102,7 +118,9 @@ def picture_format(path: Path, option: str = "the picture") -> str:
     ending = path.suffix.lower().removeprefix(".")
     if ending not in formats:
         problem = f"ends in {path.suffix!r}" if ending else "has no ending"
-        raise ValueError(f"{option} is {path}, which {problem}; give one of .{', .'.join(formats)}")
+        raise ValueError(
+            f"{option} is {path}, which {problem}; give one of .{', .'.join(formats)}"
+        )
     return ending
 
 
@@ -112,16 +130,26 @@ def draw_body(axes: Any, footprint: Array, poses: Array, ends: Array) -> None:
 
     if len(poses):
         swept: Any = placed(footprint, poses)
-        axes.add_collection(PolyCollection(swept, facecolor=VALUE_COLOURS[1], label="swept"))
-        style: Any = {"facecolor": VALUE_COLOURS[2], "edgecolor": VALUE_COLOURS[3], "alpha": 0.3}
-        axes.add_collection(PolyCollection(swept[:: len(swept) // OUTLINES + 1], **style))
+        axes.add_collection(
+            PolyCollection(swept, facecolor=VALUE_COLOURS[1], label="swept")
+        )
+        style: Any = {
+            "facecolor": VALUE_COLOURS[2],
+            "edgecolor": VALUE_COLOURS[3],
+            "alpha": 0.3,
+        }
+        axes.add_collection(
+            PolyCollection(swept[:: len(swept) // OUTLINES + 1], **style)
+        )
         axes.plot(*poses.T[:2], color=PATH_COLOUR, linewidth=2, label="path")
     (back, _), (front, left) = footprint.min(axis=0), footprint.max(axis=0)
     behind = max(0.0, back)  # of an origin that the body lies ahead of
     if front <= 0:  # or behind
         behind = (front + back) / 2
     nose = np.array([[front, 0], [behind, left / 2], [behind, -left / 2]])
-    for pose, label, colour in zip(ends, ("start", "goal"), ("white", PATH_COLOUR), strict=True):
+    for pose, label, colour in zip(
+        ends, ("start", "goal"), ("white", PATH_COLOUR), strict=True
+    ):
         style = {"edgecolor": PATH_COLOUR, "zorder": 3}
         axes.fill(*placed(footprint, pose).T, label=label, facecolor=colour, **style)
         axes.fill(*placed(nose, pose).T, facecolor=OBSTACLE_COLOUR, zorder=3)
@@ -147,11 +175,15 @@ def draw_obstacles(axes: Any, grid: GridMap) -> None:
         along = directions[:, y * step, x * step]
         along *= 0.8 * step / np.hypot(*along)
         style = {"pivot": "middle", "angles": "xy", "scale_units": "xy", "scale": 1}
-        axes.quiver(x * step, y * step, *along, color=DIRECTION_COLOUR, width=0.002, **style)
+        axes.quiver(
+            x * step, y * step, *along, color=DIRECTION_COLOUR, width=0.002, **style
+        )
 
 
 def _mean_directions(forbidden: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Return (2, H, W) float64: the sum of the legal directions of each cell, x and y."""
     legal = (forbidden >> np.arange(len(MOVES))[:, None, None] & 1) == 0
-    directions: NDArray[np.float64] = np.tensordot((MOVES / LENGTHS[:, None]).T, legal, 1)
+    directions: NDArray[np.float64] = np.tensordot(
+        (MOVES / LENGTHS[:, None]).T, legal, 1
+    )
     return directions

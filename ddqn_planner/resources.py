@@ -8,7 +8,9 @@ from typing import Final
 from ddqn_planner.files import as_path
 
 PACKAGE: Final = "ddqn_planner"
-ROS: Final = "install ROS 2 Jazzy and source it, or in the repository: pip install '.[ros]'"
+ROS: Final = (
+    "install ROS 2 Jazzy and source it, or in the repository: pip install '.[ros]'"
+)
 
 # What to give to pip, by module.
 PACKAGES: Final = {
@@ -28,7 +30,11 @@ def with_remedy(error: Exception) -> str:
     library = (getattr(error, "name", None) or "").partition(".")[0]
     if library == "rclpy" or library.endswith(("_interfaces", "_msgs", "_srvs")):
         return f"{error}; {ROS}"
-    return f"{error}; pip install {PACKAGES[library]}" if library in PACKAGES else str(error)
+    return (
+        f"{error}; pip install {PACKAGES[library]}"
+        if library in PACKAGES
+        else str(error)
+    )
 
 
 def find_resource(folder: str, name: str) -> Path:
@@ -59,7 +65,9 @@ def find_map(name: str) -> Path:
     try:
         return find_resource("maps", name if path.suffix else f"{name}.yaml")
     except FileNotFoundError:
-        maps = sorted(file.stem for file in (Path(__file__).parent / "maps").glob("*.yaml"))
+        maps = sorted(
+            file.stem for file in (Path(__file__).parent / "maps").glob("*.yaml")
+        )
         near = difflib.get_close_matches(path.stem, maps, 1)
         problem = f"there is no map file {name!r}, and no shipped map of that name"
         hint = f"did you mean {near[0]!r}? " if near else ""
@@ -78,4 +86,6 @@ def _package_path(url: str) -> Path:
 
         return Path(get_package_share_directory(package)) / rest
     except (ImportError, LookupError, OSError, ValueError) as error:
-        raise FileNotFoundError(f"{url!r}: no such package ({error}); give a path") from None
+        raise FileNotFoundError(
+            f"{url!r}: no such package ({error}); give a path"
+        ) from None

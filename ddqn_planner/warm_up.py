@@ -22,7 +22,9 @@ def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
     grid = GridMap(free, cost=free.astype(np.int8))
     if learns:
         experience = Experience(nominal_speed=1.0)
-        experience.record(np.arange(9.0), np.full((9, 2), 4.5) + np.arange(9.0)[:, None] / 3)
+        experience.record(
+            np.arange(9.0), np.full((9, 2), 4.5) + np.arange(9.0)[:, None] / 3
+        )
         experience.apply(grid)
     if planner.pose_planner is not None:
         _plan_poses(planner)
@@ -50,11 +52,19 @@ def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
 def _plan_poses(planner: Planner) -> None:
     """Plan where a wall divides a map, through it, and past a far box, and look what is left."""
     assert planner.pose_planner is not None
-    reach, cell = planner.pose_planner.body.reach, planner.pose_planner.motions.resolution
-    room = 2 * reach + 48  # cells; a field visits more of its states before it looks at the map
+    reach, cell = (
+        planner.pose_planner.body.reach,
+        planner.pose_planner.motions.resolution,
+    )
+    room = (
+        2 * reach + 48
+    )  # cells; a field visits more of its states before it looks at the map
     walled = np.zeros((room, 2 * room), np.bool_)
     walled[:, room] = True
-    grid, ends = GridMap(walled, cell), np.array([[room / 2, room / 2], [1.5 * room, room / 2]])
+    grid, ends = (
+        GridMap(walled, cell),
+        np.array([[room / 2, room / 2], [1.5 * room, room / 2]]),
+    )
     start, goal = ((*end, 0.0) for end in (ends * cell).tolist())
     planner.plan_poses(grid, start, goal)
     opened = grid.with_patch(np.zeros((room, 1), np.bool_), room, 0)

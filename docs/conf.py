@@ -14,7 +14,12 @@ author = "ddqn_planner maintainers"
 copyright = "ddqn_planner maintainers, Apache-2.0"
 release = ElementTree.parse(DOCS.parent / "package.xml").findtext("version")
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+]
 exclude_patterns = ["_build"]
 html_theme = "furo"
 html_title = f"ddqn_planner {release}"
@@ -42,7 +47,9 @@ def write_command_line() -> None:
     command = [sys.executable, "-c", "from ddqn_planner.cli import main; main()"]
     for name in COMMANDS:
         asked = [*command, name, "--help"]
-        text = subprocess.run(asked, env=environment, stdout=subprocess.PIPE, check=True).stdout
+        text = subprocess.run(
+            asked, env=environment, stdout=subprocess.PIPE, check=True
+        ).stdout
         if not text:
             raise RuntimeError(f"{asked} prints nothing")
         (folder / f"{name}.txt").write_bytes(text)

@@ -57,7 +57,9 @@ def main(arguments: Sequence[str]) -> int:
         if not plan.poses.size:
             print(f"no path: {plan.status.value}")
             return 1
-        print(f"{model}: {plan.length * grid.resolution:.2f} m in {plan.field_ms:.0f} ms")
+        print(
+            f"{model}: {plan.length * grid.resolution:.2f} m in {plan.field_ms:.0f} ms"
+        )
         axes.axis("off")
         draw_obstacles(axes, grid)
         outlines = placed(planner.network.footprint, plan.poses) / grid.resolution - 0.5
@@ -72,11 +74,15 @@ def main(arguments: Sequence[str]) -> int:
             number = min(frame, len(outlines) - 1)
             body.set_xy(outlines[number])
             if frame == number and frame % TRACE == 0:
-                axes.fill(*outlines[number].T, color=VALUE_COLOURS[2], alpha=0.25, zorder=0)
+                axes.fill(
+                    *outlines[number].T, color=VALUE_COLOURS[2], alpha=0.25, zorder=0
+                )
         return [body for *_, body in bodies]
 
     frames = [*range(0, longest, 2), *[longest] * LAST_FRAMES]
-    FuncAnimation(figure, draw, frames).save(as_path(arguments[0]), PillowWriter(FRAMES_PER_SECOND))
+    FuncAnimation(figure, draw, frames).save(
+        as_path(arguments[0]), PillowWriter(FRAMES_PER_SECOND)
+    )
     return 0
 
 

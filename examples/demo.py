@@ -32,14 +32,22 @@ def show_path(client: Client, case: Case, children: Sequence[Popen[bytes]]) -> N
     plans = client.subscribe(Path, "plan", LATCHED)
     fields = client.subscribe(OccupancyGrid, "planner/value", LATCHED)
     map_file = read_map_file(find_map(map_name))
-    grid, start, goal = map_file.grid(), map_file.start or (0, 0), map_file.goal or (0, 0)
+    grid, start, goal = (
+        map_file.grid(),
+        map_file.start or (0, 0),
+        map_file.goal or (0, 0),
+    )
     client.publish_ends(plan_request(grid, start, goal))
     plan = wait_for("plan", lambda: plans.find(lambda plan: plan.poses), children)
-    print(f"the first plan came {time.monotonic() - began:.1f} s after the nodes were started")
+    print(
+        f"the first plan came {time.monotonic() - began:.1f} s after the nodes were started"
+    )
     cells = cells_of(grid, plan)
     if grid.width <= MAX_TEXT_WIDTH:
         print(draw_text(grid, cells))
-    print(f"{grid.width} x {grid.height} cells, path of {len(cells)} from {start} to {goal}")
+    print(
+        f"{grid.width} x {grid.height} cells, path of {len(cells)} from {start} to {goal}"
+    )
     length = path_length(cells, rule)
     optimum = shortest_distances(grid, goal, rule)[start[::-1]]
     print(f"length {length:.2f} cells, optimum {optimum:.2f} under {rule.value}")
@@ -56,8 +64,12 @@ def main(_: Sequence[str]) -> int:
     with claim_ros_domain():
         for case in CASES:
             with (
-                running_node("map_server_node", yaml_filename=f"{case[0]}.yaml") as server,
-                running_node("planner_node", model=case[1], path_simplification="none") as planner,
+                running_node(
+                    "map_server_node", yaml_filename=f"{case[0]}.yaml"
+                ) as server,
+                running_node(
+                    "planner_node", model=case[1], path_simplification="none"
+                ) as planner,
                 Client() as client,
             ):
                 show_path(client, case, [server, planner])

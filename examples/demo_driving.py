@@ -52,16 +52,22 @@ class Mission:
 class Driver:
     """Sends the robot from station to station."""
 
-    def __init__(self, client: Client, world: World, children: Sequence[Popen[bytes]]) -> None:
+    def __init__(
+        self, client: Client, world: World, children: Sequence[Popen[bytes]]
+    ) -> None:
         self.client, self.world, self.children = client, world, children
         self.odometry = client.subscribe(Odometry, "odom", keep=1)
         self.drives = client.subscribe(Path, "trainer/episode")
         self.plans = client.subscribe(Path, "plan", LATCHED, keep=1)
         # The last one: once its latched message comes, the others are connected, too.
-        self.slowness = client.subscribe(OccupancyGrid, "trainer/slowness", LATCHED, keep=1)
+        self.slowness = client.subscribe(
+            OccupancyGrid, "trainer/slowness", LATCHED, keep=1
+        )
         self.planner = Planner.load("any_map")
 
-    def wait(self, what: str, recorder: Recorder, is_right: Any = lambda _: True) -> Any:
+    def wait(
+        self, what: str, recorder: Recorder, is_right: Any = lambda _: True
+    ) -> Any:
         """Return the first message that is right."""
         return wait_for(what, lambda: recorder.find(is_right), self.children)
 
@@ -73,7 +79,9 @@ class Driver:
     def known_slowness(self) -> Float64:
         """Return what the trainer says: (H, W)."""
         values = np.array(self.wait("slowness", self.slowness).data).clip(0)
-        return np.asarray(SLOWEST ** (values.reshape(self.world.grid.occupancy.shape) / 100))
+        return np.asarray(
+            SLOWEST ** (values.reshape(self.world.grid.occupancy.shape) / 100)
+        )
 
     def drive(self, goal: Cell) -> Mission:
         """Drive to a station, and wait until the planner knows what that taught."""
@@ -83,16 +91,24 @@ class Driver:
         stamped = pose(grid, goal)
         self.client.publish("goal_pose", stamped, listeners=LISTENERS)
         # The planner may still publish a path to the last goal.
-        path = self.wait("plan", self.plans, lambda plan: cells_of(grid, plan)[-1:] == [goal])
-        self.wait("odometry at the goal", self.odometry, lambda at: _is_at(at.pose, stamped))
+        path = self.wait(
+            "plan", self.plans, lambda plan: cells_of(grid, plan)[-1:] == [goal]
+        )
+        self.wait(
+            "odometry at the goal", self.odometry, lambda at: _is_at(at.pose, stamped)
+        )
         # Other drives end on the way: one that is long, or if the trainer hears the goal late.
         self.wait("drive", self.drives, lambda path: _is_at(path.poses[-1], stamped, 2))
         measured = self.now() - began
         time.sleep(0.3)  # the planner loads it
         learned, truth = cells_of(grid, path), self.world.slowness(began)
-        shortest, best = self.world.routes(self.planner, learned[0], goal, began).values()
+        shortest, best = self.world.routes(
+            self.planner, learned[0], goal, began
+        ).values()
         routes = {"shortest": shortest, "learned": learned, "best possible": best}
-        seconds = {name: path_seconds(of, self.world, began) for name, of in routes.items()}
+        seconds = {
+            name: path_seconds(of, self.world, began) for name, of in routes.items()
+        }
         return Mission(routes, seconds, measured, truth, slowness)
 
 
@@ -105,12 +121,18 @@ def _is_at(stamped: Any, goal: PoseStamped, factor: float = 1) -> bool:
 def save_pictures(world: World, missions: Sequence[Mission]) -> None:
     """Save a GIF with a frame per mission, the best of the last ones as a picture, and a curve."""
     width = min(MEAN_OF, len(missions))
-    best = min(missions[-width:], key=lambda each: each.ratio("learned") - each.ratio("shortest"))
+    best = min(
+        missions[-width:],
+        key=lambda each: each.ratio("learned") - each.ratio("shortest"),
+    )
     frames = []
     for number, mission in enumerate(missions, start=1):
         panels = {
             "what nobody told the robot": (mission.truth, mission.routes),
-            "what it has learned": (mission.slowness, {"learned": mission.routes["learned"]}),
+            "what it has learned": (
+                mission.slowness,
+                {"learned": mission.routes["learned"]},
+            ),
         }
         figure: Any = draw_slowness(world.grid, world.stations, panels, (8.4, 4.7))
         title = f"mission {number}: {mission.ratio('learned'):.2f} of the best possible time"
@@ -119,8 +141,13 @@ def save_pictures(world: World, missions: Sequence[Mission]) -> None:
         if mission is best:
             frames[-1].save("demo_driving.png")
     save_film("demo_driving.gif", frames, 450)
-    seconds = {name: [np.array([each.seconds[name] for each in missions])] for name in ROUTE_STYLES}
-    curve, _ = draw_times(seconds, seconds.pop("best possible"), width, banded="learned")
+    seconds = {
+        name: [np.array([each.seconds[name] for each in missions])]
+        for name in ROUTE_STYLES
+    }
+    curve, _ = draw_times(
+        seconds, seconds.pop("best possible"), width, banded="learned"
+    )
     curve.savefig("demo_driving_curve.png", dpi=110)
 
 
@@ -129,7 +156,11 @@ def main(arguments: Sequence[str]) -> int:
     count = int(arguments[0]) if arguments else MISSIONS
     world, random = generated_world(WORLD, SEED), np.random.default_rng(SEED)
     # Its route is compared with others cell by cell.
-    planning = {"start_source": "odometry", "move_rule": RULE.value, "follow_trainer": True}
+    planning = {
+        "start_source": "odometry",
+        "move_rule": RULE.value,
+        "follow_trainer": True,
+    }
     planning["path_simplification"] = "none"
     with tempfile.TemporaryDirectory() as folder, claim_ros_domain():
         map_file = FilePath(folder) / "world.yaml"
@@ -149,7 +180,9 @@ def main(arguments: Sequence[str]) -> int:
                 goal = others[random.integers(len(others))]
                 mission = driver.drive(goal)
                 missions.append(mission)
-                learned, shortest = (mission.ratio(name) for name in ("learned", "shortest"))
+                learned, shortest = (
+                    mission.ratio(name) for name in ("learned", "shortest")
+                )
                 print(
                     f"mission {number:2d}: drove {mission.measured:5.1f} s; its route takes "
                     f"{learned:.2f} of the best possible time, the shortest {shortest:.2f}",

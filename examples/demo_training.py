@@ -42,7 +42,9 @@ def draw(
     draw_path(left, field.rollout(scenario.start).cells, 0, "the path it would take")
     right.plot(*np.transpose([*curve, (step, share)]), color=COLOURS[2], linewidth=2)
     right.set(xlim=(0, steps), ylim=(0, 1.03), xlabel="environment steps")
-    right.set_title("share of the starts from which the robot reaches the end", fontsize=10)
+    right.set_title(
+        "share of the starts from which the robot reaches the end", fontsize=10
+    )
     right.grid(alpha=0.3)
     return frame_of(figure), share
 
@@ -50,18 +52,26 @@ def draw(
 def main(arguments: Sequence[str]) -> int:
     """Train, print how well, and save the film."""
     steps = int(arguments[0]) if arguments else HyperParameters().steps
-    scenario, parameters = paper_scenario(), HyperParameters(learning_rate=0.001, steps=steps)
+    scenario, parameters = (
+        paper_scenario(),
+        HyperParameters(learning_rate=0.001, steps=steps),
+    )
     trainer = Trainer([scenario], parameters, seed=0)
     interval, curve = max(1, steps // FRAMES), list[tuple[int, float]]()
     frames, episodes = list[Image.Image](), list[Any]()
     for ended in trainer.run(steps, interval):
         # What it does from the given start, in the dead end.
-        episodes += [episode.cells for episode in ended if episode.cells[0] == scenario.start]
+        episodes += [
+            episode.cells for episode in ended if episode.cells[0] == scenario.start
+        ]
         if trainer.steps // interval > len(curve):
             frame, share = draw(scenario, trainer.planner(), episodes, curve, steps)
             curve.append((trainer.steps, share))
             frames.append(frame)
-            print(f"step {trainer.steps:6,}: {share:4.0%} of the starts are solved", flush=True)
+            print(
+                f"step {trainer.steps:6,}: {share:4.0%} of the starts are solved",
+                flush=True,
+            )
             episodes.clear()
     save_film("demo_training.gif", frames, 200)
     print("saved demo_training.gif")

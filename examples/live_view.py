@@ -43,7 +43,9 @@ class LiveView(Node):
         self._last: dict[str, Any] = {"map": OccupancyGrid()}
         for layer, (kind, topic, qos) in LAYERS.items():
             self.create_subscription(kind, topic, partial(self._on_message, layer), qos)
-        self.create_subscription(Float32, "trainer/average_reward", self._on_reward, 100)
+        self.create_subscription(
+            Float32, "trainer/average_reward", self._on_reward, 100
+        )
 
     def _on_message(self, layer: str, message: Any) -> None:
         self._last[layer] = message
@@ -56,7 +58,9 @@ class LiveView(Node):
         rr.log("reward", rr.Scalars(message.data))
 
     def _draw_image(self, name: str, message: OccupancyGrid) -> None:
-        size, of_map = ((m.info.height, m.info.width) for m in (message, self._last["map"]))
+        size, of_map = (
+            (m.info.height, m.info.width) for m in (message, self._last["map"])
+        )
         if size != of_map or not all(size):
             return
         values = np.array(message.data, dtype=np.int16).reshape(size)[::-1]
@@ -76,8 +80,13 @@ class LiveView(Node):
         turn = complex(rotation.w, -rotation.z) ** 2
         cells = metres * turn / (abs(turn) or 1.0) / (info.resolution or 1.0)
         strip = np.stack([cells.real, info.height - cells.imag], axis=1)
-        style: Any = {"radii": rr.Radius.ui_points(radius), "colors": ImageColor.getrgb(colour)}
-        lines = rr.LineStrips2D([strip] if points else [], **style, draw_order=ORDER[name])
+        style: Any = {
+            "radii": rr.Radius.ui_points(radius),
+            "colors": ImageColor.getrgb(colour),
+        }
+        lines = rr.LineStrips2D(
+            [strip] if points else [], **style, draw_order=ORDER[name]
+        )
         rr.log(f"map/{name}", lines)
 
 

@@ -22,9 +22,13 @@ from driving_worlds import NOISE, SPEED, World, generated_world
 WORLD, SEED, SPEED_UP = "office-mixture", 9, 40.0
 STEP = 0.2  # simulated seconds from one pose to the next
 MORNING = 3000.0  # when the simulated time begins, seconds: ten minutes later the first crowd goes
-JOIN_DISTANCE = 2.0  # metres from which the robot drives to the nearest point of a new path
+JOIN_DISTANCE = (
+    2.0  # metres from which the robot drives to the nearest point of a new path
+)
 SIGHT = 0.005  # metres between the points at which a straight line is looked at for obstacles
-PATIENCE = 60.0  # simulated seconds that the robot stands before it asks for a path again
+PATIENCE = (
+    60.0  # simulated seconds that the robot stands before it asks for a path again
+)
 
 
 class Robot:
@@ -52,7 +56,11 @@ class Robot:
     def follow(self, path: NDArray[np.float64]) -> None:
         """Follow a path from now on, (N, 2) in metres; an empty one stops the robot."""
         away = np.hypot(*(path - (self.x, self.y)).T)
-        near = (n for n in away.argsort() if away[n] <= JOIN_DISTANCE and self._sees(path[n]))
+        near = (
+            n
+            for n in away.argsort()
+            if away[n] <= JOIN_DISTANCE and self._sees(path[n])
+        )
         self._path = path[next(near, len(path)) :]
 
     def step(self) -> None:
@@ -117,7 +125,9 @@ class RobotNode(Node):
         if self._goal is not None and self._stood > PATIENCE:
             self._stood, goal = 0.0, self._goal.pose.position
             if math.dist((goal.x, goal.y), (robot.x, robot.y)) > ARRIVAL_DISTANCE:
-                self.get_logger().warning("standing without a path; the goal is sent again")
+                self.get_logger().warning(
+                    "standing without a path; the goal is sent again"
+                )
                 self._goals.publish(self._goal)
 
 

@@ -45,20 +45,28 @@ def trainings(settings: Settings) -> list[Training]:
         f"any_map/{number}": replace(ANY_MAP, steps=STEPS, **changes)
         for number, changes in enumerate(VARIANTS.values())
     }
-    return settings.trainings(parameters_of, random_scenarios, evaluation_interval=10**9)
+    return settings.trainings(
+        parameters_of, random_scenarios, evaluation_interval=10**9
+    )
 
 
 def report(settings: Settings) -> str:
     """Return the shipped model's results on the paper's goals, and the table of the ablation."""
-    zero_shot = table("the shipped model, which never saw these maps | ", _zero_shot(settings))
+    zero_shot = table(
+        "the shipped model, which never saw these maps | ", _zero_shot(settings)
+    )
     rows = []
     for number, name in enumerate(VARIANTS):
         planners = settings.planners(f"any_map/{number}")
         wrong, errors = zip(*map(move_errors, planners), strict=True)
-        counts, starts, lengths = zip(*(_held_out(p, False) for p in planners), strict=True)
+        counts, starts, lengths = zip(
+            *(_held_out(p, False) for p in planners), strict=True
+        )
         _, _, costs = zip(*(_held_out(p, True) for p in planners), strict=True)
         found = f"{median_and_range(counts)} of {starts[0]:,}"
-        of_costs, *ratios = (median_and_range(each, 4) for each in (errors, lengths, costs))
+        of_costs, *ratios = (
+            median_and_range(each, 4) for each in (errors, lengths, costs)
+        )
         rows.append([name, median_and_range(wrong), of_costs, found, *ratios])
     return f"{zero_shot}\n\n{table(ABLATION, rows)}"
 
@@ -74,7 +82,10 @@ def _zero_shot(settings: Settings) -> list[list[str]]:
     rows = [
         ["goal i, length", f"{plan.length:.2f}"],
         ["planning time, ms", f"{milliseconds:.2f}"],
-        ["goal ii (without action masking)", f"{starts.solved} ({unmasked}) of {starts.starts}"],
+        [
+            "goal ii (without action masking)",
+            f"{starts.solved} ({unmasked}) of {starts.starts}",
+        ],
         ["goal ii, mean length / optimum", f"{starts.mean_ratio:.4f}"],
     ]
     for noise in settings.noise:
@@ -115,8 +126,12 @@ def _held_out(planner: Planner, with_costs: bool) -> tuple[int, int, float]:
     count, starts, ratios = 0, 0, []
     for kind in HELD_OUT:
         occupancy = generate_map(kind, (SIDE, SIDE), random)
-        grid = GridMap(occupancy, cost=random_costs(occupancy, random) if with_costs else None)
-        field = planner.q_field(grid, grid.free_cells()[-1], MoveRule.ROBOT_SAFE).unmasked()
+        grid = GridMap(
+            occupancy, cost=random_costs(occupancy, random) if with_costs else None
+        )
+        field = planner.q_field(
+            grid, grid.free_cells()[-1], MoveRule.ROBOT_SAFE
+        ).unmasked()
         evaluation = evaluate(field, grid, MoveRule.ROBOT_SAFE)
         count += evaluation.solved
         starts += evaluation.starts

@@ -43,7 +43,11 @@ FOOTPRINTS: Final = {
     "corner": "[[0.5, 0.3], [0.1, 0.3], [0.1, 0.1], [-0.3, 0.1], [-0.3, -0.3], [0.5, -0.3]]",
     "long": "[[0.7, 0.2], [-0.5, 0.2], [-0.5, -0.2], [0.7, -0.2]]",
 }
-RADII: Final = {Motion.DIFFERENTIAL: 0.4, Motion.ACKERMANN: 0.8, Motion.OMNIDIRECTIONAL: 0.4}
+RADII: Final = {
+    Motion.DIFFERENTIAL: 0.4,
+    Motion.ACKERMANN: 0.8,
+    Motion.OMNIDIRECTIONAL: 0.4,
+}
 FAR, AHEAD = (50.0, 60.0), 2.0  # metres of a request, and to the box on its path
 METRES, RADIANS = 0.02, math.radians(2)  # between two poses that the oracle looks at
 SHRUNK = 1e-6  # metres, so that what only touches does not count
@@ -58,7 +62,16 @@ def robot(footprint: str, motion: Motion | str) -> Planner:
     network = RobotNetwork.untrained(corners, motions)
     network.tensors["weight"] = network.swept_by_unit.astype(np.float32)
     network.tensors["threshold"] = np.full(network.sizes["units"], 0.5, np.float32)
-    about = "robot", network.sizes, MoveRule.ROBOT_SAFE, 1.0, "", 0, 0, package_version()
+    about = (
+        "robot",
+        network.sizes,
+        MoveRule.ROBOT_SAFE,
+        1.0,
+        "",
+        0,
+        0,
+        package_version(),
+    )
     return Planner(network, ModelMetadata(*about))
 
 
@@ -84,7 +97,9 @@ class Oracle:
         x, y, yaw = (np.interp(at, np.arange(len(x)), axis) for axis in (x, y, yaw))
         cos, sin = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
         u, v = self.corners.T
-        outline = np.stack([cos * u - sin * v + x[:, None], sin * u + cos * v + y[:, None]], -1)
+        outline = np.stack(
+            [cos * u - sin * v + x[:, None], sin * u + cos * v + y[:, None]], -1
+        )
         touched, _ = self.cells.query(shapely.polygons(outline), predicate="intersects")
         return len(np.unique(touched))
 
@@ -102,7 +117,9 @@ def requests(
     """Yield starts and goals whose surroundings are free within a radius, in metres."""
     from scipy.ndimage import distance_transform_edt
 
-    free = distance_transform_edt(np.pad(~grid.occupancy, 1))[1:-1, 1:-1] * grid.resolution
+    free = (
+        distance_transform_edt(np.pad(~grid.occupancy, 1))[1:-1, 1:-1] * grid.resolution
+    )
     rows, columns = np.nonzero(free > radius)
     while len(rows):
         poses = []
@@ -130,11 +147,15 @@ def ways(motions: Motions) -> list[dict[Cell, NDArray[np.float64]]]:
     found = []
     for poses in motions.poses:
         at = np.linspace(0, len(poses) - 1, 1001)
-        way = np.column_stack([np.interp(at, range(len(poses)), poses[:, i]) for i in (0, 1)])
+        way = np.column_stack(
+            [np.interp(at, range(len(poses)), poses[:, i]) for i in (0, 1)]
+        )
         length = np.hypot(*np.diff(way, axis=0).T) + 1e-12
         parts = np.column_stack([length / length.sum(), np.diff(way, axis=0)])
         shares: dict[Cell, NDArray[np.float64]] = {}
-        for cell, part in zip(np.floor((way[1:] + way[:-1]) / 2 + 0.5), parts, strict=True):
+        for cell, part in zip(
+            np.floor((way[1:] + way[:-1]) / 2 + 0.5), parts, strict=True
+        ):
             key = int(cell[0]), int(cell[1])
             shares[key] = shares.get(key, 0) + part
         found.append(shares)
@@ -142,7 +163,10 @@ def ways(motions: Motions) -> list[dict[Cell, NDArray[np.float64]]]:
 
 
 def least_costs(
-    grid: GridMap, motions: Motions, swept: NDArray[np.bool_], *goals: tuple[int, int, int]
+    grid: GridMap,
+    motions: Motions,
+    swept: NDArray[np.bool_],
+    *goals: tuple[int, int, int],
 ) -> NDArray[np.float64]:
     """Return (H, W, 16): the least cost from every pose to a goal, in cells, by Dijkstra."""
     height, width = grid.occupancy.shape
@@ -162,7 +186,10 @@ def least_costs(
             part = share * multiplier[y + up, x + over]
             if grid.uphill is not None and np.any(moved):
                 part = (
-                    part * UPHILL[grid.uphill[y + up, x + over], actions_along(np.array([moved]))]
+                    part
+                    * UPHILL[
+                        grid.uphill[y + up, x + over], actions_along(np.array([moved]))
+                    ]
                 )
             factor += part
         allowed = np.ones(len(x), np.bool_)
@@ -173,10 +200,14 @@ def least_costs(
         over, up = motions.offset[number]
         before = (y * width + x) * 16 + motions.start[number]
         after = ((y + up) * width + x + over) * 16 + motions.end[number]
-        edges.append(np.column_stack([before, after, motions.cost[number] * factor])[allowed])
+        edges.append(
+            np.column_stack([before, after, motions.cost[number] * factor])[allowed]
+        )
     before, after, cost = np.concatenate(edges).T
     size = grid.occupancy.size * 16
-    graph = coo_matrix((cost, (after.astype(int), before.astype(int))), (size, size)).tocsr()
+    graph = coo_matrix(
+        (cost, (after.astype(int), before.astype(int))), (size, size)
+    ).tocsr()
     numbers = [(y * width + x) * 16 + heading for x, y, heading in goals]
     costs: NDArray[np.float64] = dijkstra(graph, indices=numbers, min_only=True)
     return costs.reshape(height, width, 16)
@@ -192,7 +223,9 @@ def narrow(random: np.random.Generator) -> Iterator[tuple[str, NDArray[np.bool_]
         yield "door", occupancy
         occupancy = np.ones((100, 110), np.bool_)
         wide, corner = random.integers(14, 24), random.integers(45, 80)
-        occupancy[5 : 5 + wide, 5:corner] = occupancy[5:95, corner - wide : corner] = False
+        occupancy[5 : 5 + wide, 5:corner] = occupancy[5:95, corner - wide : corner] = (
+            False
+        )
         yield "corridor with a turn", occupancy
         maze = generate_map("maze", (5, 5), random)
         yield "maze", np.kron(maze, np.ones((24, 24), np.bool_))
@@ -205,7 +238,10 @@ def optimality(options: argparse.Namespace) -> Iterator[list[Any]]:
     motions, swept = planner.network.motions, planner.network.swept()
     rows: dict[str, list[Any]] = {}
     for name, occupancy in narrow(random):
-        grid, row = GridMap(occupancy, CELL), rows.setdefault(name, [0, 0, 0, 1.0, 1.0, 1.0])
+        grid, row = (
+            GridMap(occupancy, CELL),
+            rows.setdefault(name, [0, 0, 0, 1.0, 1.0, 1.0]),
+        )
         best = np.full(1, np.inf)
         while np.isfinite(best).sum() < 1000:
             y, x = random.choice(np.argwhere(~occupancy)).tolist()
@@ -215,8 +251,12 @@ def optimality(options: argparse.Namespace) -> Iterator[list[Any]]:
         reached = np.argwhere(np.isfinite(best) & (best > 0))
         for y, x, heading in random.choice(reached, options.requests).tolist():
             start = *grid.cell_to_world((x, y)), float(motions.angles[heading])
-            first, last = (planner.plan_poses(grid, start, end, bound=b) for b in (1.2, 1.0))
-            ratios = [(plan.cost or np.nan) / best[y, x, heading] for plan in (first, last)]
+            first, last = (
+                planner.plan_poses(grid, start, end, bound=b) for b in (1.2, 1.0)
+            )
+            ratios = [
+                (plan.cost or np.nan) / best[y, x, heading] for plan in (first, last)
+            ]
             row[:2] = row[0] + 1, row[1] + bool(first.poses.size and last.poses.size)
             row[2] += ratios[0] > first.bound * 1.0001
             row[3:] = np.maximum(row[3:], [*ratios, first.bound]).tolist()
@@ -232,7 +272,10 @@ def collisions(options: argparse.Namespace) -> Iterator[list[Any]]:
         planner, counts = robot(footprint, motion), np.zeros(4, np.int64)
         radius = inner_radius(read_footprint(footprint))
         for grid in maps.values():
-            oracle, asked = Oracle(grid, footprint), requests(grid, radius + CELL, random)
+            oracle, asked = (
+                Oracle(grid, footprint),
+                requests(grid, radius + CELL, random),
+            )
             for _, (start, goal) in zip(range(options.requests), asked, strict=False):
                 plan = planner.plan_poses(grid, start, goal)
                 collides = bool(plan.poses.size and oracle.collisions(plan.poses))
@@ -262,11 +305,19 @@ def speed(options: argparse.Namespace) -> Iterator[list[Any]]:
             found.max(axis=0),
             found[:, 2] / found[:, 3],
         )
-        row = [found[:, 0].mean(), worst[0], *middle[1:4], np.median(ratio), ratio.max()]
+        row = [
+            found[:, 0].mean(),
+            worst[0],
+            *middle[1:4],
+            np.median(ratio),
+            ratio.max(),
+        ]
         yield [name, *(f"{x:.2f}" for x in (*row, found[:, 4].mean(), worst[5]))]
 
 
-def drive(planner: Planner, grid: GridMap, start: Pose, goal: Pose, bound: float) -> list[float]:
+def drive(
+    planner: Planner, grid: GridMap, start: Pose, goal: Pose, bound: float
+) -> list[float]:
     """Return milliseconds: first plan, next, repair, new; then the bound, and the memory in MB."""
     other = Planner(planner.network, planner.metadata)
     for one in (planner, other):  # what holds for the map
@@ -277,7 +328,9 @@ def drive(planner: Planner, grid: GridMap, start: Pose, goal: Pose, bound: float
     memory = resident() - before
     if not plan.poses.size:
         return [first, 0, 1, 1, 1, memory]
-    following = [timed(planner, grid, tuple(pose), goal, bound) for pose in plan.poses[1:12]]
+    following = [
+        timed(planner, grid, tuple(pose), goal, bound) for pose in plan.poses[1:12]
+    ]
     after = float(np.median([milliseconds for milliseconds, _ in following]))
     way = np.append(0, np.cumsum(np.hypot(*np.diff(plan.poses[:, :2].T))))
     x, y = grid.world_to_cell(*plan.poses[np.searchsorted(way, AHEAD), :2])
@@ -298,7 +351,11 @@ def timed(
 
 def resident() -> float:
     """Return the memory of this process in MB."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE") / 1e6
+    return (
+        int(Path("/proc/self/statm").read_text().split()[1])
+        * os.sysconf("SC_PAGESIZE")
+        / 1e6
+    )
 
 
 def blocks(share: float, seed: int) -> GridMap:
@@ -306,7 +363,10 @@ def blocks(share: float, seed: int) -> GridMap:
     random, occupancy = np.random.default_rng(seed), np.zeros((2000, 2000), np.bool_)
     rows, columns = np.ogrid[:2000, :2000]
     while occupancy.mean() < share:
-        (x, y), (wide, high) = random.integers(2000, size=2), random.integers(20, 50, size=2)
+        (x, y), (wide, high) = (
+            random.integers(2000, size=2),
+            random.integers(20, 50, size=2),
+        )
         box = abs(columns - x) < wide, abs(rows - y) < high
         disc = (columns - x) ** 2 + (rows - y) ** 2 < wide**2
         occupancy |= box[0] & box[1] if random.random() < 0.5 else disc
@@ -314,7 +374,10 @@ def blocks(share: float, seed: int) -> GridMap:
 
 
 FIGURES: Final = {
-    "collisions": ("body | motion | requests | plans | with a collision | poses", collisions),
+    "collisions": (
+        "body | motion | requests | plans | with a collision | poses",
+        collisions,
+    ),
     "optimality": (
         "place | requests with a way | solved | above the bound | worst cost | at last | bound",
         optimality,
@@ -330,11 +393,19 @@ def main() -> None:
     """Print the figure that is asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--figure", choices=FIGURES, required=True)
-    parser.add_argument("--maps", type=file_of, metavar="FOLDER", help="ROS maps of 0.05 m")
-    parser.add_argument("--requests", type=int, default=30, metavar="N", help="of each map")
+    parser.add_argument(
+        "--maps", type=file_of, metavar="FOLDER", help="ROS maps of 0.05 m"
+    )
+    parser.add_argument(
+        "--requests", type=int, default=30, metavar="N", help="of each map"
+    )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--model", default="differential_robot", help="whose times count")
-    parser.add_argument("--bound", type=float, default=1.2, help="of the paths whose times count")
+    parser.add_argument(
+        "--model", default="differential_robot", help="whose times count"
+    )
+    parser.add_argument(
+        "--bound", type=float, default=1.2, help="of the paths whose times count"
+    )
     options = parser.parse_args()
     header, rows = FIGURES[options.figure]
     print(table(header, list(rows(options))))

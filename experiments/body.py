@@ -22,14 +22,24 @@ def main(arguments: Sequence[str]) -> int:
     path = str(find_map(arguments[0] if arguments else "office"))
     radius = float(arguments[1]) if len(arguments) > 1 else 0.15
     grid, planner = load_map(path), Planner.load("any_map")
-    inflated, metres = inflate(grid, radius), clearance(grid.occupancy) * grid.resolution
-    requests = random_requests(inflated.occupancy, RULE, REQUESTS, np.random.default_rng(0))
-    optima = [shortest_distances(inflated, goal, RULE)[start[::-1]] for start, goal in requests]
+    inflated, metres = (
+        inflate(grid, radius),
+        clearance(grid.occupancy) * grid.resolution,
+    )
+    requests = random_requests(
+        inflated.occupancy, RULE, REQUESTS, np.random.default_rng(0)
+    )
+    optima = [
+        shortest_distances(inflated, goal, RULE)[start[::-1]]
+        for start, goal in requests
+    ]
     rows, means = [], []
     for weight in WEIGHTS:
         body = inflate(grid, radius, weight)
         plans = [planner.plan(body, start, goal, RULE) for start, goal in requests]
-        ratios = [p.length / least for p, least in zip(plans, optima, strict=True) if p.cells]
+        ratios = [
+            p.length / least for p, least in zip(plans, optima, strict=True) if p.cells
+        ]
         x, y = np.concatenate([plan.path for plan in plans]).T
         means.append(metres[y, x].mean())
         figures = np.mean(ratios), max(ratios), means[-1], means[-1] / means[0]

@@ -31,7 +31,10 @@ class Costmap:
     """Publishes a costmap: free, or with a ring of obstacles around the start."""
 
     def __init__(self, client: Client, frequency: float, topic: str = "map") -> None:
-        self.period, self.grid = 1 / frequency, GridMap(np.zeros((SIZE, SIZE), np.bool_), 0.1)
+        self.period, self.grid = (
+            1 / frequency,
+            GridMap(np.zeros((SIZE, SIZE), np.bool_), 0.1),
+        )
         self.has_ring = False
         self._client, self._topic = client, topic
         self._timer = client.node.create_timer(self.period, self._publish)
@@ -92,13 +95,20 @@ def planner(**parameters: Any) -> Iterator[Client]:
     options = [f"{name}:={value}" for name, value in named.items()]
     arguments = [part for option in options for part in ("-p", option)]
     command = executable("planner_node"), "--ros-args", *arguments
-    with running(*command, stderr=subprocess.DEVNULL), Client() as client:  # it logs each failure
+    with (
+        running(*command, stderr=subprocess.DEVNULL),
+        Client() as client,
+    ):  # it logs each failure
         yield client
 
 
 def main(arguments: Sequence[str]) -> int:
     """Print a row for each frequency; return 1 if any retry failed."""
-    count, random, rows = int(arguments[0]) if arguments else CLEARS, np.random.default_rng(0), []
+    count, random, rows = (
+        int(arguments[0]) if arguments else CLEARS,
+        np.random.default_rng(0),
+        [],
+    )
     _claim = claim_ros_domain()
     failed = 0
     with planner() as client:
@@ -107,7 +117,8 @@ def main(arguments: Sequence[str]) -> int:
             navigator = Navigator(client, costmap)
             wait_for("path", navigator.plan)
             retries = [
-                navigator.retry_after_clear(random.uniform(0, 1 / frequency)) for _ in range(count)
+                navigator.retry_after_clear(random.uniform(0, 1 / frequency))
+                for _ in range(count)
             ]
             costmap.close()
             seconds = [retry[1] for retry in retries]

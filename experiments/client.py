@@ -92,13 +92,17 @@ class Recorder:
         return next(filter(predicate, self.messages()), None)
 
     def wait(
-        self, predicate: Callable[[Any], Any] = lambda message: True, timeout: float = TIMEOUT
+        self,
+        predicate: Callable[[Any], Any] = lambda message: True,
+        timeout: float = TIMEOUT,
     ) -> Any:
         """Return the first message for which the predicate holds, or raise TimeoutError."""
         with self._arrived:
             found = self._arrived.wait_for(lambda: self.find(predicate), timeout)
             if found is None:
-                raise TimeoutError(f"no such message; there came {[*self._messages][-3:]}")
+                raise TimeoutError(
+                    f"no such message; there came {[*self._messages][-3:]}"
+                )
             return found
 
 
@@ -110,7 +114,9 @@ def ask(service: Any, request: Any, timeout: float = TIMEOUT) -> Any:
         return answers.get(timeout=timeout).result()
     except queue.Empty:
         service.remove_pending_request(future)
-        raise TimeoutError(f"no answer from {service.srv_name} within {timeout:.0f} s") from None
+        raise TimeoutError(
+            f"no answer from {service.srv_name} within {timeout:.0f} s"
+        ) from None
 
 
 class Client(ExitStack):
@@ -121,7 +127,10 @@ class Client(ExitStack):
         self._context = Context()
         self._context.init(args=[])
         self.node = rclpy.create_node(
-            name, namespace=namespace, context=self._context, start_parameter_services=False
+            name,
+            namespace=namespace,
+            context=self._context,
+            start_parameter_services=False,
         )
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
@@ -166,7 +175,9 @@ class Client(ExitStack):
         answered = threading.Event()
 
         def asked() -> bool:
-            probe.call_async(GetParameters.Request()).add_done_callback(lambda _: answered.set())
+            probe.call_async(GetParameters.Request()).add_done_callback(
+                lambda _: answered.set()
+            )
             return answered.wait(1.0)
 
         wait_for(f"discovery by {node}", asked)
@@ -188,19 +199,30 @@ class Client(ExitStack):
             }
         return set()
 
-    def call(self, kind: Any, name: str, request: Any = None, timeout: float = TIMEOUT) -> Any:
+    def call(
+        self, kind: Any, name: str, request: Any = None, timeout: float = TIMEOUT
+    ) -> Any:
         """Wait for a service, call it, and return its response; or raise TimeoutError."""
         return ask(self.service(kind, name), request or kind.Request(), timeout)
 
-    def publisher(self, message_type: Any, topic: str, qos: Any = 10, listeners: int = 1) -> Any:
+    def publisher(
+        self, message_type: Any, topic: str, qos: Any = 10, listeners: int = 1
+    ) -> Any:
         """Return a publisher, always the same one per topic, once so many listen."""
         if topic not in self._publishers:
-            self._publishers[topic] = self.node.create_publisher(message_type, topic, qos)
+            self._publishers[topic] = self.node.create_publisher(
+                message_type, topic, qos
+            )
         publisher = self._publishers[topic]
-        wait_for(f"listener to {topic}", lambda: publisher.get_subscription_count() >= listeners)
+        wait_for(
+            f"listener to {topic}",
+            lambda: publisher.get_subscription_count() >= listeners,
+        )
         return publisher
 
-    def publish(self, topic: str, message: Any, qos: Any = 10, listeners: int = 1) -> None:
+    def publish(
+        self, topic: str, message: Any, qos: Any = 10, listeners: int = 1
+    ) -> None:
         """Publish a message once so many listen."""
         self.publisher(type(message), topic, qos, listeners).publish(message)
 
@@ -209,10 +231,14 @@ class Client(ExitStack):
         self.publish("initialpose", initial_pose(request.start))
         self.publish("goal_pose", request.goal)
 
-    def subscribe(self, kind: Any, topic: str, qos: Any = 10, keep: int | None = None) -> Recorder:
+    def subscribe(
+        self, kind: Any, topic: str, qos: Any = 10, keep: int | None = None
+    ) -> Recorder:
         """Return what a topic brings from now on."""
         recorder = Recorder(keep)
-        add: Any = recorder.add  # rclpy takes callbacks of two arguments, and does not say so
+        add: Any = (
+            recorder.add
+        )  # rclpy takes callbacks of two arguments, and does not say so
         self.node.create_subscription(kind, topic, add, qos)
         return recorder
 
@@ -223,7 +249,9 @@ class Client(ExitStack):
 
     def set_parameters(self, node: str, **values: Any) -> list[Any]:
         """Set parameters of a node one by one; return a SetParametersResult for each."""
-        messages = [Parameter(name, value=v).to_parameter_msg() for name, v in values.items()]
+        messages = [
+            Parameter(name, value=v).to_parameter_msg() for name, v in values.items()
+        ]
         request = SetParameters.Request(parameters=messages)
         return list(self.call(SetParameters, f"{node}/set_parameters", request).results)
 
@@ -256,7 +284,9 @@ class RobotPoses:
         self._send_transform(transform)
 
 
-def pose(grid: GridMap, cell: Cell, yaw: float = 0.0, offset: float = 0.0) -> PoseStamped:
+def pose(
+    grid: GridMap, cell: Cell, yaw: float = 0.0, offset: float = 0.0
+) -> PoseStamped:
     """Return the pose of a cell's centre in the map frame, or one that is `offset` m beside it."""
     message = PoseStamped(header=Header(frame_id="map"))
     x, y = grid.cell_to_world(cell)
@@ -287,7 +317,9 @@ def cells_of(grid: GridMap, path: Path) -> list[Cell]:
     return [cell_of(grid, stamped) for stamped in path.poses]
 
 
-def map_message(values: NDArray[np.int8], grid: GridMap, stamp: int = 0) -> OccupancyGrid:
+def map_message(
+    values: NDArray[np.int8], grid: GridMap, stamp: int = 0
+) -> OccupancyGrid:
     """Return the message of a map in the map frame, stamped with a number of seconds."""
     header = Header(frame_id="map", stamp=Time(sec=stamp))
     return occupancy_message(values, grid.resolution, grid.origin, header)
@@ -334,7 +366,11 @@ class MapFixture:
         if not plan.poses:
             both_free = grid.is_free(start) and grid.is_free(goal)
             possible = both_free and grid.reachable([start], RULE)[goal[::-1]]
-            return f"no path from {start} to {goal}, where there is one" if possible else ""
+            return (
+                f"no path from {start} to {goal}, where there is one"
+                if possible
+                else ""
+            )
         points = np.array([point_of(stamped) for stamped in plan.poses])
         for point, pose in ((points[0], request.start), (points[-1], request.goal)):
             if point.tolist() != [*point_of(pose)]:
@@ -345,7 +381,9 @@ class MapFixture:
         while leaving < len(cells) and not grid.is_free(cells[leaving]):
             leaving += 1
         is_right = all(map(grid.is_free, cells[leaving:])) and leaving < len(cells)
-        is_right &= all(np.hypot(*np.subtract(cell, start)) <= 1 for cell in cells[:leaving])
+        is_right &= all(
+            np.hypot(*np.subtract(cell, start)) <= 1 for cell in cells[:leaving]
+        )
         for (x, y), (to_x, to_y) in pairwise(cells[leaving:]):
             is_right &= grid.is_free((to_x, y)) and grid.is_free((x, to_y))
         return "" if is_right else f"an illegal segment in {points.tolist()}"
@@ -369,7 +407,9 @@ def cells_passed(grid: GridMap, points: NDArray[np.float64]) -> list[Cell]:
     return cells
 
 
-def generated_map(kind: str, side: int, resolution: float = 0.05, seed: Any = 0) -> MapFixture:
+def generated_map(
+    kind: str, side: int, resolution: float = 0.05, seed: Any = 0
+) -> MapFixture:
     """Return a square map of a kind, always the same one; a generator as a seed moves on."""
     occupancy = generate_map(kind, (side, side), np.random.default_rng(seed))
     return MapFixture(MapFile(OCCUPIED * occupancy, resolution))
@@ -377,4 +417,7 @@ def generated_map(kind: str, side: int, resolution: float = 0.05, seed: Any = 0)
 
 def shipped_maps() -> dict[str, MapFixture]:
     """Return two shipped maps, a small one and a large one."""
-    return {name: MapFixture(read_map_file(find_map(name))) for name in ("dilemma", "office")}
+    return {
+        name: MapFixture(read_map_file(find_map(name)))
+        for name in ("dilemma", "office")
+    }

@@ -67,7 +67,9 @@ def plan(folder: Path, python: str) -> subprocess.CompletedProcess[str]:
     """Run the program that plans, with its compiled code in a folder."""
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder)}
     command = [python, "-c", PLAN]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    return subprocess.run(
+        command, env=environment, capture_output=True, text=True, check=False
+    )
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -90,7 +92,9 @@ def main(arguments: Sequence[str]) -> int:
                     else:
                         path.write_bytes(DAMAGES[damage](path.read_bytes(), random))
                 runs = [plan(folder, python) for _ in range(2)]
-                are_right = [run.returncode == 0 and run.stdout == first.stdout for run in runs]
+                are_right = [
+                    run.returncode == 0 and run.stdout == first.stdout for run in runs
+                ]
                 n_warnings = [run.stderr.count(WARNING) for run in runs]
                 n_wrong += not all(are_right) or n_warnings != [1, 0]
                 rows.append([suffix, damage, *are_right, *n_warnings])

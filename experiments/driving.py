@@ -17,7 +17,16 @@ import driving_worlds as worlds
 import numpy as np
 from driving_learners import LEARNERS
 from driving_missions import Job, Result, planner, run, run_in
-from driving_worlds import HELD_OUT, HELD_OUT_SEED, ON_FILES, RULE, SPEED, TUNING, World, drive
+from driving_worlds import (
+    HELD_OUT,
+    HELD_OUT_SEED,
+    ON_FILES,
+    RULE,
+    SPEED,
+    TUNING,
+    World,
+    drive,
+)
 from figures import draw_times, save_figure
 from random_maps import generate_map
 from tables import table, write_report
@@ -33,7 +42,12 @@ Stages = Sequence[tuple[int, int]]
 
 STAGES: Final = ((0, 20), (20, 50), (50, 100))
 LONG_STAGES: Final = ((0, 200), (200, 600), (600, 1000))
-MOVED_STAGES: Final = ((0, 10), (10, 50), (100, 110), (110, 150))  # new to the world, and moved
+MOVED_STAGES: Final = (
+    (0, 10),
+    (10, 50),
+    (100, 110),
+    (110, 150),
+)  # new to the world, and moved
 NEW_STAGES: Final = ((0, 5), (0, 20))
 # What is slow on the map where the robot learned, and on those that are new to it.
 PRIORS: Final = (("clearance", "clearance"), ("discs", "discs"), ("clearance", "discs"))
@@ -55,18 +69,26 @@ def compared(options: Options) -> Sections:
         for learner, own in of_learners.items():
             over = {}
             for kind, of_kind in _by(own, "kind").items():
-                over[kind] = np.mean([result.over_shortest(0, 20) for result in of_kind])
-                of_kinds[kind].append(", ".join(f"{value:.1f}" for value in _above(of_kind)))
+                over[kind] = np.mean(
+                    [result.over_shortest(0, 20) for result in of_kind]
+                )
+                of_kinds[kind].append(
+                    ", ".join(f"{value:.1f}" for value in _above(of_kind))
+                )
             worst = max(over, key=lambda kind: over[kind])
             beyond = f"{100 * over[worst] - 100:+.1f} % ({_short(worst)})"
             rows.append([learner, *_percent(_above(own)), beyond])
-        header = f"missions | {_names(STAGES)} | worst kind over the shortest path, 1 to 20"
+        header = (
+            f"missions | {_names(STAGES)} | worst kind over the shortest path, 1 to 20"
+        )
         sections[title] = table(header, rows)
         header = " | ".join(["kind", *LEARNERS])
         sections[f"{title}, by kind"] = table(header, [*of_kinds.values()])
         if title == HELD_OUT_SET:
             drawn = {name: of_learners[name] for name in DRAWN}
-            sections["From mission to mission"] = _curve(options.out / "curve.png", drawn)
+            sections["From mission to mission"] = _curve(
+                options.out / "curve.png", drawn
+            )
             sections["Expected times"] = _forecasts(of_learners[EXPERIENCE])
     return sections
 
@@ -74,7 +96,9 @@ def compared(options: Options) -> Sections:
 def faulty(options: Options) -> Sections:
     """Measure the held-out worlds with faults."""
     results = _runs(options.sets[HELD_OUT_SET], (EXPERIENCE,), options, is_faulty=True)
-    text = table(f"missions | {_names(STAGES)}", [["with faults", *_percent(_above(results))]])
+    text = table(
+        f"missions | {_names(STAGES)}", [["with faults", *_percent(_above(results))]]
+    )
     return {"Faults": text, "Expected times with faults": _forecasts(results)}
 
 
@@ -86,7 +110,9 @@ def long(options: Options) -> Sections:
 def moved(options: Options) -> Sections:
     """Measure what happens when all slow zones move."""
     title, hidden = "All slow zones move", ("discs", "mixture")
-    return _every_kind(title, MOVED_STAGES, options, hidden, missions=150, is_moved=True)
+    return _every_kind(
+        title, MOVED_STAGES, options, hidden, missions=150, is_moved=True
+    )
 
 
 def priors(options: Options) -> Sections:
@@ -139,13 +165,25 @@ def zones(_: Options) -> Sections:
     for noise, rate in itertools.product(ZONE_NOISES, ZONE_RATES):
         learned = []
         for width in ZONE_WIDTHS:
-            experience, random, clock = Experience(SPEED, width), np.random.default_rng(0), 0.0
+            experience, random, clock = (
+                Experience(SPEED, width),
+                np.random.default_rng(0),
+                0.0,
+            )
             for number in range(10):
-                measured = drive(path[:: 1 - 2 * (number % 2)], world, clock, random, noise, rate)
+                measured = drive(
+                    path[:: 1 - 2 * (number % 2)], world, clock, random, noise, rate
+                )
                 experience.record(measured.seconds, measured.positions)
                 clock += measured.duration
             learned.append(experience.slowness(grid)[10, 36:44].mean())
-        rows.append([f"{100 * noise:g} cm", f"{rate} Hz", *(f"{value:.2f}" for value in learned)])
+        rows.append(
+            [
+                f"{100 * noise:g} cm",
+                f"{rate} Hz",
+                *(f"{value:.2f}" for value in learned),
+            ]
+        )
     widths = " | ".join(f"robot_width {width}" for width in ZONE_WIDTHS)
     return {"A zone of slowness 4.0": table(f"noise of poses | rate | {widths}", rows)}
 
@@ -159,7 +197,9 @@ def speed(_: Options) -> Sections:
     goal, experience, clock = requests[0][1], Experience(SPEED), 0.0
     times = []
     for number in range(25):
-        cells = planner().plan(experience.apply(grid), requests[number % 6][0], goal).cells
+        cells = (
+            planner().plan(experience.apply(grid), requests[number % 6][0], goal).cells
+        )
         measured = drive(cells[:1001], world, clock, random)
         some = np.linspace(0, len(measured.seconds) - 1, 1000).astype(np.int64)
         clock += measured.duration
@@ -172,9 +212,15 @@ def speed(_: Options) -> Sections:
         began.append(time.thread_time())
         steps = 1e3 * np.diff(began)
         times.append([*steps, steps.sum()])
-    columns = zip(("record", "apply", "plan again", "all"), np.array(times[5:]).T, strict=True)
+    columns = zip(
+        ("record", "apply", "plan again", "all"), np.array(times[5:]).T, strict=True
+    )
     rows = [[name, f"{np.median(ms):.1f}", f"{ms.max():.1f}"] for name, ms in columns]
-    return {"Speed": table("1,000 poses on 1000 x 1000 cells | median [ms] | worst [ms]", rows)}
+    return {
+        "Speed": table(
+            "1,000 poses on 1000 x 1000 cells | median [ms] | worst [ms]", rows
+        )
+    }
 
 
 FIGURES: Final[dict[str, Callable[[Options], Sections]]] = {
@@ -210,7 +256,11 @@ def _by(results: Sequence[Result], name: str) -> dict[str, list[Result]]:
 
 
 def _every_kind(
-    title: str, stages: Stages, options: Options, hidden: tuple[str, ...] = ("",), **more: Any
+    title: str,
+    stages: Stages,
+    options: Options,
+    hidden: tuple[str, ...] = ("",),
+    **more: Any,
 ) -> Sections:
     """Return what `Experience` reaches in each set of worlds, and in each kind."""
     rows, of_kinds = [], []
@@ -222,7 +272,9 @@ def _every_kind(
             last[_short(kind)] = _above(own, stages)[-1]
             of_kinds.append([_short(kind), *_percent(_above(own, stages))])
         worst = max(last, key=lambda kind: last[kind])
-        rows.append([name, *_percent(_above(results, stages)), f"{last[worst]:.1f} % ({worst})"])
+        rows.append(
+            [name, *_percent(_above(results, stages)), f"{last[worst]:.1f} % ({worst})"]
+        )
     header = f"missions | {_names(stages)}"
     tables = table(f"{header} | worst kind at last", rows), table(header, of_kinds)
     return {title: tables[0], f"{title}, by kind": tables[1]}
@@ -264,7 +316,10 @@ def _forecasts(results: Sequence[Result]) -> str:
         if len(measured):
             error = np.abs(expected / measured - 1).mean()
             inside = ((low <= measured) & (measured <= high)).mean()
-            width, ratio = np.median((high - low) / expected), measured.sum() / expected.sum()
+            width, ratio = (
+                np.median((high - low) / expected),
+                measured.sum() / expected.sum(),
+            )
             shares = [f"{share:.1%}" for share in (error, inside, width)]
             rows.append([name, len(measured), *shares, f"{ratio:.2f}"])
     header = "missions | drives | MAPE | within the 90 % interval | width of it, median"
@@ -272,20 +327,30 @@ def _forecasts(results: Sequence[Result]) -> str:
 
 
 def _curve(path: Path, results: Mapping[str, Sequence[Result]]) -> str:
-    seconds = {name: [result.seconds for result in own] for name, own in results.items()}
+    seconds = {
+        name: [result.seconds for result in own] for name, own in results.items()
+    }
     best = [result.best for result in results[EXPERIENCE]]
-    figure, _ = draw_times(seconds, best, min(SMOOTHED, len(best[0])), banded=EXPERIENCE)
-    return save_figure(figure, path, "Time over the best possible, from mission to mission")
+    figure, _ = draw_times(
+        seconds, best, min(SMOOTHED, len(best[0])), banded=EXPERIENCE
+    )
+    return save_figure(
+        figure, path, "Time over the best possible, from mission to mission"
+    )
 
 
 def measure(options: Options) -> int:
     """Run the experiment, write its tables, figures and ``report.md``, and print it."""
-    options.maps_found = sorted(map(str, options.maps.rglob("*.yaml"))) if options.maps else []
+    options.maps_found = (
+        sorted(map(str, options.maps.rglob("*.yaml"))) if options.maps else []
+    )
     if options.maps and not options.maps_found:
         raise ValueError(f"{options.maps}: found no ROS map (.yaml); check the path")
     options.out = make_folder(options)
     options.sets = {HELD_OUT_SET: HELD_OUT, "Worlds for tuning": TUNING}
-    if found := [f"{path}-{hidden}" for path in options.maps_found for hidden in ON_FILES]:
+    if found := [
+        f"{path}-{hidden}" for path in options.maps_found for hidden in ON_FILES
+    ]:
         options.sets["Maps from files"] = found
     if options.quick:
         options.sets = {title: kinds[:2] for title, kinds in options.sets.items()}
@@ -301,8 +366,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; return the exit code."""
     parser = parser_of("driving.py", __doc__, "runs/driving")
     add = parser.add_argument
-    add("--maps", type=file_of, metavar="FOLDER", help="measure on the ROS maps of a folder too")
-    add("--figure", action="append", choices=FIGURES, help="measure some of the figures alone")
+    add(
+        "--maps",
+        type=file_of,
+        metavar="FOLDER",
+        help="measure on the ROS maps of a folder too",
+    )
+    add(
+        "--figure",
+        action="append",
+        choices=FIGURES,
+        help="measure some of the figures alone",
+    )
     words = "what `Experience.apply` is given (default: %(default)s)"
     add("--exploration", type=float, default=0.1, metavar="SHARE", help=words)
     options = parser.parse_args(arguments)

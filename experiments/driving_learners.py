@@ -34,7 +34,10 @@ class Learner:
             for cells in grid.occupancy.shape
         )
         self.shape = int(rows[-1]) + 1, int(columns[-1]) + 1
-        self.of_cells, self.count = rows[:, None] * self.shape[1] + columns, np.prod(self.shape)
+        self.of_cells, self.count = (
+            rows[:, None] * self.shape[1] + columns,
+            np.prod(self.shape),
+        )
         self.slowness: Float64 | None = None
 
     def apply(self, grid: GridMap) -> GridMap:
@@ -42,7 +45,10 @@ class Learner:
         if self.slowness is None:
             return grid
         of_squares = np.clip(self.slowness, 1, MAX_SLOWNESS).astype(np.float32)
-        times = {"slowness": of_squares[self.of_cells], "seconds_per_cell": grid.resolution / SPEED}
+        times = {
+            "slowness": of_squares[self.of_cells],
+            "seconds_per_cell": grid.resolution / SPEED,
+        }
         return replace(grid, **times)
 
     def record(self, seconds: Float64, positions: Float64) -> None:
@@ -60,7 +66,11 @@ class Learner:
         )
         squares = np.unique(steps)
         driven = np.maximum(metres[squares], self.side / 4)
-        self.learn(squares, driven, np.clip(took[squares] * SPEED / driven, 1 / 3, MAX_SLOWNESS))
+        self.learn(
+            squares,
+            driven,
+            np.clip(took[squares] * SPEED / driven, 1 / 3, MAX_SLOWNESS),
+        )
 
     def learn(self, squares: Any, metres: Float64, slowness: Float64) -> None:
         """Learn from the squares of a drive, from the metres in each and its slowness."""
@@ -86,7 +96,9 @@ class MeanTime(Learner):
         """Learn from the squares of a drive."""
         self.metres[squares] += metres
         self.took[squares] += metres * slowness
-        self.slowness = np.where(self.metres, self.took / np.maximum(self.metres, 1e-9), 1)
+        self.slowness = np.where(
+            self.metres, self.took / np.maximum(self.metres, 1e-9), 1
+        )
 
 
 class GaussianProcess(Learner):
@@ -94,7 +106,11 @@ class GaussianProcess(Learner):
 
     def __init__(self, grid: GridMap) -> None:
         super().__init__(grid, SQUARE)
-        self.number, self.sum, self.drives = np.zeros(self.count), np.zeros(self.count), 0
+        self.number, self.sum, self.drives = (
+            np.zeros(self.count),
+            np.zeros(self.count),
+            0,
+        )
         self.parameters = np.log([2.0, 0.5, 0.3])
         at = np.indices(self.shape).reshape(2, -1).T * SQUARE
         self.squared = ((at[:, None] - at) ** 2).sum(axis=2)
@@ -119,10 +135,14 @@ class GaussianProcess(Learner):
         kernel = signal**2 * np.exp(-self.squared[known] / (2 * length**2))
         among = kernel[:, known] + np.diag(noise**2 / number + 1e-6)
         factor = scipy.linalg.cho_factor(among, lower=True, check_finite=False)
-        both = scipy.linalg.cho_solve(factor, np.stack([seen, np.ones(len(known))], axis=1))
+        both = scipy.linalg.cho_solve(
+            factor, np.stack([seen, np.ones(len(known))], axis=1)
+        )
         mean = float(both[:, 0].sum() / both[:, 1].sum())
         weights = both[:, 0] - mean * both[:, 1]
-        misfit = float((seen - mean) @ weights) / 2 + float(np.log(np.diag(factor[0])).sum())
+        misfit = float((seen - mean) @ weights) / 2 + float(
+            np.log(np.diag(factor[0])).sum()
+        )
         return misfit, mean + weights @ kernel
 
 
@@ -134,9 +154,13 @@ class MarkovField(Learner):
         free = np.bincount(self.of_cells.ravel(), ~grid.occupancy.ravel()) > 0
         number = np.arange(self.count).reshape(self.shape)
         pairs = (number[:, 1:], number[:, :-1]), (number[1:], number[:-1])
-        ends = np.concatenate([np.stack([of.ravel() for of in pair]) for pair in pairs], axis=1)
+        ends = np.concatenate(
+            [np.stack([of.ravel() for of in pair]) for pair in pairs], axis=1
+        )
         first, last = ends[:, free[ends].all(axis=0)]
-        links = coo_array((np.ones(len(first)), (first, last)), (self.count, self.count)).tocsr()
+        links = coo_array(
+            (np.ones(len(first)), (first, last)), (self.count, self.count)
+        ).tocsr()
         links += links.T
         self.prior = tau * (diags_array(links.sum(axis=1) + kappa) - links)
         self.weight, self.sum, self.mean = np.zeros((3, self.count))

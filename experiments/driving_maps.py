@@ -16,7 +16,10 @@ Bool = NDArray[np.bool_]
 SIDE, RESOLUTION = 96, 0.25
 NARROW: Final = 1.25  # metres: the widest door
 APART: Final = 1.5  # metres from one door to the next
-GATES, GATE_AREA = 6, 25.0  # where doors are few: so many narrow places, or one per so many m²
+GATES, GATE_AREA = (
+    6,
+    25.0,
+)  # where doors are few: so many narrow places, or one per so many m²
 
 
 def _halls(random: Random) -> Bool:
@@ -58,7 +61,9 @@ def _warehouse(random: Random) -> Bool:
 
 def _blobs(random: Random) -> Bool:
     """Draw smooth obstacles on a quarter of the map."""
-    smooth = scipy.ndimage.gaussian_filter(random.normal(size=(SIDE, SIDE)), 4, mode="nearest")
+    smooth = scipy.ndimage.gaussian_filter(
+        random.normal(size=(SIDE, SIDE)), 4, mode="nearest"
+    )
     return np.asarray(smooth > np.quantile(smooth, 0.75))
 
 
@@ -88,7 +93,9 @@ MAPS: Final[dict[str, Callable[[Random], Bool]]] = {
 def draw_map(name: str, random: Random) -> GridMap:
     """Draw a map that is named in `MAPS`, or one of `random_maps`."""
     shape = SIDE, SIDE
-    occupancy = MAPS[name](random) if name in MAPS else generate_map(name, shape, random)
+    occupancy = (
+        MAPS[name](random) if name in MAPS else generate_map(name, shape, random)
+    )
     return GridMap(occupancy, RESOLUTION)
 
 
@@ -97,7 +104,9 @@ def gates(grid: GridMap, random: Random) -> list[tuple[Any, Any]]:
     found = []  # whether it is no door, a random number, and its cells
     beside = max(round(0.5 / grid.resolution), 1)
     for occupancy in (grid.occupancy, grid.occupancy.T):
-        step = np.diff(np.pad(occupancy, ((0, 0), (1, 1)), constant_values=True).astype(np.int8))
+        step = np.diff(
+            np.pad(occupancy, ((0, 0), (1, 1)), constant_values=True).astype(np.int8)
+        )
         rows, begins = np.nonzero(step == -1)
         ends = np.nonzero(step == 1)[1]
         widths = np.zeros(occupancy.shape, np.int64)
@@ -105,7 +114,10 @@ def gates(grid: GridMap, random: Random) -> list[tuple[Any, Any]]:
             widths[row, first:end] = end - first
         widths = np.pad(widths, ((beside, beside), (0, 0)))
         middle, width = (begins + ends) // 2, ends - begins
-        wider = np.minimum(widths[rows, middle], widths[rows + 2 * beside, middle]) > 1.5 * width
+        wider = (
+            np.minimum(widths[rows, middle], widths[rows + 2 * beside, middle])
+            > 1.5 * width
+        )
         for index in np.flatnonzero(width * grid.resolution <= NARROW):
             columns = np.arange(begins[index], ends[index])
             cells: tuple[Any, Any] = rows[index], columns

@@ -17,7 +17,9 @@ from ddqn_planner.grid import Cell
 from ddqn_planner.training.prior import prior_of
 
 MOVED_AT: Final = 100  # the mission before which all that is slow moves, where it does
-FAULT_EVERY: Final = 900.0  # seconds of driving: four faults per hour, one of each kind on average
+FAULT_EVERY: Final = (
+    900.0  # seconds of driving: four faults per hour, one of each kind on average
+)
 TEACHING: Final = 50  # missions on one map, before the robot comes to another
 ROBOT_RADIUS: Final = 0.2  # metres, on maps from files
 
@@ -33,7 +35,9 @@ class Job:
     exploration: float | None = None
     is_faulty: bool = False
     is_moved: bool = False
-    prior_from: str | None = None  # the kind that another world teaches; "" for an untaught robot
+    prior_from: str | None = (
+        None  # the kind that another world teaches; "" for an untaught robot
+    )
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,9 @@ class Result:
     seconds: Float64
     best: Float64
     shortest: Float64
-    forecast: Float64  # (M, 5): measured, the expected time, its bounds, and the new share
+    forecast: (
+        Float64  # (M, 5): measured, the expected time, its bounds, and the new share
+    )
 
     def ratio(self, first: int, end: int) -> float:
         """Return the total time over the best possible, over some missions."""
@@ -79,7 +85,10 @@ def run(job: Job) -> Result:
     world = world_of(job)
     learner = LEARNERS[job.learner](world.grid)
     if job.prior_from:
-        source, teacher = replace(job, kind=job.prior_from, prior_from=""), Experience(worlds.SPEED)
+        source, teacher = (
+            replace(job, kind=job.prior_from, prior_from=""),
+            Experience(worlds.SPEED),
+        )
         taught = world_of(source)
         run_in(replace(source, missions=TEACHING), taught, teacher)
         learner.prior = prior_of(taught.grid, teacher.evidence.table, teacher.prior)
@@ -89,7 +98,9 @@ def run(job: Job) -> Result:
 def run_in(job: Job, world: World, learner: Any) -> Result:
     """Drive the missions of a job in a world, with a learner that may know something."""
     grid = world.grid
-    missions, noise, faults, moved = (np.random.default_rng([job.seed, n]) for n in range(4))
+    missions, noise, faults, moved = (
+        np.random.default_rng([job.seed, n]) for n in range(4)
+    )
     is_exploring = isinstance(learner, Experience) and job.exploration is not None
     given = {"exploration": job.exploration} if is_exploring else {}
     shortest: dict[tuple[int, int], Sequence[Cell]] = {}
@@ -104,7 +115,9 @@ def run_in(job: Job, world: World, learner: Any) -> Result:
         if pair not in shortest:
             shortest[pair] = planner().plan(grid, start, goal, RULE).cells
         cells = planner().plan(learner.apply(grid, **given), start, goal, RULE).cells
-        of_routes = [path_seconds(route, world, clock) for route in (cells, shortest[pair])]
+        of_routes = [
+            path_seconds(route, world, clock) for route in (cells, shortest[pair])
+        ]
         best = world.best_seconds(start, goal, clock)
         times.append([*of_routes, best])
         measured = drive(cells, world, clock, noise)
@@ -126,7 +139,9 @@ def run_in(job: Job, world: World, learner: Any) -> Result:
 def _mark(new: Bool, cells: Sequence[Cell], reach: int) -> None:
     """Mark what is near a path as driven."""
     for x, y in cells:
-        new[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1] = False
+        new[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1] = (
+            False
+        )
 
 
 def with_faults(measured: Drive, random: Random) -> Drive:

@@ -36,18 +36,54 @@ RATE: Final = 10.0  # poses per second
 
 # Each kind of world is a map and what is slow on it.
 TUNING: Final = (
-    *("office-mixture", "small_rooms-mixture", "corridors-mixture", "rooms-discs", "rooms-sills"),
+    *(
+        "office-mixture",
+        "small_rooms-mixture",
+        "corridors-mixture",
+        "rooms-discs",
+        "rooms-sills",
+    ),
     *("rooms-noise", "halls-discs", "halls-checkerboard", "halls-ramps", "maze-discs"),
-    *("maze-waits", "warehouse-crowds", "warehouse-gradient", "blobs-clearance", "rooms-waits"),
+    *(
+        "maze-waits",
+        "warehouse-crowds",
+        "warehouse-gradient",
+        "blobs-clearance",
+        "rooms-waits",
+    ),
 )
 HELD_OUT: Final = (
-    *("warehouse-discs", "corridors-waits", "rooms-clearance", "rooms-ramps", "halls-noise"),
-    *("halls-crowds", "halls-gradient", "maze-sills", "maze-noise", "maze-checkerboard"),
-    *("warehouse-waits", "warehouse-clearance", "blobs-noise", "blobs-discs", "blobs-ramps"),
+    *(
+        "warehouse-discs",
+        "corridors-waits",
+        "rooms-clearance",
+        "rooms-ramps",
+        "halls-noise",
+    ),
+    *(
+        "halls-crowds",
+        "halls-gradient",
+        "maze-sills",
+        "maze-noise",
+        "maze-checkerboard",
+    ),
+    *(
+        "warehouse-waits",
+        "warehouse-clearance",
+        "blobs-noise",
+        "blobs-discs",
+        "blobs-ramps",
+    ),
     *("small_rooms-sills", "office-checkerboard", "office-crowds"),
 )
 HELD_OUT_SEED: Final = 14_000  # their first one
-ON_FILES: Final = ("mixture", "discs", "waits", "clearance", "noise")  # what is slow on ROS maps
+ON_FILES: Final = (
+    "mixture",
+    "discs",
+    "waits",
+    "clearance",
+    "noise",
+)  # what is slow on ROS maps
 
 
 @dataclass
@@ -56,10 +92,16 @@ class World:
 
     grid: GridMap
     always: Float64  # the slowness of slow zones, of a slipping carpet, ...
-    crowds: list[Float64]  # they come and go by the hour; the first comes in the odd hours
+    crowds: list[
+        Float64
+    ]  # they come and go by the hour; the first comes in the odd hours
     stations: list[Cell]
-    waits: Float64 | None = None  # seconds that the robot stands before it enters a door
-    ramps: Float64 | None = None  # (H, W, 2): how much slower is a drive in this direction
+    waits: Float64 | None = (
+        None  # seconds that the robot stands before it enters a door
+    )
+    ramps: Float64 | None = (
+        None  # (H, W, 2): how much slower is a drive in this direction
+    )
     best: dict[int, Float64] = field(default_factory=dict)
 
     def slowness(self, seconds: float) -> Float64:
@@ -73,9 +115,13 @@ class World:
     def known(self, seconds: float) -> GridMap:
         """Return the map of one who knows, but for waits and directions."""
         slowness = self.slowness(seconds).astype(np.float32)
-        return replace(self.grid, slowness=slowness, seconds_per_cell=self.grid.resolution / SPEED)
+        return replace(
+            self.grid, slowness=slowness, seconds_per_cell=self.grid.resolution / SPEED
+        )
 
-    def routes(self, planner: Planner, start: Cell, goal: Cell, seconds: float) -> Routes:
+    def routes(
+        self, planner: Planner, start: Cell, goal: Cell, seconds: float
+    ) -> Routes:
         """Return the routes of one who knows nothing, and of one who knows all."""
         maps = {"shortest": self.grid, "best possible": self.known(seconds)}
         return {
@@ -90,11 +136,17 @@ class World:
         way = np.stack([next_x - x, next_y - y], axis=-1).astype(np.float64)
         length = np.hypot(*way.T)
         slowness = self.slowness(seconds)
-        first, second, waits = slowness[y, x], slowness[next_y, next_x], np.zeros(len(x))
+        first, second, waits = (
+            slowness[y, x],
+            slowness[next_y, next_x],
+            np.zeros(len(x)),
+        )
         if self.ramps is not None:
             heading = way / length[:, None]
             first = first + np.maximum((self.ramps[y, x] * heading).sum(axis=1), 0)
-            second = second + np.maximum((self.ramps[next_y, next_x] * heading).sum(axis=1), 0)
+            second = second + np.maximum(
+                (self.ramps[next_y, next_x] * heading).sum(axis=1), 0
+            )
         if self.waits is not None:
             entered = self.waits[next_y, next_x]
             waits = np.where(self.waits[y, x] != entered, entered, 0)
@@ -106,7 +158,9 @@ class World:
         hour = int(seconds // HOUR) % 2
         if hour not in self.best:
             self.best[hour] = self._all_pairs(seconds)
-        return float(self.best[hour][self.stations.index(start), self.stations.index(goal)])
+        return float(
+            self.best[hour][self.stations.index(start), self.stations.index(goal)]
+        )
 
     def _all_pairs(self, seconds: float) -> Float64:
         """Return the least seconds between all stations."""
@@ -132,7 +186,9 @@ class World:
         HIDDEN[hidden](self, random)
 
 
-def _discs(grid: GridMap, count: int, radius: Range, factor: Range, random: Random) -> Float64:
+def _discs(
+    grid: GridMap, count: int, radius: Range, factor: Range, random: Random
+) -> Float64:
     """Draw discs of some radius (metres) and slowness around free cells: (H, W)."""
     free = np.argwhere(~grid.occupancy)
     y, x = np.ogrid[: grid.height, : grid.width]
@@ -154,7 +210,9 @@ def _mixture(world: World, random: Random) -> None:
     """Draw slow zones, a slipping carpet, two crowds, and a cell between two walls of 20."""
     grid, occupancy = world.grid, world.grid.occupancy
     _slow_discs(world, random)
-    world.always = np.maximum(world.always, _discs(grid, 1, (1.5, 3), (1.4, 1.4), random))
+    world.always = np.maximum(
+        world.always, _discs(grid, 1, (1.5, 3), (1.4, 1.4), random)
+    )
     world.crowds = [_discs(grid, 1, (1, 2), (2, 2), random) for _ in range(2)]
     wall = np.pad(occupancy, 1, constant_values=True)
     beside = (wall[1:-1, :-2] & wall[1:-1, 2:]) | (wall[:-2, 1:-1] & wall[2:, 1:-1])
@@ -194,7 +252,9 @@ def _checkerboard(world: World, random: Random) -> None:
     """Let every second square of 1 to 3 m be 2 to 3 times as slow."""
     side = random.uniform(1, 3) / world.grid.resolution
     y, x = np.indices(world.grid.occupancy.shape)
-    odd = ((x + random.uniform(0, side)) // side + (y + random.uniform(0, side)) // side) % 2
+    odd = (
+        (x + random.uniform(0, side)) // side + (y + random.uniform(0, side)) // side
+    ) % 2
     world.always = np.where(odd == 1, random.uniform(2, 3), 1.0)
 
 
@@ -205,9 +265,13 @@ def _noise(world: World, random: Random) -> None:
     height, width = (int(of_axis[-1]) + 1 for of_axis in squares)
     frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width))
     frequency[0, 0] = np.inf
-    log = np.fft.ifft2(np.fft.fft2(random.normal(size=(height, width))) / frequency).real
+    log = np.fft.ifft2(
+        np.fft.fft2(random.normal(size=(height, width))) / frequency
+    ).real
     of_squares = np.exp(np.maximum(0.4 + 0.65 * log / log.std(), 0))
-    world.always = of_squares[np.ix_(*(of_axis.astype(np.int64) for of_axis in squares))]
+    world.always = of_squares[
+        np.ix_(*(of_axis.astype(np.int64) for of_axis in squares))
+    ]
 
 
 def _ramps(world: World, random: Random) -> None:
@@ -217,7 +281,9 @@ def _ramps(world: World, random: Random) -> None:
     world.ramps = np.zeros((*grid.occupancy.shape, 2))
     for _ in range(5):
         y, x = free[random.integers(len(free))]
-        rows, columns = np.rint(random.uniform(1.5, 3, 2) / grid.resolution).astype(np.int64)
+        rows, columns = np.rint(random.uniform(1.5, 3, 2) / grid.resolution).astype(
+            np.int64
+        )
         angle, more = random.uniform(0, 2 * np.pi), random.uniform(1.5, 4)
         box = slice(max(y - rows, 0), y + rows), slice(max(x - columns, 0), x + columns)
         world.ramps[box] = more * np.cos(angle), more * np.sin(angle)
@@ -228,7 +294,9 @@ def _clearance(world: World, random: Random) -> None:
     padded = np.pad(world.grid.occupancy, 1, constant_values=True)
     cells = scipy.ndimage.distance_transform_edt(~padded)[1:-1, 1:-1] - 0.5
     metres = cells * world.grid.resolution
-    world.always = 1 + random.uniform(1.5, 3.5) * np.exp(-metres / random.uniform(0.3, 0.6))
+    world.always = 1 + random.uniform(1.5, 3.5) * np.exp(
+        -metres / random.uniform(0.3, 0.6)
+    )
 
 
 HIDDEN: Final[dict[str, Callable[[World, Random], None]]] = {
@@ -249,7 +317,9 @@ def make_world(grid: GridMap, hidden: str, random: Random) -> World:
     """Draw what is slow on a map, and stations; all in its largest part that is connected."""
     labels = scipy.ndimage.label(~grid.occupancy)[0]
     occupancy = labels != np.bincount(labels[labels > 0]).argmax()
-    world = World(GridMap(occupancy, grid.resolution, grid.origin), np.ones(labels.shape), [], [])
+    world = World(
+        GridMap(occupancy, grid.resolution, grid.origin), np.ones(labels.shape), [], []
+    )
     world.change(hidden, random)
     free = np.argwhere(~occupancy)
     drawn = free[random.choice(len(free), STATIONS, False)]
@@ -303,7 +373,9 @@ def drive(
     points[2::3] = (centres[1:] + centres[:-1]) / 2
     points *= world.grid.resolution
     times = np.arange(0, at[-1], 1 / rate)
-    positions = np.column_stack([np.interp(times, at, points[:, axis]) for axis in (0, 1)])
+    positions = np.column_stack(
+        [np.interp(times, at, points[:, axis]) for axis in (0, 1)]
+    )
     positions += random.normal(0, pose_noise, positions.shape)
     positions += world.grid.origin[:2]
     return Drive(times + clock, positions, float(at[-1]))

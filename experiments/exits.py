@@ -56,7 +56,9 @@ def stop_node(
     name: str, delay: float, number: signal.Signals, code_folder: Path, n_busy: int
 ) -> Exit:
     """Start a node, send it a signal some time after its own first line, and wait for its end."""
-    words = [word for key, value in NODES[name].items() for word in ("-p", f"{key}:={value}")]
+    words = [
+        word for key, value in NODES[name].items() for word in ("-p", f"{key}:={value}")
+    ]
     command = [executable(name), "--ros-args", "--log-level", "fatal", *words]
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(code_folder)}
     log = code_folder.with_suffix(".log")
@@ -99,7 +101,9 @@ def main(arguments: Sequence[str]) -> int:
                 stopped = []
                 for run in range(runs):
                     is_late = when == "later"
-                    delay = FIRST_SECONDS if is_late else random.uniform(0, FIRST_SECONDS)
+                    delay = (
+                        FIRST_SECONDS if is_late else random.uniform(0, FIRST_SECONDS)
+                    )
                     folder = warm if is_late else Path(name, f"{node}_{run}")
                     number = (signal.SIGINT, signal.SIGTERM)[run % 2]
                     stopped.append(stop_node(node, delay, number, folder, n_busy))

@@ -33,10 +33,14 @@ from ddqn_planner.training.trainer import Trainer
 
 KILLS = 50
 SIDE, GOALS = 1000, 6  # cells of a map, and fields asked for at once: a second's work
-TRY_TIME = 1.0  # seconds until a question is asked again: it may have gone to a killed node
+TRY_TIME = (
+    1.0  # seconds until a question is asked again: it may have gone to a killed node
+)
 START_TIME = 20.0  # the same for ~/start, which a second question would find started
 LAST_WAIT = 0.5  # seconds that a client waits after a kill until it gives up
-COUNTS = "kills | in a save | restarts | answers | time-outs | wrong paths | temporaries"
+COUNTS = (
+    "kills | in a save | restarts | answers | time-outs | wrong paths | temporaries"
+)
 Tally = Counter[str]  # the counts of COUNTS: what became of the kills of one node
 
 
@@ -55,13 +59,21 @@ class Faults(Client):
         save_map(MapFile(self.map.values, 1.0, (0.0, 0.0, 0.0), *ends), self.map_path)
         self.watched = plan_request(self.map.grid, *ends)
         quiet, apart = ("--log-level", "fatal"), ("-r", "__ns:=/training")
-        training = {"map_file": "dilemma", "steps": 10**9, "output_folder": self.training_folder}
+        training = {
+            "map_file": "dilemma",
+            "steps": 10**9,
+            "output_folder": self.training_folder,
+        }
         server = {"yaml_filename": self.map_path}
         self.nodes = {
             "map_server": partial(running_node, "map_server_node", *quiet, **server),
             "planner": partial(running_node, "planner_node", *quiet),
-            "trainer": partial(running_node, "trainer_node", *quiet, *apart, **training),
-            "follower": partial(running_node, "planner_node", *quiet, *apart, follow_trainer=True),
+            "trainer": partial(
+                running_node, "trainer_node", *quiet, *apart, **training
+            ),
+            "follower": partial(
+                running_node, "planner_node", *quiet, *apart, follow_trainer=True
+            ),
         }
         self.children: dict[str, Popen[bytes]] = {}
         for name in self.nodes:
@@ -71,7 +83,9 @@ class Faults(Client):
         """Start a node."""
         self.children[name] = self.enter_context(self.nodes[name]())
 
-    def kill(self, name: str, tally: Tally, calls: Sequence[tuple[Any, Any]]) -> list[Any]:
+    def kill(
+        self, name: str, tally: Tally, calls: Sequence[tuple[Any, Any]]
+    ) -> list[Any]:
         """Kill a node under calls (service and future); count and return their answers, or None."""
         child = self.children.pop(name)
         child.kill()  # as a power cut would
@@ -82,7 +96,9 @@ class Faults(Client):
             service.remove_pending_request(future)
         return [future.result() for _, future in calls]
 
-    def ask(self, kind: Any, name: str, request: Any, accept: Any, wait: float = TRY_TIME) -> Any:
+    def ask(
+        self, kind: Any, name: str, request: Any, accept: Any, wait: float = TRY_TIME
+    ) -> Any:
         """Ask until an answer is accepted; return it."""
 
         def answer() -> Any:
@@ -98,7 +114,9 @@ class Faults(Client):
     def trigger(self, name: str) -> str:
         """Call a Trigger service of the trainer until it succeeds; return its message."""
         name = f"/training/trainer/{name}"
-        return str(self.ask(Trigger, name, None, lambda it: it.success, START_TIME).message)
+        return str(
+            self.ask(Trigger, name, None, lambda it: it.success, START_TIME).message
+        )
 
     def ask_for_plan(
         self, tally: Tally, request: Any, accept: Any = lambda it: it.plan.poses
@@ -117,7 +135,9 @@ class Faults(Client):
             time.sleep(0.2)
             return self.plans.find(lambda plan: plan.poses)
 
-        tally["wrong paths"] += bool(self.map.error(self.watched, wait_for("plan", planned)))
+        tally["wrong paths"] += bool(
+            self.map.error(self.watched, wait_for("plan", planned))
+        )
 
     def kill_planner(self, tally: Tally) -> None:
         """Kill the planner while it plans toward goals that it does not know."""
@@ -125,8 +145,12 @@ class Faults(Client):
         requests = self.map.requests(GOALS, self.random)
         calls = [(get_plan, get_plan.call_async(request)) for request in requests]
         time.sleep(self.random.uniform(0.0, 1.0))
-        for request, answer in zip(requests, self.kill("planner", tally, calls), strict=True):
-            tally["wrong paths"] += bool(answer and self.map.error(request, answer.plan))
+        for request, answer in zip(
+            requests, self.kill("planner", tally, calls), strict=True
+        ):
+            tally["wrong paths"] += bool(
+                answer and self.map.error(request, answer.plan)
+            )
         self.start("planner")
         self.ask_for_plan(tally, requests[0])
         tally["restarts"] += 1
@@ -136,12 +160,15 @@ class Faults(Client):
         self.plan_for_active_goal(tally)
         load = LoadMap.Request(map_url=str(self.map_path))
         requests = [
-            *[(self.service(Trigger, "map_server/restore_map"), Trigger.Request())] * 20,
+            *[(self.service(Trigger, "map_server/restore_map"), Trigger.Request())]
+            * 20,
             *[(self.service(LoadMap, "map_server/load_map"), load)] * 4,
             (self.service(Trigger, "map_server/scatter_obstacles"), Trigger.Request()),
         ]
         self.random.shuffle(requests)
-        calls = [(service, service.call_async(request)) for service, request in requests]
+        calls = [
+            (service, service.call_async(request)) for service, request in requests
+        ]
         time.sleep(self.random.uniform(0.0, 2.0))
         self.kill("map_server", tally, calls)
         # The first answer must be a plan. With it, the plans of the last maps are out.
@@ -159,7 +186,9 @@ class Faults(Client):
     def kill_trainer(self, tally: Tally) -> None:
         """Kill the trainer while it saves after each step, soon after a save was seen to begin."""
         save = self.service(Trigger, "/training/trainer/save")
-        temporaries = partial(self.training_folder.glob, ".*")  # what a killed save leaves
+        temporaries = partial(
+            self.training_folder.glob, ".*"
+        )  # what a killed save leaves
         until = time.monotonic() + self.random.uniform(0.2, 1.2)
         calls = []
         while time.monotonic() < until:
@@ -217,7 +246,10 @@ def main(arguments: Sequence[str]) -> int:
                 kill(tallies[node])
         finally:
             names = COUNTS.split(" | ")
-            rows = [[node, *(tally[name] for name in names)] for node, tally in tallies.items()]
+            rows = [
+                [node, *(tally[name] for name in names)]
+                for node, tally in tallies.items()
+            ]
             print(table(f"node | killed while | {COUNTS}", rows))
     total = sum(tallies.values(), Tally())
     lost = total["kills"] - total["restarts"]

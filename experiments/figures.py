@@ -28,7 +28,10 @@ ROUTE_STYLES: Final[dict[str, dict[str, str]]] = {
     "learned": {"color": COLOURS[0], "linestyle": "-"},
     "best possible": {"color": COLOURS[3], "linestyle": "--"},
 }
-LINE: Final = {"linewidth": 2.2, "path_effects": [withStroke(linewidth=4, foreground="white")]}
+LINE: Final = {
+    "linewidth": 2.2,
+    "path_effects": [withStroke(linewidth=4, foreground="white")],
+}
 
 
 def save_figure(figure: Any, path: Path, caption: str) -> str:
@@ -84,15 +87,22 @@ def draw_slowness(
         axes.scatter(*np.transpose(stations), 35, color="black", zorder=4)
         axes.set(xticks=[], yticks=[])
         axes.set_title(title, loc="left", fontsize=10)
-    bar = figure.colorbar(image, ax=both, label="seconds over seconds at nominal speed", shrink=0.8)
+    bar = figure.colorbar(
+        image, ax=both, label="seconds over seconds at nominal speed", shrink=0.8
+    )
     bar.set_ticks([1, 2, 4, 8], labels=["1", "2", "4", "8"])
     bar.minorticks_off()
-    figure.legend(*both[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    figure.legend(
+        *both[0].get_legend_handles_labels(), loc="outside lower center", ncols=3
+    )
     return figure
 
 
 def draw_times(
-    seconds: Mapping[str, Sequence[Array]], best: Sequence[Array], width: int, banded: str
+    seconds: Mapping[str, Sequence[Array]],
+    best: Sequence[Array],
+    width: int,
+    banded: str,
 ) -> tuple[Any, Any]:
     """Draw the times over the best of `width` missions each, one name as median and band."""
     window, curves = np.ones(width), dict[str, Sequence[Array]]()
@@ -122,5 +132,9 @@ def draw_map(axes: Any, scenario: "Scenario", title: str) -> None:
 def draw_path(axes: Any, cells: Sequence[Cell], number: int, label: str) -> None:
     """Draw the path of the n-th planner of a figure."""
     if cells:
-        style = {"color": COLOURS[number], "linestyle": STYLES[number], "zorder": 2 + number}
+        style = {
+            "color": COLOURS[number],
+            "linestyle": STYLES[number],
+            "zorder": 2 + number,
+        }
         axes.plot(*np.transpose(cells), label=label, **LINE, **style)

@@ -24,12 +24,19 @@ from ddqn_planner.planning.segments import cost_along
 RULE = MoveRule.ROBOT_SAFE
 THRESHOLDS = (0.0, 0.03, 0.05, 0.1)
 KINDS = ("two ways", "rooms", "office", "random_10")
-SIDE, RUNS, REPLANS = 160, 16, 100  # cells of a side; runs of a kind; replans of a run at most
+SIDE, RUNS, REPLANS = (
+    160,
+    16,
+    100,
+)  # cells of a side; runs of a kind; replans of a run at most
 STRIDE = 2  # cells from one replan to the next: at 5 cm, 0.5 m/s and 5 Hz
 SIGHT = 80  # cells: farther away than this nothing flickers
 # The costmap flickers: such shares of the free cells are seen as obstacles, with costs around.
 SEEN_BESIDE_WALLS, SEEN_ELSEWHERE, INFLATION = 0.03, 0.001, 8.0
-AHEAD, APART = 60, 10  # cells: how far ahead a path counts, and how far apart it has flipped
+AHEAD, APART = (
+    60,
+    10,
+)  # cells: how far ahead a path counts, and how far apart it has flipped
 
 
 class Driven(NamedTuple):
@@ -52,13 +59,32 @@ def main(_: Sequence[str]) -> int:
             replans, flips, cost = np.sum(runs, axis=0)
             first = first or cost
             more = f"{cost / first - 1:+.2%}"
-            rows.append([kind, path, threshold, int(replans), f"{100 * flips / replans:.1f}", more])
-    print(table("map | path | switch_threshold | replans | flips per 100 | cost driven", rows))
+            rows.append(
+                [
+                    kind,
+                    path,
+                    threshold,
+                    int(replans),
+                    f"{100 * flips / replans:.1f}",
+                    more,
+                ]
+            )
+    print(
+        table(
+            "map | path | switch_threshold | replans | flips per 100 | cost driven",
+            rows,
+        )
+    )
     return 0
 
 
 def drive(
-    planner: Planner, kind: str, seed: int, threshold: float, straight: bool, side: int = SIDE
+    planner: Planner,
+    kind: str,
+    seed: int,
+    threshold: float,
+    straight: bool,
+    side: int = SIDE,
 ) -> Driven:
     """Drive from a start to a goal; the seed and the kind fix the map and its noise."""
     random = np.random.default_rng([seed, KINDS.index(kind)])
@@ -72,7 +98,9 @@ def drive(
         seen = occupancy | (noise & (np.hypot(x - robot[0], y - robot[1]) <= SIGHT))
         seen[robot[::-1]] = seen[goal[::-1]] = False
         grid = GridMap(seen, cost=inflated_costs(seen, INFLATION))
-        request = PlanRequest(grid, robot, (goal,), RULE, simplified=straight, under_way=path)
+        request = PlanRequest(
+            grid, robot, (goal,), RULE, simplified=straight, under_way=path
+        )
         plan = last_step(planner.steps(replace(request, switch_threshold=threshold)))
         if not plan.cells:  # it waits
             continue
@@ -107,7 +135,9 @@ def is_flip(rest: NDArray[np.int32], path: NDArray[np.int32]) -> bool:
     if not len(rest):
         return False
     ahead, _ = cells_along(path)
-    apart = np.hypot(*(ahead[:AHEAD, None] - cells_along(rest)[0]).transpose(2, 0, 1)).min(axis=1)
+    apart = np.hypot(
+        *(ahead[:AHEAD, None] - cells_along(rest)[0]).transpose(2, 0, 1)
+    ).min(axis=1)
     return bool((apart > APART).any())
 
 

@@ -23,7 +23,13 @@ from tqdm import tqdm
 
 from ddqn_planner import GridMap, MoveRule, Planner, QField
 from ddqn_planner.cli import exit_code, file_of
-from ddqn_planner.grid import MOVES, Cell, legal_moves, read_map_file, shortest_distances
+from ddqn_planner.grid import (
+    MOVES,
+    Cell,
+    legal_moves,
+    read_map_file,
+    shortest_distances,
+)
 from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.noise import random_costs, random_requests, unknown_costs
 from ddqn_planner.planning.segments import cost_along
@@ -35,7 +41,9 @@ COSTS: Final[dict[str, Callable[[Occupancy, Random], NDArray[np.int8] | None]]] 
     "random": random_costs,
     "gradient": gradient_costs,
     "inflated": lambda occupancy, random: inflated_costs(occupancy, INFLATION_RADIUS),
-    "unknown": lambda occupancy, random: unknown_costs(occupancy, UNKNOWN_SHARE, random),
+    "unknown": lambda occupancy, random: unknown_costs(
+        occupancy, UNKNOWN_SHARE, random
+    ),
 }
 
 GOALS = 10  # of a generated map: each needs a Q field and exact distances
@@ -90,10 +98,14 @@ def generated_maps(
                 name = f"{kind}-{size}-{number}"
                 random = settings.random(name)
                 occupancy = generate_map(kind, (size, size), random)
-                yield BenchmarkMap(kind, name, *_draw(occupancy, GOALS, settings, random))
+                yield BenchmarkMap(
+                    kind, name, *_draw(occupancy, GOALS, settings, random)
+                )
 
 
-def _draw(occupancy: Occupancy, goals: int, settings: RequestSettings, random: Random) -> Drawn:
+def _draw(
+    occupancy: Occupancy, goals: int, settings: RequestSettings, random: Random
+) -> Drawn:
     """Draw costs and requests for a map; the requests share a number of goals evenly."""
     grid, requests = settings.grid(occupancy, random), []
     parts = np.array_split(range(settings.requests), goals)
@@ -109,23 +121,34 @@ def _draw(occupancy: Occupancy, goals: int, settings: RequestSettings, random: R
 
 def find_files(folder: Path) -> list[Path]:
     """Return the benchmark files of a folder and its subfolders; a ValueError without a map."""
-    files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
+    files = sorted(
+        p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file()
+    )
     if all(path.suffix.lower() == ".scen" for path in files):
-        raise ValueError(f"{folder}: no MovingAI map (.map) or ROS map (.yaml); check the path")
+        raise ValueError(
+            f"{folder}: no MovingAI map (.map) or ROS map (.yaml); check the path"
+        )
     return files
 
 
-def read_maps(files: Sequence[Path], settings: RequestSettings) -> Iterator[BenchmarkMap]:
+def read_maps(
+    files: Sequence[Path], settings: RequestSettings
+) -> Iterator[BenchmarkMap]:
     """Read benchmark maps; report on stderr which files cannot be read, and continue."""
     suffix_of = {path: path.suffix.lower() for path in files}
-    scenarios = {p.stem.removesuffix(".map"): p for p in files if suffix_of[p] == ".scen"}
+    scenarios = {
+        p.stem.removesuffix(".map"): p for p in files if suffix_of[p] == ".scen"
+    }
     for path, suffix in suffix_of.items():
         try:
             if suffix == ".map" and path.stem in scenarios:
                 yield _scenario_map(path, scenarios[path.stem], settings)
             elif suffix != ".scen":
                 name = f"{'movingai' if suffix == '.map' else 'ros'} {path.stem}"
-                occupancy, random = read_map_file(path).grid().occupancy, settings.random(path.stem)
+                occupancy, random = (
+                    read_map_file(path).grid().occupancy,
+                    settings.random(path.stem),
+                )
                 drawn = _draw(occupancy, settings.requests, settings, random)
                 yield BenchmarkMap(name, str(path), *drawn)
         except (OSError, ValueError) as error:
@@ -133,7 +156,9 @@ def read_maps(files: Sequence[Path], settings: RequestSettings) -> Iterator[Benc
             tqdm.write(f"skipped: {known}{error}", file=sys.stderr)
 
 
-def _scenario_map(path: Path, scenario: Path, settings: RequestSettings) -> BenchmarkMap:
+def _scenario_map(
+    path: Path, scenario: Path, settings: RequestSettings
+) -> BenchmarkMap:
     """Read a MovingAI map, with requests of its scenario file: short and long paths alike."""
     random, rule = settings.random(path.stem), settings.move_rule
     grid = settings.grid(read_map_file(path).grid().occupancy, random)
@@ -155,7 +180,9 @@ def _scenario_map(path: Path, scenario: Path, settings: RequestSettings) -> Benc
     for start, goal in requests:
         both_free = grid.is_free(start) and grid.is_free(goal)
         if not both_free or labels[start[::-1]] != labels[goal[::-1]]:
-            raise ValueError(f"{scenario}: no path joins {start} and {goal} on this map")
+            raise ValueError(
+                f"{scenario}: no path joins {start} and {goal} on this map"
+            )
     known = rule is MoveRule.ROBOT_SAFE and grid.cost is None
     optima = drawn[:, -1].tolist() if known else None
     return BenchmarkMap(f"movingai {path.stem}", str(path), grid, requests, optima)
@@ -169,7 +196,9 @@ class Rollout:
     map_name: str
     size: str
     optimum: float  # exact cost of the best path; without costs its length in cells
-    agrees: bool | None  # whether the benchmark's file says the same, if it says anything
+    agrees: (
+        bool | None
+    )  # whether the benchmark's file says the same, if it says anything
     ratio: float  # cost of the rollout over the optimum; infinite if it misses the goal
     unmasked: bool  # whether the rollout without action masking reaches the goal too
     illegal: int  # number of illegal moves
@@ -186,12 +215,18 @@ def measure(
         grid, requests = drawn.grid, drawn.requests
         legal = legal_moves(grid.occupancy, move_rule)
         given = drawn.optima or [math.nan] * len(requests)
-        cases = [(goal, start, o) for (start, goal), o in zip(requests, given, strict=True)]
-        for goal, of_goal in groupby(sorted(cases, key=itemgetter(0)), key=itemgetter(0)):
+        cases = [
+            (goal, start, o) for (start, goal), o in zip(requests, given, strict=True)
+        ]
+        for goal, of_goal in groupby(
+            sorted(cases, key=itemgetter(0)), key=itemgetter(0)
+        ):
             if not warm:  # the first field of a process also loads compiled code
                 compare_with_dijkstra(planner, grid, goal, move_rule)
                 warm = True
-            field, optima, *times = compare_with_dijkstra(planner, grid, goal, move_rule)
+            field, optima, *times = compare_with_dijkstra(
+                planner, grid, goal, move_rule
+            )
             unmasked = field.unmasked()
             for _, start, told in of_goal:
                 cells = field.rollout(start).cells
@@ -221,7 +256,9 @@ def compare_with_dijkstra(
     field = Planner(planner.network, planner.metadata).q_field(grid, goal, move_rule)
     field.policy  # noqa: B018  # from it, as from the distances, the path of any start can be read
     middle = time.perf_counter()
-    distances = shortest_distances(grid, goal, move_rule)  # with the graph that scipy needs
+    distances = shortest_distances(
+        grid, goal, move_rule
+    )  # with the graph that scipy needs
     ended = time.perf_counter()
     return field, distances, 1e3 * (middle - began), 1e3 * (ended - middle)
 
@@ -254,7 +291,10 @@ def markdown(rollouts: Sequence[Rollout]) -> str:
     )
     if given := [rollout.agrees for rollout in rollouts if rollout.agrees is not None]:
         text += f"\nOptima given by files: the oracle agrees with {sum(given)}/{len(given)}."
-    tables = table(f"set | size | {COLUMNS}", sets), table(f"optimum | {COLUMNS}", optima)
+    tables = (
+        table(f"set | size | {COLUMNS}", sets),
+        table(f"optimum | {COLUMNS}", optima),
+    )
     return "\n\n".join((text, *tables))
 
 
@@ -264,7 +304,9 @@ def _row(rollouts: Sequence[Rollout]) -> list[object]:
     ratios = np.array([rollout.ratio for rollout in rollouts])
     solved = ratios[np.isfinite(ratios)]
     return [
-        len({(rollout.set_name, rollout.size, rollout.map_name) for rollout in rollouts}),
+        len(
+            {(rollout.set_name, rollout.size, rollout.map_name) for rollout in rollouts}
+        ),
         requests,
         f"{len(solved)}/{requests}",
         f"{sum(rollout.unmasked for rollout in rollouts)}/{requests}",
@@ -280,16 +322,36 @@ def _row(rollouts: Sequence[Rollout]) -> list[object]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; return the exit code."""
     parser = argparse.ArgumentParser(
-        "generalisation.py", None, __doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter
+        "generalisation.py",
+        None,
+        __doc__,
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     add = parser.add_argument
     add("--model", default="any_map", help="name or file")
     rules = [rule.value for rule in MoveRule]
-    add("--move-rule", choices=rules, default="robot_safe", help="which diagonal moves are legal")
+    add(
+        "--move-rule",
+        choices=rules,
+        default="robot_safe",
+        help="which diagonal moves are legal",
+    )
     data = "MovingAI .map and .scen, ROS .yaml instead of generated maps"
     add("--data", type=file_of, metavar="FOLDER", help=data)
-    add("--kinds", nargs="+", choices=KINDS, default=[*KINDS], help="kinds of generated maps")
-    add("--sizes", nargs="+", type=int, default=[32, 64, 128, 256], help="sides of maps, cells")
+    add(
+        "--kinds",
+        nargs="+",
+        choices=KINDS,
+        default=[*KINDS],
+        help="kinds of generated maps",
+    )
+    add(
+        "--sizes",
+        nargs="+",
+        type=int,
+        default=[32, 64, 128, 256],
+        help="sides of maps, cells",
+    )
     add("--maps", type=int, default=3, metavar="N", help="maps per kind and size")
     add("--requests", type=int, default=200, metavar="N", help="requests per map")
     add("--costs", choices=COSTS, default="none", help="costs of free cells")
@@ -302,7 +364,9 @@ def run(options: argparse.Namespace) -> int:
     """Print the tables of the maps that the options ask for; return the exit code."""
     for name, least in (("maps", 1), ("requests", 1), ("seed", 0)):
         if getattr(options, name) < least:
-            raise ValueError(f"--{name} is {getattr(options, name)}; give at least {least}")
+            raise ValueError(
+                f"--{name} is {getattr(options, name)}; give at least {least}"
+            )
     rule = MoveRule(options.move_rule)
     settings = RequestSettings(rule, options.requests, options.costs, options.seed)
     planner = Planner.load(options.model)

@@ -11,7 +11,15 @@ import numpy as np
 from figures import draw_curves, draw_map, draw_path, save_figure
 from numpy.typing import NDArray
 from tables import median_and_range, table
-from trainings import MOVE_RULE, PROFILES, SCENARIO, Evaluations, Settings, Training, read_csv
+from trainings import (
+    MOVE_RULE,
+    PROFILES,
+    SCENARIO,
+    Evaluations,
+    Settings,
+    Training,
+    read_csv,
+)
 
 from ddqn_planner import MoveRule, Plan, Planner
 from ddqn_planner.grid import Cell, path_length, shortest_path
@@ -32,7 +40,9 @@ CONVERGENCE = (
 )
 
 
-def trainings(settings: Settings, variants: Sequence[str] = ("both",)) -> list[Training]:
+def trainings(
+    settings: Settings, variants: Sequence[str] = ("both",)
+) -> list[Training]:
     """Return the trainings of both profiles on the paper's map, by the name "profile/variant"."""
     parameters_of = {
         f"{profile}/{name}": replace(parameters, **VARIANTS[name])
@@ -44,9 +54,13 @@ def trainings(settings: Settings, variants: Sequence[str] = ("both",)) -> list[T
 
 def convergence_row(runs: Sequence[Evaluations]) -> list[str]:
     """Return the cells of `CONVERGENCE` for the evaluations of each seed."""
-    shortest_one = shortest_path(SCENARIO.grid, SCENARIO.start, SCENARIO.goal, MOVE_RULE)
+    shortest_one = shortest_path(
+        SCENARIO.grid, SCENARIO.start, SCENARIO.goal, MOVE_RULE
+    )
     optimum, ends = path_length(shortest_one), [run[-1] for run in runs]
-    solved, unmasked = (sum(int(end[key]) for end in ends) for key in ("solved", "solved_unmasked"))
+    solved, unmasked = (
+        sum(int(end[key]) for end in ends) for key in ("solved", "solved_unmasked")
+    )
     shortest = [first_kept(run, run["length"] <= optimum + 1e-6) for run in runs]
     return [
         f"{solved} ({unmasked}) of {len(ends)}",
@@ -71,18 +85,26 @@ def report(settings: Settings) -> str:
         planned = [timed_plan(p) for p in settings.planners(f"{profile}/both")]
         milliseconds = median_and_range([took for _, took in planned], 1)
         rows.append([profile, *convergence_row(runs), milliseconds])
-        by_length = sorted((plan for plan, _ in planned), key=lambda p: p.length or np.inf)
+        by_length = sorted(
+            (plan for plan, _ in planned), key=lambda p: p.length or np.inf
+        )
         paths[f"{profile}, median seed"] = by_length[len(planned) // 2].cells
     for rule in (MoveRule.CORNER_CUTTING, MoveRule.ROBOT_SAFE):
         shortest = shortest_path(SCENARIO.grid, SCENARIO.start, SCENARIO.goal, rule)
         paths[f"shortest, {rule.value}"] = shortest
-    figure, panels = plt.subplots(1, len(paths), figsize=(15, 4.2), layout="constrained")
-    for number, (axes, (planner, cells)) in enumerate(zip(panels, paths.items(), strict=True)):
+    figure, panels = plt.subplots(
+        1, len(paths), figsize=(15, 4.2), layout="constrained"
+    )
+    for number, (axes, (planner, cells)) in enumerate(
+        zip(panels, paths.items(), strict=True)
+    ):
         length = f"{path_length(cells):.2f} cells" if cells else "trapped"
         draw_map(axes, SCENARIO, f"{planner}: {length}")
         draw_path(axes, cells, number, planner)
     drawn = save_figure(
-        figure, settings.out / "goal_1.png", "As the paper's Fig. 7: the paths of goal i"
+        figure,
+        settings.out / "goal_1.png",
+        "As the paper's Fig. 7: the paths of goal i",
     )
     return f"{table(f'profile | {CONVERGENCE} | planning, ms', rows)}\n\n{drawn}"
 
@@ -101,14 +123,25 @@ def timed_plan(planner: Planner) -> tuple[Plan, float]:
 def ablation_report(settings: Settings) -> str:
     """Return the table of the ablation, and write its curves."""
     rows = []
-    figure, panels = plt.subplots(2, len(PROFILES), figsize=(13, 7.5), layout="constrained")
+    figure, panels = plt.subplots(
+        2, len(PROFILES), figsize=(13, 7.5), layout="constrained"
+    )
     for (upper, lower), profile in zip(panels.T, PROFILES, strict=True):
-        runs = {variant: settings.evaluations(f"{profile}/{variant}") for variant in VARIANTS}
-        rows += [[profile, variant, *convergence_row(of)] for variant, of in runs.items()]
+        runs = {
+            variant: settings.evaluations(f"{profile}/{variant}")
+            for variant in VARIANTS
+        }
+        rows += [
+            [profile, variant, *convergence_row(of)] for variant, of in runs.items()
+        ]
         edges = np.linspace(0, runs["both"][0]["step"][-1], BINS + 1)
-        rewards = {v: _rewards(settings.folders(f"{profile}/{v}"), edges) for v in VARIANTS}
+        rewards = {
+            v: _rewards(settings.folders(f"{profile}/{v}"), edges) for v in VARIANTS
+        }
         middle = (edges[:-1] + edges[1:]) / 2
-        draw_curves(upper, middle, rewards, "environment steps", "average reward per step")
+        draw_curves(
+            upper, middle, rewards, "environment steps", "average reward per step"
+        )
         draw_shares(lower, runs)
         upper.set_title(f"profile {profile}", loc="left")
     handles, labels = panels[0, 0].get_legend_handles_labels()
@@ -121,8 +154,13 @@ def ablation_report(settings: Settings) -> str:
 def draw_shares(axes: Any, runs: dict[str, list[Evaluations]]) -> None:
     """Draw the share of the seeds that are solved from the start, over the steps."""
     steps = next(iter(runs.values()))[0]["step"]
-    shares = {name: [np.mean([run["solved"] for run in of], axis=0)] for name, of in runs.items()}
-    draw_curves(axes, steps, shares, "environment steps", "share of seeds solved from the start")
+    shares = {
+        name: [np.mean([run["solved"] for run in of], axis=0)]
+        for name, of in runs.items()
+    }
+    draw_curves(
+        axes, steps, shares, "environment steps", "share of seeds solved from the start"
+    )
     axes.set_ylim(-0.05, 1.05)
 
 

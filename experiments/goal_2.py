@@ -22,7 +22,19 @@ from ddqn_planner.training.propagation import PropagationLearner
 
 # The paper's dilemma on its rebuilt map: the start and ten more cells.
 START_DEAD_END: Final[frozenset[Cell]] = frozenset(
-    {(6, 6), (4, 6), (4, 7), (4, 8), (5, 6), (5, 7), (5, 8), (6, 7), (6, 8), (7, 6), (7, 7)}
+    {
+        (6, 6),
+        (4, 6),
+        (4, 7),
+        (4, 8),
+        (5, 6),
+        (5, 7),
+        (5, 8),
+        (6, 7),
+        (6, 8),
+        (7, 6),
+        (7, 7),
+    }
 )
 # The folder and the target of each. The paper's equation, as it is printed, leaves θ⁻ out.
 TARGETS = {
@@ -34,9 +46,7 @@ COLUMNS = (
     "profile | solved, of 286 | without action masking | of the dilemma's 10 | "
     "mean length / optimum | worst"
 )
-TARGET_COLUMNS = (
-    "target | seeds solved from the start | starts solved | over-estimation, last 10 % | worst"
-)
+TARGET_COLUMNS = "target | seeds solved from the start | starts solved | over-estimation, last 10 % | worst"
 # The free cells except start and end: (H, W) bool, the paper's 286.
 STARTS = ~SCENARIO.grid.occupancy
 STARTS[SCENARIO.start[::-1]] = STARTS[SCENARIO.goal[::-1]] = False
@@ -53,7 +63,10 @@ def trained_field(planner: Planner) -> QField:
     environment = GridVectorEnvironment([SCENARIO], PROFILES["propagation"])
     network, cells = planner.network, np.arange(occupancy.size)
     assert isinstance(network, PropagationQNetwork)
-    parts = [{name: tensor.copy() for name, tensor in network.tensors.items()} for _ in range(4)]
+    parts = [
+        {name: tensor.copy() for name, tensor in network.tensors.items()}
+        for _ in range(4)
+    ]
     learner = PropagationLearner(network, tuple(parts), environment)
     q_CA = learner.q_values(np.zeros_like(cells), cells)
     q_AHW = q_CA.T.reshape(len(MOVES), *occupancy.shape)
@@ -77,9 +90,14 @@ def report(settings: Settings) -> str:
     x, y = np.transpose(sorted(START_DEAD_END - {SCENARIO.start}))
     rows, ratios = [], {}
     for label, of_seeds in fields.items():
-        masked, unmasked = _ratios(of_seeds), _ratios([field.unmasked() for field in of_seeds])
+        masked, unmasked = (
+            _ratios(of_seeds),
+            _ratios([field.unmasked() for field in of_seeds]),
+        )
         solved = count_solved(masked, STARTS), count_solved(unmasked, STARTS)
-        lengths = mean_and_worst([ratio[STARTS & np.isfinite(ratio)] for ratio in masked])
+        lengths = mean_and_worst(
+            [ratio[STARTS & np.isfinite(ratio)] for ratio in masked]
+        )
         rows.append([label, *solved, count_solved(masked, (y, x)), *lengths])
         ratios[label] = masked
     return f"{table(COLUMNS, rows)}\n\n{_draw(settings, ratios)}"
@@ -87,7 +105,9 @@ def report(settings: Settings) -> str:
 
 def _draw(settings: Settings, ratios: dict[str, list[NDArray[np.float64]]]) -> str:
     """Colour each cell by the number of seeds that solve it."""
-    figure, panels = plt.subplots(1, len(PROFILES), figsize=(11, 5), layout="constrained")
+    figure, panels = plt.subplots(
+        1, len(PROFILES), figsize=(11, 5), layout="constrained"
+    )
     seeds = settings.seeds
     colours = ListedColormap(plt.get_cmap("RdYlBu")(np.linspace(0.08, 0.92, seeds + 1)))
     norm = BoundaryNorm(np.arange(seeds + 2) - 0.5, seeds + 1)
@@ -96,7 +116,9 @@ def _draw(settings: Settings, ratios: dict[str, list[NDArray[np.float64]]]) -> s
     border = {"color": "black", "linewidth": 2.5, "zorder": 3}
     for axes, profile in zip(panels, PROFILES, strict=True):
         solved = np.sum([np.isfinite(ratio) for ratio in ratios[profile]], axis=0)
-        image = axes.imshow(np.where(free, solved, np.nan), cmap=colours, norm=norm, origin="lower")
+        image = axes.imshow(
+            np.where(free, solved, np.nan), cmap=colours, norm=norm, origin="lower"
+        )
         draw_map(axes, SCENARIO, f"profile {profile}")
         for x, y in START_DEAD_END:
             for side in (-1, 1):
@@ -114,7 +136,8 @@ def _draw(settings: Settings, ratios: dict[str, list[NDArray[np.float64]]]) -> s
 def target_trainings(settings: Settings) -> list[Training]:
     """Return the trainings of the profile paper with each target."""
     parameters_of = {
-        folder: replace(PROFILES["paper"], target=target) for folder, target in TARGETS.values()
+        folder: replace(PROFILES["paper"], target=target)
+        for folder, target in TARGETS.values()
     }
     return settings.trainings(parameters_of, [SCENARIO])
 
@@ -122,8 +145,12 @@ def target_trainings(settings: Settings) -> list[Training]:
 def target_report(settings: Settings) -> str:
     """Return the table of the targets, and write their figure."""
     rows = []
-    runs = {label: settings.evaluations(folder) for label, (folder, _) in TARGETS.items()}
-    estimates = {label: [run["overestimation"] for run in of] for label, of in runs.items()}
+    runs = {
+        label: settings.evaluations(folder) for label, (folder, _) in TARGETS.items()
+    }
+    estimates = {
+        label: [run["overestimation"] for run in of] for label, of in runs.items()
+    }
     for label, errors in estimates.items():
         late = [float(error[-max(len(error) // 10, 1) :].mean()) for error in errors]
         row = [

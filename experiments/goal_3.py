@@ -47,22 +47,26 @@ from ddqn_planner.training.trainer import Trainer
 
 TRAINING_MAPS, TEST_MAPS, NOISE_SEED = 100, 200, 0
 # The profile paper for many maps: the steps are the paper's, memory and filters ours.
-PAPER: Final = replace(PROFILES["paper"], steps=120_000, replay_capacity=120_000, filters=32)
+PAPER: Final = replace(
+    PROFILES["paper"], steps=120_000, replay_capacity=120_000, filters=32
+)
 EVALUATION_INTERVAL = 1_000
 SUPERVISED_UPDATES, SUPERVISED_BATCH, SUPERVISED_LEARNING_RATE = 10_000, 128, 0.003
 KEPT = "kept.safetensors"
-COLUMNS = (
-    "new obstacles | planner | training maps solved | test maps solved | mean length / optimum"
-)
+COLUMNS = "new obstacles | planner | training maps solved | test maps solved | mean length / optimum"
 
 
-def noisy_maps(training: int, test: int, noise: str) -> tuple[list[Scenario], list[Scenario]]:
+def noisy_maps(
+    training: int, test: int, noise: str
+) -> tuple[list[Scenario], list[Scenario]]:
     """Draw training and test maps, all different, with new obstacles on or near goal i's path."""
     path = shortest_path(SCENARIO.grid, SCENARIO.start, SCENARIO.goal, MOVE_RULE)
     random = np.random.default_rng(NOISE_SEED)
     scenarios: dict[str, Scenario] = {}
     while len(scenarios) < training + test:
-        grid, _ = scatter_obstacles(SCENARIO.grid, path, MOVE_RULE, random, NOISE[noise])
+        grid, _ = scatter_obstacles(
+            SCENARIO.grid, path, MOVE_RULE, random, NOISE[noise]
+        )
         scenarios.setdefault(grid.fingerprint, replace(SCENARIO, grid=grid))
     drawn = list(scenarios.values())
     return drawn[:training], drawn[training:]
@@ -70,7 +74,9 @@ def noisy_maps(training: int, test: int, noise: str) -> tuple[list[Scenario], li
 
 def drawn_maps(settings: Settings, noise: str) -> tuple[list[Scenario], list[Scenario]]:
     """Return the noisy maps of the experiment."""
-    return noisy_maps(*((4, 6) if settings.quick else (TRAINING_MAPS, TEST_MAPS)), noise)
+    return noisy_maps(
+        *((4, 6) if settings.quick else (TRAINING_MAPS, TEST_MAPS)), noise
+    )
 
 
 def networks(settings: Settings) -> dict[str, tuple[str, HyperParameters]]:
@@ -86,7 +92,9 @@ def trainings(settings: Settings) -> list[Training]:
     """Return the trainings of each network on the training maps of each noise."""
     found = []
     for noise in settings.noise:
-        parameters_of = {f"{noise}/{name}": p for name, p in networks(settings).values()}
+        parameters_of = {
+            f"{noise}/{name}": p for name, p in networks(settings).values()
+        }
         maps, _ = drawn_maps(settings, noise)
         found += settings.trainings(parameters_of, maps, EVALUATION_INTERVAL)
     return found
@@ -129,9 +137,13 @@ def best_moves(scenario: Scenario) -> NDArray[np.bool_]:
     """Return the moves that begin a shortest path: (C, 8) bool, none where there is no path."""
     occupancy = scenario.grid.occupancy
     distance = shortest_distances(scenario.grid, scenario.goal, MOVE_RULE).ravel()
-    onward_AC = np.append(distance, np.inf)[neighbours(occupancy.shape)] + LENGTHS[:, None]
+    onward_AC = (
+        np.append(distance, np.inf)[neighbours(occupancy.shape)] + LENGTHS[:, None]
+    )
     legal_AC = legal_moves(occupancy, MOVE_RULE).reshape(len(LENGTHS), -1)
-    return np.array((legal_AC & np.isfinite(onward_AC) & (onward_AC <= distance + 1e-9)).T)
+    return np.array(
+        (legal_AC & np.isfinite(onward_AC) & (onward_AC <= distance + 1e-9)).T
+    )
 
 
 def fixed_path(maps: Sequence[Scenario]) -> tuple[Cell, ...]:
@@ -149,23 +161,34 @@ def report(settings: Settings) -> str:
         maps, lengths = GridVectorEnvironment([*training, *test], PAPER), {}
         for label, (folder, parameters) in networks(settings).items():
             name = f"{noise}/{folder}"
-            lengths[label] = np.array([rollouts(p, maps)[0] for p in settings.planners(name, KEPT)])
+            lengths[label] = np.array(
+                [rollouts(p, maps)[0] for p in settings.planners(name, KEPT)]
+            )
             # Obstacles on the path alone can be avoided by one fixed path.
             if parameters.network == "paper" and noise == "near_path":
-                taught = {f"{name}/supervised": replace(parameters, steps=SUPERVISED_UPDATES)}
+                taught = {
+                    f"{name}/supervised": replace(parameters, steps=SUPERVISED_UPDATES)
+                }
                 jobs = settings.trainings(taught, training)
                 in_parallel(train_supervised, jobs, settings.backend)
                 planners = settings.planners(*taught)
-                lengths[f"{label}, supervised"] = np.array([rollouts(p, maps)[0] for p in planners])
+                lengths[f"{label}, supervised"] = np.array(
+                    [rollouts(p, maps)[0] for p in planners]
+                )
         path = fixed_path(training)
         is_free = [all(map(scenario.grid.is_free, path)) for scenario in maps.scenarios]
-        lengths["one fixed path"] = np.where([is_free], path_length(path, MOVE_RULE), np.nan)
+        lengths["one fixed path"] = np.where(
+            [is_free], path_length(path, MOVE_RULE), np.nan
+        )
         distances = (shortest_distances(s.grid, s.goal, MOVE_RULE) for s in test)
         optimum = np.array([d[SCENARIO.start[::-1]] for d in distances])
         for label, of_seeds in lengths.items():
             parts = np.split(np.isfinite(of_seeds), [len(training)], axis=1)
             counts = [median_and_range(part.sum(axis=1).tolist()) for part in parts]
-            ratios = [ratio[np.isfinite(ratio)] for ratio in of_seeds[:, len(training) :] / optimum]
+            ratios = [
+                ratio[np.isfinite(ratio)]
+                for ratio in of_seeds[:, len(training) :] / optimum
+            ]
             rows.append([noise, label, *counts, mean_and_worst(ratios)[0]])
     drawn = table(COLUMNS, rows), _draw(settings)
     return "\n\n".join(drawn)
@@ -186,13 +209,17 @@ def _draw(settings: Settings) -> str:
         for axes, scenario in zip(row, drawn_maps(settings, noise)[1], strict=False):
             draw_map(axes, scenario, noise)
             for y, x in np.argwhere(scenario.grid.occupancy & ~before):
-                cell = Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor="#E69F00", edgecolor="black")
+                cell = Rectangle(
+                    (x - 0.5, y - 0.5), 1, 1, facecolor="#E69F00", edgecolor="black"
+                )
                 axes.add_patch(cell)
             for number, (label, planner) in enumerate(planners.items()):
                 plan = planner.plan(scenario.grid, scenario.start, scenario.goal)
                 draw_path(axes, plan.cells, number, label)
             handles, labels = axes.get_legend_handles_labels()
             legend |= dict(zip(labels, handles, strict=True))
-    figure.legend([*legend.values()], [*legend], loc="outside lower center", ncols=len(legend))
+    figure.legend(
+        [*legend.values()], [*legend], loc="outside lower center", ncols=len(legend)
+    )
     caption = "As the paper's Fig. 9: the first three test maps of each reading"
     return save_figure(figure, settings.out / "goal_3.png", caption)

@@ -27,7 +27,9 @@ from ddqn_planner.nodes.nav2 import QUEUES
 from ddqn_planner.nodes.runtime import LATCHED
 
 REQUESTS, CLIENTS, CHANGES, GOALS_PER_MAP = 10_000, 8, 50, 40
-WARM_UP = 0.3  # of the requests, in which the planner comes to keep as many fields as it may
+WARM_UP = (
+    0.3  # of the requests, in which the planner comes to keep as many fields as it may
+)
 GOALS, GOALS_PERIOD = 2000, 0.005
 SIZES, COUNTS, BURST_CLIENTS, BURSTS = (20, 400, 2000), (20, 50, 200), (1, 20), 30
 BURST_GOALS = 2  # as many as the fields of the greatest map that the planner keeps
@@ -45,12 +47,16 @@ def ask(seed: int, count: int, shared: SimpleNamespace) -> None:
     random, maps = np.random.default_rng(seed), three_maps()
     asked = [fixture.requests(GOALS_PER_MAP, random) for fixture in maps]
     with ros.Client() as client:
-        client.call(GetPlan, "planner/get_plan")  # not measured: it waits for the service
+        client.call(
+            GetPlan, "planner/get_plan"
+        )  # not measured: it waits for the service
         shared.ready.wait(ros.TIMEOUT)
         for _ in range(count):
             first = shared.confirmed.value
             current = first % len(maps)
-            one, other = (asked[current][i] for i in random.integers(GOALS_PER_MAP, size=2))
+            one, other = (
+                asked[current][i] for i in random.integers(GOALS_PER_MAP, size=2)
+            )
             request = GetPlan.Request(start=one.start, goal=other.goal)
             began = time.perf_counter()
             try:
@@ -92,7 +98,9 @@ def load_requests(planner: int, requests: int, clients: int) -> bool:
                 shared.published.value = number
                 send_map(number)
                 shared.confirmed.value = number
-            answers.append(shared.answers.get(timeout=2 * ros.TIMEOUT))  # Empty if a process failed
+            answers.append(
+                shared.answers.get(timeout=2 * ros.TIMEOUT)
+            )  # Empty if a process failed
             if len(answers) == math.ceil(WARM_UP * requests):
                 first_memory = memory(planner)
         last_memory = memory(planner)
@@ -119,7 +127,9 @@ def load_goals(goals: int) -> bool:
     # All free cells are joined.
     cells = random.permutation(grid.free_cells())[: goals + 1].tolist()
     from_start, *poses = (ros.pose(grid, (x, y)) for x, y in cells)
-    numbers = {ros.cell_of(grid, stamped): number for number, stamped in enumerate(poses)}
+    numbers = {
+        ros.cell_of(grid, stamped): number for number, stamped in enumerate(poses)
+    }
     with ros.Client() as client:
         diagnostics = client.subscribe(DiagnosticArray, "/diagnostics", keep=1)
         client.publish("map", message, LATCHED)
@@ -135,7 +145,9 @@ def load_goals(goals: int) -> bool:
         seconds = time.monotonic() - began
         plans.wait(lambda plan: numbers[ros.cell_of(grid, plan.poses[-1])] == goals - 1)
         time.sleep(2)  # a plan for an older goal would come now
-        order = [numbers[ros.cell_of(grid, plan.poses[-1])] for plan in plans.messages()]
+        order = [
+            numbers[ros.cell_of(grid, plan.poses[-1])] for plan in plans.messages()
+        ]
     print(f"goal_pose: {goals} goals in {seconds:.1f} s, {len(order)} plans published")
     late = sum(later < earlier for earlier, later in itertools.pairwise(order))
     return report("  plans for a goal before the last one's", late, "", 0)
@@ -145,11 +157,16 @@ class BurstClients(ros.Client):
     """Clients of one service in one process."""
 
     def __init__(
-        self, clients: int, service_type: Any = GetPlan, service: str = "planner/get_plan"
+        self,
+        clients: int,
+        service_type: Any = GetPlan,
+        service: str = "planner/get_plan",
     ) -> None:
         super().__init__(name="bursts")
         self._clients = [
-            self.node.create_client(service_type, service, qos_profile=ros.SERVICE_QUALITY)
+            self.node.create_client(
+                service_type, service, qos_profile=ros.SERVICE_QUALITY
+            )
             for _ in range(clients)
         ]
         for client in self._clients:
@@ -170,7 +187,9 @@ class BurstClients(ros.Client):
 class GoalBursts(ros.Client):
     """A client of Nav2's action `compute_path_to_pose`; it needs nav2_msgs."""
 
-    def __init__(self, action: str = "compute_path_to_pose", node: str = "planner") -> None:
+    def __init__(
+        self, action: str = "compute_path_to_pose", node: str = "planner"
+    ) -> None:
         from nav2_msgs.action import ComputePathToPose
 
         super().__init__(name="goal_bursts")
@@ -217,16 +236,27 @@ def load_bursts(
     for size in sizes:
         fixture = ros.generated_map("rooms", size, resolution=0.5)
         free = fixture.grid.free_cells()
-        goals = [free[i] for i in np.random.default_rng(1).integers(len(free), size=BURST_GOALS)]
+        goals = [
+            free[i]
+            for i in np.random.default_rng(1).integers(len(free), size=BURST_GOALS)
+        ]
         sent = {
-            count: [burst_requests(fixture.grid, goals, count, seed) for seed in range(bursts)]
+            count: [
+                burst_requests(fixture.grid, goals, count, seed)
+                for seed in range(bursts)
+            ]
             for count in counts
         }
 
-        def wrong(asking: BurstClients, asked: Sequence[Any], fixture: Any = fixture) -> int:
+        def wrong(
+            asking: BurstClients, asked: Sequence[Any], fixture: Any = fixture
+        ) -> int:
             """Send a burst; count the answers that are lost, or no path where there is one."""
             answers = zip(asked, asking.burst(asked), strict=True)
-            return sum(not it or bool(fixture.error(request, it.plan)) for request, it in answers)
+            return sum(
+                not it or bool(fixture.error(request, it.plan))
+                for request, it in answers
+            )
 
         with BurstClients(1) as one:
             one.publish("map", fixture.message(), LATCHED)
@@ -242,14 +272,23 @@ def load_bursts(
     with suppress(ModuleNotFoundError), GoalBursts() as action:
         for count in counts:
             missing = sum(count - action.burst(requests) for requests in sent[count])
-            yield report(f"{bursts} bursts of {count} actions: without a result", missing, "", 0)
+            yield report(
+                f"{bursts} bursts of {count} actions: without a result", missing, "", 0
+            )
 
 
 def main(arguments: Sequence[str]) -> int:
     """Load a planner node with requests and with goals; return 1 if anything is lost or wrong."""
     requests = int(arguments[0]) if arguments else REQUESTS
-    with claim_ros_domain(), running_node("planner_node", "--log-level", "error") as planner:
-        failed = [load_requests(planner.pid, requests, CLIENTS), load_goals(GOALS), *load_bursts()]
+    with (
+        claim_ros_domain(),
+        running_node("planner_node", "--log-level", "error") as planner,
+    ):
+        failed = [
+            load_requests(planner.pid, requests, CLIENTS),
+            load_goals(GOALS),
+            *load_bursts(),
+        ]
     return int(any(failed))
 
 

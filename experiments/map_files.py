@@ -15,7 +15,9 @@ def save_map(grid: GridMap | MapFile, path: str | Path) -> None:
     """Write a ROS map: YAML and PGM, and one for directions; `GridMap.obstacles` is left out."""
     path = as_path(path)
     if path.suffix.lower() not in (".yaml", ".yml"):
-        raise MapFileError(f"{path}: ends in {path.suffix!r}; give a path that ends in .yaml")
+        raise MapFileError(
+            f"{path}: ends in {path.suffix!r}; give a path that ends in .yaml"
+        )
     if isinstance(grid, GridMap):
         cost = 0 if grid.cost is None else grid.cost
         percent = np.where(grid.occupancy, 100, cost).astype(np.int8)
@@ -37,13 +39,17 @@ def save_map(grid: GridMap | MapFile, path: str | Path) -> None:
         "free_thresh": 0.196,  # grey 205 would be free at 0.25
     }
     cells = {"start": grid.start, "goal": grid.goal}
-    ours: dict[str, Any] = {name: list(cell) for name, cell in cells.items() if cell is not None}
+    ours: dict[str, Any] = {
+        name: list(cell) for name, cell in cells.items() if cell is not None
+    }
     if grid.forbidden is not None:
         ours["directions"] = f"{path.stem}_directions.pgm"
         write_atomically(path.with_name(ours["directions"]), _pgm(grid.forbidden))
     if ours:
         metadata["ddqn_planner"] = ours
-    text = yaml.safe_dump(metadata, sort_keys=False, allow_unicode=True, default_flow_style=None)
+    text = yaml.safe_dump(
+        metadata, sort_keys=False, allow_unicode=True, default_flow_style=None
+    )
     write_atomically(path, text.encode())
 
 

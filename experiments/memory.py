@@ -31,10 +31,17 @@ def measure_layers(fixture: ros.MapFixture) -> None:
     start, goal = (ros.cell_of(grid, pose) for pose in (request.start, request.goal))
     field = planner.q_field(grid, goal, ros.RULE)
     field.rollout(start)
-    layers = [value.nbytes for value in vars(grid).values() if isinstance(value, np.ndarray)]
+    layers = [
+        value.nbytes for value in vars(grid).values() if isinstance(value, np.ndarray)
+    ]
     patches = field.costs.patch.nbytes if field.costs is not None else 0
     cells = grid.occupancy.size
-    sizes = {"message": cells, "map": sum(layers), "patches": patches, "a field": field.nbytes}
+    sizes = {
+        "message": cells,
+        "map": sum(layers),
+        "patches": patches,
+        "a field": field.nbytes,
+    }
     words = ", ".join(f"{name} {size / 1e6:.1f} MB" for name, size in sizes.items())
     print(f"{grid.width}x{grid.height}: {words}")
 
@@ -46,7 +53,9 @@ def measure_node(
     requests = fixture.requests(PLANS, np.random.default_rng(0))
     with ros.Client() as client, processes.running_node("planner_node") as node:
         if map_file is not None:
-            server = processes.running_node("map_server_node", yaml_filename=map_file.resolve())
+            server = processes.running_node(
+                "map_server_node", yaml_filename=map_file.resolve()
+            )
             client.enter_context(server)
         else:
             client.publish("map", fixture.message(), LATCHED)
@@ -58,11 +67,16 @@ def measure_node(
             ros.ask(get_plan, request)
             greatest = max(greatest, processes.memory(node.pid))
         split = ", ".join(
-            f"{words} {processes.memory(node.pid, kind):.0f}" for kind, words in KINDS.items()
+            f"{words} {processes.memory(node.pid, kind):.0f}"
+            for kind, words in KINDS.items()
         )
         peak = processes.memory(node.pid, "VmHWM")
-        print(f"{name}: MB after {PLANS} plans: {split}; the greatest since the start {peak:.0f}")
-        yield report(f"{name}: planner_node, after any of the plans", greatest, "MB", bound)
+        print(
+            f"{name}: MB after {PLANS} plans: {split}; the greatest since the start {peak:.0f}"
+        )
+        yield report(
+            f"{name}: planner_node, after any of the plans", greatest, "MB", bound
+        )
 
 
 def measure_reloads() -> Iterator[bool]:
@@ -76,7 +90,9 @@ def measure_reloads() -> Iterator[bool]:
                 assert ros.ask(reload_model, Trigger.Request()).success
             time.sleep(SETTLED)
             memory.append(processes.memory(node.pid, "RssAnon"))
-    yield report(f"{RELOADS} reloads of the model: growth", memory[1] - memory[0], "MB", 1)
+    yield report(
+        f"{RELOADS} reloads of the model: growth", memory[1] - memory[0], "MB", 1
+    )
 
 
 def main(_: Sequence[str]) -> int:

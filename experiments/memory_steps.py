@@ -61,8 +61,13 @@ def main() -> None:
     for name, step in STEPS.items():
         load_results.append(step())
         memory = [processes.memory(os.getpid(), kind) for kind in KINDS]
-        print(f"| {name} | " + " | ".join(f"{size:.0f}" for size in memory) + " |", flush=True)
-    loaded = [name for name in ("scipy", "PIL", "matplotlib", "torch") if name in sys.modules]
+        print(
+            f"| {name} | " + " | ".join(f"{size:.0f}" for size in memory) + " |",
+            flush=True,
+        )
+    loaded = [
+        name for name in ("scipy", "PIL", "matplotlib", "torch") if name in sys.modules
+    ]
     print("modules that no plan needs:", ", ".join(loaded) or "none")
 
 

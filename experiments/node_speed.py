@@ -35,7 +35,9 @@ RATE = 5  # maps per second
 IDLE = 30  # seconds
 SETTLED = 0.6  # seconds after which a client is known to DDS
 FREE = float("inf")
-Usage = tuple[float, float, float]  # wall time and CPU time, seconds; resident memory, MB
+Usage = tuple[
+    float, float, float
+]  # wall time and CPU time, seconds; resident memory, MB
 
 
 def usage(child: AbstractContextManager[Any], wait: Callable[[], Any]) -> Usage:
@@ -44,7 +46,11 @@ def usage(child: AbstractContextManager[Any], wait: Callable[[], Any]) -> Usage:
     began = time.monotonic()
     with child as node:
         wait()
-        return time.monotonic() - began, processes.cpu_seconds(node.pid), processes.memory(node.pid)
+        return (
+            time.monotonic() - began,
+            processes.cpu_seconds(node.pid),
+            processes.memory(node.pid),
+        )
 
 
 # A client per start: one that has seen other nodes end is discovered more slowly.
@@ -62,7 +68,12 @@ def start_planner(*environment: str) -> Usage:
             client.publish_ends(request)
             plans.wait(lambda plan: plan.poses)
 
-        command = processes.executable("planner_node"), "--ros-args", "--log-level", "error"
+        command = (
+            processes.executable("planner_node"),
+            "--ros-args",
+            "--log-level",
+            "error",
+        )
         return usage(processes.running("env", *environment, *command), first_plan)
 
 
@@ -76,14 +87,18 @@ def start_map_server() -> Usage:
     """Start the map server; return what it takes until its first map is received."""
     with ros.Client() as client:
         maps = client.subscribe(OccupancyGrid, "map", LATCHED)
-        return usage(processes.running_node("map_server_node", "--log-level", "error"), maps.wait)
+        return usage(
+            processes.running_node("map_server_node", "--log-level", "error"), maps.wait
+        )
 
 
 def start_bare_node() -> Usage:
     """Start a node with one service; return what it takes until it is discovered."""
     with ros.Client() as client:
         ready = client.node.create_client(GetPlan, "bare/get_plan").service_is_ready
-        return usage(processes.running(*BARE, "0"), lambda: ros.wait_for("the bare node", ready))
+        return usage(
+            processes.running(*BARE, "0"), lambda: ros.wait_for("the bare node", ready)
+        )
 
 
 def run_command(*command: str) -> Usage:
@@ -104,7 +119,9 @@ def run_command(*command: str) -> Usage:
 def measure_starts() -> Iterator[bool]:
     """Print the medians of some starts beside their bounds."""
     imported = partial(run_command, sys.executable, "-c", "import ddqn_planner")
-    planned = partial(run_command, processes.executable("ddqn-planner"), "plan", "dilemma")
+    planned = partial(
+        run_command, processes.executable("ddqn-planner"), "plan", "dilemma"
+    )
     starts: dict[str, tuple[Callable[[], Usage], Usage]] = {
         "a bare rclpy node, discovered": (start_bare_node, (FREE, FREE, FREE)),
         "map_server_node to its first map": (start_map_server, (0.8, FREE, 90)),
@@ -116,7 +133,9 @@ def measure_starts() -> Iterator[bool]:
     for name, (start, bounds) in starts.items():
         columns = list(zip(*(start() for _ in range(STARTS)), strict=True))
         name = f"{name} (slowest {max(columns[0]):.2f} s)"
-        for column, unit, bound in zip(columns, ("s", "CPU", "MB"), bounds, strict=True):
+        for column, unit, bound in zip(
+            columns, ("s", "CPU", "MB"), bounds, strict=True
+        ):
             yield report(name, statistics.median(column), unit, bound)
 
 
@@ -143,8 +162,13 @@ def measure_requests(client: ros.Client, map_file: Path) -> Iterator[bool]:
             with processes.running(*BARE, str(poses)):
                 bare = client.service(GetPlan, "bare/get_plan")
                 timed(bare, request)
-                both = [[timed(s, request)[0] for s in (planner, bare)] for _ in range(CALLS)]
-            ours, theirs = (statistics.median(column) for column in zip(*both, strict=True))
+                both = [
+                    [timed(s, request)[0] for s in (planner, bare)]
+                    for _ in range(CALLS)
+                ]
+            ours, theirs = (
+                statistics.median(column) for column in zip(*both, strict=True)
+            )
             ratios.append(ours / theirs)
             print(
                 f"GetPlan of {poses} poses: first {took:.1f} ms, then {ours:.2f} ms; bare "
@@ -180,24 +204,36 @@ def measure_large_map(client: ros.Client) -> Iterator[bool]:
                 while not plan.done():
                     times.append(timed(service, question)[0])
                 waited.append(1e3 * (time.perf_counter() - began))
-            figure = f"{LARGE}x{LARGE}, field under way: {name}, slowest of {len(times)}"
+            figure = (
+                f"{LARGE}x{LARGE}, field under way: {name}, slowest of {len(times)}"
+            )
             yield report(figure, max(times), "ms", 100)
-        print(f"{LARGE}x{LARGE}: GetPlan with a new field, {statistics.median(waited):.0f} ms")
+        print(
+            f"{LARGE}x{LARGE}: GetPlan with a new field, {statistics.median(waited):.0f} ms"
+        )
         peak = processes.memory(planner.pid, "VmHWM")
-        yield report(f"{LARGE}x{LARGE}: planner node, greatest memory", peak, "MB", 2000)
+        yield report(
+            f"{LARGE}x{LARGE}: planner node, greatest memory", peak, "MB", 2000
+        )
         plans, seconds = client.subscribe(PathMessage, "plan", LATCHED), []
         for turns in (1, 2, 3):
             origin = LARGE * turns, 0.0, 0.0
-            turned = ros.MapFixture(MapFile(np.rot90(fixture.values, turns), 1.0, origin))
+            turned = ros.MapFixture(
+                MapFile(np.rot90(fixture.values, turns), 1.0, origin)
+            )
             client.publish_ends(*turned.requests(1, random))
-            time.sleep(2)  # until the node has answered that these lie outside the map before
+            time.sleep(
+                2
+            )  # until the node has answered that these lie outside the map before
             message = turned.message()
             plans.clear()
             began = time.monotonic()
             client.publish("map", message, LATCHED)
             plans.wait(lambda plan: plan.poses)
             seconds.append(time.monotonic() - began)
-    yield report(f"{LARGE}x{LARGE}: new map to path", statistics.median(seconds), "s", 0.3)
+    yield report(
+        f"{LARGE}x{LARGE}: new map to path", statistics.median(seconds), "s", 0.3
+    )
 
 
 def measure_changing_map(client: ros.Client) -> Iterator[bool]:
@@ -221,7 +257,10 @@ def measure_changing_map(client: ros.Client) -> Iterator[bool]:
         time.sleep(IDLE)
         idle = processes.cpu_seconds(planner.pid) - computed
         yield report(
-            f"{CHANGING}x{CHANGING}: no goal: share of a core", 100 * idle / IDLE, "%", 0.2
+            f"{CHANGING}x{CHANGING}: no goal: share of a core",
+            100 * idle / IDLE,
+            "%",
+            0.2,
         )
         client.publish_ends(ros.plan_request(grid, start, goal))
         for number, message in enumerate(messages):
@@ -229,7 +268,10 @@ def measure_changing_map(client: ros.Client) -> Iterator[bool]:
                 began, computed = time.monotonic(), processes.cpu_seconds(planner.pid)
             client.publish("map", message, LATCHED)
             time.sleep(1 / RATE)
-        seconds, computed = time.monotonic() - began, processes.cpu_seconds(planner.pid) - computed
+        seconds, computed = (
+            time.monotonic() - began,
+            processes.cpu_seconds(planner.pid) - computed,
+        )
     name = f"{CHANGING}x{CHANGING}: a few cells change, {RATE} Hz: share of a core"
     yield report(name, 100 * computed / seconds, "%", 8)
 
@@ -246,9 +288,13 @@ def measure_trainer(client: ros.Client) -> Iterator[bool]:
     for number in (signal.SIGINT, signal.SIGTERM):
         with (
             tempfile.TemporaryDirectory() as folder,
-            processes.running_node("trainer_node", output_folder=folder, **options) as trainer,
+            processes.running_node(
+                "trainer_node", output_folder=folder, **options
+            ) as trainer,
         ):
-            print(f"trainer: first ~/start, once torch is imported: {call('start'):.0f} ms")
+            print(
+                f"trainer: first ~/start, once torch is imported: {call('start'):.0f} ms"
+            )
             time.sleep(10)  # thousands of steps: a checkpoint and curves of some size
             for name in slowest:
                 slowest[name] = max(slowest[name], call(name, 50))
@@ -257,11 +303,15 @@ def measure_trainer(client: ros.Client) -> Iterator[bool]:
                 time.sleep(0.1)
             began = time.monotonic()
             trainer.send_signal(number)
-            assert trainer.wait() == 0, f"{number.name} ended it with {trainer.returncode}"
+            assert trainer.wait() == 0, (
+                f"{number.name} ended it with {trainer.returncode}"
+            )
             seconds = time.monotonic() - began
         yield report(f"trainer: {number.name} to exit", seconds, "s", 3)
     for name, ms in slowest.items():
-        yield report(f"trainer: ~/{name} while it trains, slowest of 100", ms, "ms", 100)
+        yield report(
+            f"trainer: ~/{name} while it trains, slowest of 100", ms, "ms", 100
+        )
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -35,7 +35,9 @@ def main() -> None:
             continue
         from_centre = random.random((2, 2)) - 0.5  # cells
         ends = positions(grid, np.array([start_cell, goal_cell]) + from_centre)
-        path = exact_path([plan.path], grid, plan.move_rule, [(x, y) for x, y in ends.tolist()])
+        path = exact_path(
+            [plan.path], grid, plan.move_rule, [(x, y) for x, y in ends.tolist()]
+        )
         of_paths.append(distances(path.points[[0, -1]], ends))
         of_centres.append(distances(positions(grid, plan.path[[0, -1]]), ends))
         with_more_points += len(path.points) > max(len(plan.path), 2)
@@ -50,7 +52,9 @@ def positions(grid: GridMap, cells: NDArray[np.generic]) -> NDArray[np.float64]:
     return np.column_stack(grid.centres(x, y))
 
 
-def distances(points: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
+def distances(
+    points: NDArray[np.float64], others: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return how far points (N, 2) lie from others."""
     lengths: NDArray[np.float64] = np.hypot(*(points - others).T)
     return lengths

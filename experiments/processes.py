@@ -26,7 +26,9 @@ def claim_ros_domain() -> socket.socket:
             os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
             return claim
         claim.close()
-    raise RuntimeError("all ROS domains from 1 to 100 are in use; end a demo or a test first")
+    raise RuntimeError(
+        "all ROS domains from 1 to 100 are in use; end a demo or a test first"
+    )
 
 
 def executable(name: str) -> str:
@@ -45,7 +47,10 @@ def _signals_held_back() -> Iterator[None]:
     held: list[int] = []
     numbers = signal.SIGINT, signal.SIGTERM
     # Handlers, not a mask: a child would inherit the mask.
-    handlers = [signal.signal(number, lambda number, _: held.append(number)) for number in numbers]
+    handlers = [
+        signal.signal(number, lambda number, _: held.append(number))
+        for number in numbers
+    ]
     try:
         yield
     finally:
@@ -63,7 +68,9 @@ def running(*command: str, **options: Any) -> Iterator[subprocess.Popen[bytes]]:
         # A signal inside Popen would lose the child that it has just begun.
         with _signals_held_back():
             # In a session of its own, it does not hear Ctrl-C: the parent does, and tidies up.
-            child = subprocess.Popen([*TIED, *command], start_new_session=True, **options)
+            child = subprocess.Popen(
+                [*TIED, *command], start_new_session=True, **options
+            )
         yield child
     finally:
         if child is not None:
@@ -80,7 +87,9 @@ def running_node(
     name: str, *arguments: str, **parameters: object
 ) -> AbstractContextManager[subprocess.Popen[bytes]]:
     """Run a node of the package with ROS arguments and parameters."""
-    given = [word for key, value in parameters.items() for word in ("-p", f"{key}:={value}")]
+    given = [
+        word for key, value in parameters.items() for word in ("-p", f"{key}:={value}")
+    ]
     return running(executable(name), "--ros-args", *arguments, *given)
 
 
@@ -92,7 +101,12 @@ def memory(process: int, kind: str = "VmRSS") -> float:
 
 def cpu_seconds(process: int) -> float:
     """Return how long a process has computed so far, in all its threads."""
-    fields = Path(f"/proc/{process}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+    fields = (
+        Path(f"/proc/{process}/stat")
+        .read_text(encoding="utf-8")
+        .rpartition(")")[2]
+        .split()
+    )
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 

@@ -12,10 +12,14 @@ from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.body import clearance
 
 MINIMUM_SIDE = 5  # of a map: a maze of two corridors between its walls
-SHORTEST_STEP = 3  # cells from one wall of a room to the next: it is at least two cells wide
+SHORTEST_STEP = (
+    3  # cells from one wall of a room to the next: it is at least two cells wide
+)
 EXTRA_LINKS = 0.15  # of the links outside the spanning tree are opened too
 
-Spans = list[tuple[int, int]]  # the first cell of each corridor and the cell after its last
+Spans = list[
+    tuple[int, int]
+]  # the first cell of each corridor and the cell after its last
 Random = np.random.Generator
 Integers = NDArray[np.int64]
 
@@ -40,11 +44,15 @@ def _maze(shape: tuple[int, int], random: Random) -> Occupancy:
 
 def _rooms(shape: tuple[int, int], random: Random) -> Occupancy:
     """Divide the map into rooms by walls one cell thick, with doors so that all are connected."""
-    longest = int(random.integers(SHORTEST_STEP, np.clip(min(shape) // 3, SHORTEST_STEP, 15) + 1))
+    longest = int(
+        random.integers(SHORTEST_STEP, np.clip(min(shape) // 3, SHORTEST_STEP, 15) + 1)
+    )
     y, x = (_wall_lines(0, side - 1, longest, random) for side in shape)
     occupancy = np.zeros(shape, dtype=np.bool_)
     occupancy[y] = occupancy[:, x] = True
-    row, column, next_row, next_column = _links(len(y) - 1, len(x) - 1, EXTRA_LINKS, random)
+    row, column, next_row, next_column = _links(
+        len(y) - 1, len(x) - 1, EXTRA_LINKS, random
+    )
     beside = next_column > column
     row, next_column = row[beside], next_column[beside]
     column, next_row = column[~beside], next_row[~beside]
@@ -65,12 +73,20 @@ def _corridors(shape: tuple[int, int], random: Random) -> Occupancy:
     row, column, next_row, next_column = _links(rows, columns, EXTRA_LINKS, random)
     widths = random.integers(1, 4, len(row))
     turns = random.random(len(row)) < 0.5
-    (y0s, y1s), (x0s, x1s) = ((of[row, column], of[next_row, next_column]) for of in (y, x))
+    (y0s, y1s), (x0s, x1s) = (
+        (of[row, column], of[next_row, next_column]) for of in (y, x)
+    )
     occupancy = np.ones(shape, dtype=np.bool_)
-    for y0, x0, y1, x1, width, turn in zip(y0s, x0s, y1s, x1s, widths, turns, strict=True):
+    for y0, x0, y1, x1, width, turn in zip(
+        y0s, x0s, y1s, x1s, widths, turns, strict=True
+    ):
         corner_y, corner_x = (y0, x1) if turn else (y1, x0)
-        occupancy[min(y0, y1) : max(y0, y1) + width, corner_x : corner_x + width] = False
-        occupancy[corner_y : corner_y + width, min(x0, x1) : max(x0, x1) + width] = False
+        occupancy[min(y0, y1) : max(y0, y1) + width, corner_x : corner_x + width] = (
+            False
+        )
+        occupancy[corner_y : corner_y + width, min(x0, x1) : max(x0, x1) + width] = (
+            False
+        )
     occupancy[[0, -1]] = occupancy[:, [0, -1]] = True
     return occupancy
 
@@ -116,7 +132,9 @@ def _office(shape: tuple[int, int], random: Random) -> Occupancy:
                 x = _wall_lines(left, right, 9, random)
                 occupancy[above + 1 : below, left + 1 : right] = False
                 occupancy[above + 1 : below, x] = True
-                _open_doors(occupancy.T, np.full(len(x) - 1, door), x[:-1], x[1:], random)
+                _open_doors(
+                    occupancy.T, np.full(len(x) - 1, door), x[:-1], x[1:], random
+                )
     for desk in random.integers(1, 4, (occupancy.size // 25, 2)).tolist():
         _stamp(occupancy, np.ones(desk, dtype=np.bool_), random)
     occupancy &= ~corridor  # desks stand in rooms only
@@ -137,7 +155,9 @@ def _links(
     order = random.permutation(len(first))
     first, second = first[order], second[order]
     numbers = np.arange(1, len(first) + 1)  # scipy reads a weight of 0 as no link
-    tree = minimum_spanning_tree(coo_matrix((numbers, (first, second)), (node.size, node.size)))
+    tree = minimum_spanning_tree(
+        coo_matrix((numbers, (first, second)), (node.size, node.size))
+    )
     linked = random.random(len(first)) < extra
     linked[tree.data.astype(np.int64) - 1] = True
     return *np.divmod(first[linked], columns), *np.divmod(second[linked], columns)
@@ -145,7 +165,9 @@ def _links(
 
 def _wall_lines(first: int, last: int, longest: int, random: Random) -> Integers:
     """Return where walls stand from the first to the last one, random steps apart."""
-    steps = random.integers(SHORTEST_STEP, longest + 1, (last - first) // SHORTEST_STEP + 1)
+    steps = random.integers(
+        SHORTEST_STEP, longest + 1, (last - first) // SHORTEST_STEP + 1
+    )
     lines = first + np.cumsum(steps)
     return np.concatenate([[first], lines[lines <= last - SHORTEST_STEP], [last]])
 
@@ -173,7 +195,9 @@ def _corridor_spans(side: int, count: int, random: Random) -> Spans:
     spans = []
     for index in range(count):
         width = int(random.integers(2, min(4, side - 2) + 1))
-        first = round((index + 0.5) * side / count - width / 2) + int(random.integers(-1, 2))
+        first = round((index + 0.5) * side / count - width / 2) + int(
+            random.integers(-1, 2)
+        )
         first = min(max(first, 1), side - 1 - width)
         spans.append((first, first + width))
     return spans
@@ -189,7 +213,10 @@ def _between(spans: Spans, side: int) -> Spans:
 
 # The function that makes each kind of map. All free cells are connected, except in random_*.
 KINDS: Final[dict[str, Callable[[tuple[int, int], Random], Occupancy]]] = {
-    **{f"random_{percent}": partial(_independent, percent / 100) for percent in (10, 20, 30, 40)},
+    **{
+        f"random_{percent}": partial(_independent, percent / 100)
+        for percent in (10, 20, 30, 40)
+    },
     "maze": _maze,
     "rooms": _rooms,
     "corridors": _corridors,
@@ -201,7 +228,9 @@ KINDS: Final[dict[str, Callable[[tuple[int, int], Random], Occupancy]]] = {
 def generate_map(kind: str, shape: tuple[int, int], random: Random) -> Occupancy:
     """Make a random map of a kind in `KINDS` in which a path joins at least two free cells."""
     if kind not in KINDS:
-        raise ValueError(f"the kind {kind!r} is unknown; give one of {', '.join(KINDS)}")
+        raise ValueError(
+            f"the kind {kind!r} is unknown; give one of {', '.join(KINDS)}"
+        )
     if min(shape) < MINIMUM_SIDE:
         raise ValueError(f"shape is {shape}; give (H, W) with H, W >= {MINIMUM_SIDE}")
     return KINDS[kind](shape, random)
@@ -220,5 +249,7 @@ def gradient_costs(occupancy: Occupancy, random: Random) -> NDArray[np.int8]:
 def inflated_costs(occupancy: Occupancy, radius: float) -> NDArray[np.int8]:
     """Return (H, W) costs that fall exponentially around obstacles: 0 beyond `radius` cells."""
     distance = np.maximum(clearance(occupancy), 1)  # occupied cells do not matter
-    costs = np.where(distance <= radius, np.rint(99 ** (1 - (distance - 1) / radius)), 0)
+    costs = np.where(
+        distance <= radius, np.rint(99 ** (1 - (distance - 1) / radius)), 0
+    )
     return costs.astype(np.int8) * ~occupancy

@@ -33,14 +33,20 @@ from ddqn_planner.cli import exit_code
 ALL_VARIANTS: Final = partial(goal_1.trainings, variants=tuple(goal_1.VARIANTS))
 # The title of each, its trainings, and the report of their results.
 EXPERIMENTS: Final[
-    dict[str, tuple[str, Callable[[Settings], list[Training]], Callable[[Settings], str]]]
+    dict[
+        str, tuple[str, Callable[[Settings], list[Training]], Callable[[Settings], str]]
+    ]
 ] = {
     "goal-1": ("Goal i: from the given start", goal_1.trainings, goal_1.report),
     "ablation": ("Goal i: the ablation", ALL_VARIANTS, goal_1.ablation_report),
     # It asks more of the networks of goal i.
     "goal-2": ("Goal ii: from every free cell", goal_1.trainings, goal_2.report),
     "goal-3": ("Goal iii: noisy maps", goal_3.trainings, goal_3.report),
-    "targets": ("What the printed target does", goal_2.target_trainings, goal_2.target_report),
+    "targets": (
+        "What the printed target does",
+        goal_2.target_trainings,
+        goal_2.target_report,
+    ),
     "any-map": ("The model for any map", any_map.trainings, any_map.report),
 }
 
@@ -49,10 +55,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; return the exit code."""
     parser = parser_of("reproduce.py", __doc__, "runs/reproduce")
     add = parser.add_argument
-    add("--experiment", choices=[*EXPERIMENTS, "all"], default="all", help="one, or all")
-    add("--noise", nargs="+", choices=NOISE, default=[*NOISE], help="new obstacles of goal iii")
+    add(
+        "--experiment", choices=[*EXPERIMENTS, "all"], default="all", help="one, or all"
+    )
+    add(
+        "--noise",
+        nargs="+",
+        choices=NOISE,
+        default=[*NOISE],
+        help="new obstacles of goal iii",
+    )
     units = "hidden layers of the paper's network for goal iii"
-    add("--hidden-units", nargs="+", type=int, default=[*HIDDEN_UNITS], metavar="N", help=units)
+    add(
+        "--hidden-units",
+        nargs="+",
+        type=int,
+        default=[*HIDDEN_UNITS],
+        metavar="N",
+        help=units,
+    )
     options = parser.parse_args(arguments)
     return exit_code(parser.prog, lambda: reproduce(options))
 
@@ -71,12 +92,16 @@ def reproduce(options: argparse.Namespace) -> int:
     names = [*EXPERIMENTS] if options.experiment == "all" else [options.experiment]
     # Experiments share trainings: each folder is trained once.
     trainings = {
-        training.folder: training for name in names for training in EXPERIMENTS[name][1](settings)
+        training.folder: training
+        for name in names
+        for training in EXPERIMENTS[name][1](settings)
     }
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         in_parallel(train, list(trainings.values()), settings.backend)
-        sections = {EXPERIMENTS[name][0]: EXPERIMENTS[name][2](settings) for name in names}
+        sections = {
+            EXPERIMENTS[name][0]: EXPERIMENTS[name][2](settings) for name in names
+        }
     except KeyboardInterrupt:
         print("interrupted; run the same command to resume", file=sys.stderr)
         return 130

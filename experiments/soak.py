@@ -38,7 +38,9 @@ MINUTES, MAX_GROWTH = 30.0, 2.0  # percent
 PERIOD, EVENT_PERIOD, PAUSE = 5.0, 10.0, 0.02
 STEADY_FIELDS = 8  # that are computed before each sample
 NAMESPACE = "/robot"
-SOURCE = "tf" if importlib.util.find_spec("tf2_ros") else "odometry"  # of the robot's poses
+SOURCE = (
+    "tf" if importlib.util.find_spec("tf2_ros") else "odometry"
+)  # of the robot's poses
 SPEED_UP, SLOWNESS = 4.0, 0.5  # the robot is twice as fast as at nominal speed
 # The planner's transform_tolerance and map_timeout, seconds; silent odometry has 2 seconds.
 TOLERANCE, MAP_TIMEOUT = 1.0, 1.0
@@ -57,20 +59,35 @@ class Work:
         self._diagnostics = client.subscribe(DiagnosticArray, "/diagnostics", keep=1)
         self._draw = random.Random(0)
         self._maps = ros.shipped_maps()
-        self._steady = self._maps["office"].requests(STEADY_FIELDS, np.random.default_rng(0))
+        self._steady = self._maps["office"].requests(
+            STEADY_FIELDS, np.random.default_rng(0)
+        )
         self.done: Counter[str] = Counter()
 
     def __call__(self) -> None:
         """Do one piece of work; count it, and as lost if it has no answer."""
-        client, draw, noise = self._client, self._draw, ("scatter_obstacles", "restore_map")
+        client, draw, noise = (
+            self._client,
+            self._draw,
+            ("scatter_obstacles", "restore_map"),
+        )
         # How often each kind of work is drawn, and what it does.
         work: dict[str, tuple[int, Callable[[], Any]]] = {
             "map": (1, lambda: self._load(draw.choice([*self._maps]))),
-            "noise": (1, lambda: client.call(Trigger, f"map_server/{draw.choice(noise)}")),
+            "noise": (
+                1,
+                lambda: client.call(Trigger, f"map_server/{draw.choice(noise)}"),
+            ),
             "model": (1, lambda: client.call(Trigger, "planner/reload_model")),
-            "parameters": (1, lambda: self._set(draw.choice([*MoveRule]), draw.randint(1, 100))),
+            "parameters": (
+                1,
+                lambda: self._set(draw.choice([*MoveRule]), draw.randint(1, 100)),
+            ),
             "bad input": (1, self.bad_input),
-            "start": (3, lambda: client.publish("initialpose", ros.initial_pose(self._pose()))),
+            "start": (
+                3,
+                lambda: client.publish("initialpose", ros.initial_pose(self._pose())),
+            ),
             "goal": (5, lambda: client.publish("goal_pose", self._pose())),
             "plan": (8, lambda: client.get_plan(self._pose(), self._pose())),
         }
@@ -82,12 +99,16 @@ class Work:
             self.done["lost"] += 1
 
     def _set(self, rule: str, threshold: int) -> None:
-        self._client.set_parameters("planner", move_rule=rule, occupied_threshold=threshold)
+        self._client.set_parameters(
+            "planner", move_rule=rule, occupied_threshold=threshold
+        )
 
     def settle(self) -> None:
         """Bring the nodes to the same state: the memory depends on the fields that are kept."""
         self._set("", 65)
-        self._client.call(Trigger, "planner/reload_model")  # loaded again, it forgets all fields
+        self._client.call(
+            Trigger, "planner/reload_model"
+        )  # loaded again, it forgets all fields
         loaded = self._load("office")
         ros.wait_for_map(self._diagnostics, loaded.map.header.stamp)
         for steady in self._steady:
@@ -104,7 +125,11 @@ class Work:
         client.publish("goal_pose", bad)
         client.get_plan(bad, bad)
         self._load("no_such_map")
-        wrong = {"move_rule": "flying", "occupied_threshold": 0, "model": "no_such_model"}
+        wrong = {
+            "move_rule": "flying",
+            "occupied_threshold": 0,
+            "model": "no_such_model",
+        }
         client.set_parameters("planner", **wrong)
 
     def _load(self, name: str) -> Any:
@@ -113,7 +138,9 @@ class Work:
 
     def _pose(self) -> PoseStamped:
         grid = self._draw.choice([*self._maps.values()]).grid
-        return ros.pose(grid, (self._draw.randrange(grid.width), self._draw.randrange(grid.height)))
+        return ros.pose(
+            grid, (self._draw.randrange(grid.width), self._draw.randrange(grid.height))
+        )
 
 
 class DrivenRobot(ros.Client):
@@ -123,7 +150,10 @@ class DrivenRobot(ros.Client):
         super().__init__(NAMESPACE, "simulated_robot")
         self._poses = ros.RobotPoses(self.node)
         self._drives = self.subscribe(Path, "trainer/episode")
-        self._map, self._planner = ros.shipped_maps()["dilemma"], Planner.load("any_map")
+        self._map, self._planner = (
+            ros.shipped_maps()["dilemma"],
+            Planner.load("any_map"),
+        )
         self._grid, self._draw = self._map.grid, random.Random(0)
         self._cells = self._grid.free_cells()
         slowness = np.full(self._grid.occupancy.shape, SLOWNESS)
@@ -151,7 +181,9 @@ class DrivenRobot(ros.Client):
             self._drive_on(cell)
 
     def _drive_on(self, start: Cell) -> None:
-        goal = self._draw.choice([cell for cell in self._cells if math.dist(cell, start) > 5])
+        goal = self._draw.choice(
+            [cell for cell in self._cells if math.dist(cell, start) > 5]
+        )
         cells = self._planner.plan(self._grid, start, goal).cells
         self._robot.follow(np.array([self._grid.cell_to_world(cell) for cell in cells]))
         self.publish("goal_pose", ros.pose(self._grid, goal), listeners=0)
@@ -181,7 +213,9 @@ class DrivenRobot(ros.Client):
             self._silent = ""
         if not self._is_well(kind, RECOVERY):
             self.done["lost"] += 1
-            print(f"after {kind}: no plan, or no new drive, in {RECOVERY:g} s", flush=True)
+            print(
+                f"after {kind}: no plan, or no new drive, in {RECOVERY:g} s", flush=True
+            )
 
     def _is_well(self, kind: str, seconds: float) -> bool:
         """Ask for plans, count stale ones; return whether a right one and two drives came."""
@@ -190,13 +224,18 @@ class DrivenRobot(ros.Client):
         self._drives.clear()
         while time.monotonic() < until:
             # Where the planner thinks that the robot is.
-            poses = self.get_plan(PoseStamped(), ros.pose(self._grid, self._cells[0])).poses
+            poses = self.get_plan(
+                PoseStamped(), ros.pose(self._grid, self._cells[0])
+            ).poses
             start = ros.cell_of(self._grid, poses[0]) if poses else None
             is_right = start in self._visited and not self._silent
             planned |= is_right
             if poses and not is_right:
                 self.done["stale"] += 1
-                print(f"after {kind}: a plan from {start}, silent: {self._silent!r}", flush=True)
+                print(
+                    f"after {kind}: a plan from {start}, silent: {self._silent!r}",
+                    flush=True,
+                )
             if planned and len(self._drives.messages()) >= 2:
                 return True
             time.sleep(0.1)
@@ -220,7 +259,9 @@ def soak(
             work.settle()
             for name, child in children.items():
                 if child.poll() is not None:
-                    raise RuntimeError(f"{name} ended with exit code {child.returncode}")
+                    raise RuntimeError(
+                        f"{name} ended with exit code {child.returncode}"
+                    )
                 samples[name].append(memory(child.pid))
     return samples
 
@@ -238,10 +279,18 @@ def main(arguments: Sequence[str]) -> int:
     minutes = float(arguments[0]) if arguments else MINUTES
     quiet = ("--log-level", "fatal")
     apart = (*quiet, "-r", f"__ns:={NAMESPACE}", "-p", "use_sim_time:=true")
-    of_planner = {"start_source": SOURCE, "transform_tolerance": TOLERANCE, "follow_trainer": True}
+    of_planner = {
+        "start_source": SOURCE,
+        "transform_tolerance": TOLERANCE,
+        "follow_trainer": True,
+    }
     of_planner |= {"map_type": "costmap", "map_timeout": MAP_TIMEOUT}
     of_trainer = {"learn_from": "driving", "pose_source": SOURCE}
-    with claim_ros_domain(), tempfile.TemporaryDirectory() as folder, ros.Client() as client:
+    with (
+        claim_ros_domain(),
+        tempfile.TemporaryDirectory() as folder,
+        ros.Client() as client,
+    ):
         of_trainer["output_folder"] = f"{folder}/drives"
         nodes = {
             "map_server_node": running_node("map_server_node", *quiet),

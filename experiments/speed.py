@@ -39,7 +39,9 @@ REQUESTS, ROUNDS, FIELDS, CHANGES = 15, 3, 100, 100
 STEPS, TRAINING_ROUNDS = 3_000, 5
 FLIPPED = 10  # cells that a change near a place flips, of the 25 around it
 WALL = 41  # cells of a wall that opens or closes
-SHORTEST = 40  # moves of the shortest path for replans: robot and goal are far from each other
+SHORTEST = (
+    40  # moves of the shortest path for replans: robot and goal are far from each other
+)
 
 # The kinds of changes, and where on the path: a number of moves from its ends, or 0 for its middle.
 CHANGE_KINDS = {
@@ -54,7 +56,9 @@ CHANGE_KINDS = {
 # with tcod 1.4 times as much.
 # pyastar2d is not among them: where cells cost differently, it may read memory that it never set.
 PEERS = "tcod", "dijkstra3d A*", "dijkstra3d from both ends"
-Change = tuple[Occupancy, Occupancy, int, int]  # a map, and a patch of it with its x and y
+Change = tuple[
+    Occupancy, Occupancy, int, int
+]  # a map, and a patch of it with its x and y
 LOADED = Planner.load("any_map")
 
 
@@ -63,7 +67,9 @@ def new_planner() -> Planner:
     return Planner(LOADED.network, LOADED.metadata)
 
 
-def timed(function: Callable[..., Any], *arguments: Any, **options: Any) -> tuple[float, Any]:
+def timed(
+    function: Callable[..., Any], *arguments: Any, **options: Any
+) -> tuple[float, Any]:
     """Call a function; return how long it computed, milliseconds, and its answer."""
     began = time.process_time()
     answer = function(*arguments, **options)
@@ -97,16 +103,27 @@ def measure_requests(side: int) -> Iterator[bool]:
                 ms, plan = timed(planner.plan, grid, start, goal, RULE)
                 known_ms, _ = timed(planner.plan, grid, plan.cells[1], goal, RULE)
                 nano_ms, (_, length) = timed(nano_astar.astar, of_nano, *cells)
-                pyastar_ms, _ = timed(pyastar2d.astar_path, weights, *cells, allow_diagonal=True)
+                pyastar_ms, _ = timed(
+                    pyastar2d.astar_path, weights, *cells, allow_diagonal=True
+                )
                 times.append((ms, nano_ms, pyastar_ms, known_ms))
-            assert math.isclose(plan.length, length, rel_tol=1e-6), (plan.length, length)
+            assert math.isclose(plan.length, length, rel_tol=1e-6), (
+                plan.length,
+                length,
+            )
             of_requests.append((*medians(times), len(plan.cells)))
         ms, nano_ms, pyastar_ms, known_ms, moves = medians(of_requests)
         name = f"{side}x{side} {kind}: request {ms:.2f} ms"
         yield report(f"{name}, nano-astar {nano_ms:.2f}; ratio", ms / nano_ms, "x", 1.0)
-        yield report(f"{name}, pyastar2d* {pyastar_ms:.2f}; ratio", ms / pyastar_ms, "x", 1.3)
-        yield report(f"{side}x{side} {kind}: known goal, {moves:.0f} cells", known_ms, "ms", 0.1)
-    print("* cuts corners, and a diagonal counts 1: its paths are no paths under our rule")
+        yield report(
+            f"{name}, pyastar2d* {pyastar_ms:.2f}; ratio", ms / pyastar_ms, "x", 1.3
+        )
+        yield report(
+            f"{side}x{side} {kind}: known goal, {moves:.0f} cells", known_ms, "ms", 0.1
+        )
+    print(
+        "* cuts corners, and a diagonal counts 1: its paths are no paths under our rule"
+    )
 
 
 def search_with_tcod(cost: NDArray[np.int32], start: Cell, goal: Cell) -> Any:
@@ -135,28 +152,42 @@ def measure_requests_with_costs(side: int) -> Iterator[bool]:
         occupancy = generate_map(kind, (side, side), random)
         start, goal = farthest_cells(occupancy)
         inflated = inflate(GridMap(occupancy, 0.05), 0, 1).cost
-        for name, cost in (("inflated", inflated), ("random", random_costs(occupancy, random))):
+        for name, cost in (
+            ("inflated", inflated),
+            ("random", random_costs(occupancy, random)),
+        ):
             multiplier, times = GridMap(occupancy, cost=cost).cost_multiplier, []
             weights = np.where(occupancy, np.inf, multiplier).astype(np.float32)
             whole = np.where(occupancy, 0, np.rint(25 * multiplier)).astype(np.int32)
             ends = weights, start[::-1], goal[::-1]
             for _ in range(2 + ROUNDS * 1024 // side):
-                ms, _ = timed(new_planner().plan, GridMap(occupancy, cost=cost), start, goal, RULE)
+                ms, _ = timed(
+                    new_planner().plan, GridMap(occupancy, cost=cost), start, goal, RULE
+                )
                 tcod_ms, _ = timed(search_with_tcod, whole, start, goal)
-                astar_ms, _ = timed(dijkstra3d.dijkstra, *ends, connectivity=8, compass=True)
-                both_ms, _ = timed(dijkstra3d.dijkstra, *ends, connectivity=8, bidirectional=True)
+                astar_ms, _ = timed(
+                    dijkstra3d.dijkstra, *ends, connectivity=8, compass=True
+                )
+                both_ms, _ = timed(
+                    dijkstra3d.dijkstra, *ends, connectivity=8, bidirectional=True
+                )
                 times.append((ms, tcod_ms, astar_ms, both_ms))
             ms, *peers = medians(times[2:])  # the first rounds of all load their code
             ratios.append([ms / peer for peer in peers])
             beside = ", ".join(f"{peer:.1f}" for peer in peers)
-            print(f"{side}x{side} {kind}, {name} costs: {ms:.1f} ms; peers {beside}", flush=True)
+            print(
+                f"{side}x{side} {kind}, {name} costs: {ms:.1f} ms; peers {beside}",
+                flush=True,
+            )
     for peer, of_peer in zip(PEERS, zip(*ratios, strict=True), strict=True):
         typical = statistics.median(of_peer)
         figure = f"{side}x{side}: long request with costs / {peer}, median {typical:.2f}; worst"
         yield report(figure, max(of_peer), "x", 1.0)
 
 
-def draw_change(kind: str, occupancy: Occupancy, path: Sequence[Cell], random: Random) -> Change:
+def draw_change(
+    kind: str, occupancy: Occupancy, path: Sequence[Cell], random: Random
+) -> Change:
     """Draw a change of some cells around a place or anywhere, or of a wall across a path."""
     side, at = len(occupancy), CHANGE_KINDS[kind] or len(path) // 2
     (x0, y0), (x, y), (x1, y1) = path[at - 2], path[at], path[at + 2]
@@ -177,7 +208,9 @@ def draw_change(kind: str, occupancy: Occupancy, path: Sequence[Cell], random: R
     return occupancy, other, x, y
 
 
-def draw_changes(map_kind: str, side: int, kind: str) -> Iterator[tuple[Change, Cell, Cell]]:
+def draw_changes(
+    map_kind: str, side: int, kind: str
+) -> Iterator[tuple[Change, Cell, Cell]]:
     """Draw changes that leave start and goal free, each with its start and goal."""
     random, drawn = np.random.default_rng(0), 0
     occupancy = generate_map(map_kind, (side, side), random)
@@ -192,7 +225,9 @@ def draw_changes(map_kind: str, side: int, kind: str) -> Iterator[tuple[Change, 
                 yield change, start, goal
 
 
-def replan(change: Change, start: Cell, goal: Cell, knows_before: bool) -> tuple[float, Plan]:
+def replan(
+    change: Change, start: Cell, goal: Cell, knows_before: bool
+) -> tuple[float, Plan]:
     """Time a plan after a change, with the plan before it or without."""
     planner, before = new_planner(), GridMap(change[0])
     if knows_before:
@@ -208,7 +243,9 @@ def measure_replans(side: int) -> Iterator[bool]:
             for drawn in draw_changes(map_kind, side, kind):
                 times = []
                 for _ in range(ROUNDS):
-                    (ms, plan), (fresh_ms, fresh) = (replan(*drawn, it) for it in (True, False))
+                    (ms, plan), (fresh_ms, fresh) = (
+                        replan(*drawn, it) for it in (True, False)
+                    )
                     assert plan.cells == fresh.cells, drawn[1:]
                     times.append((ms, fresh_ms))
                 ms, fresh_ms = medians(times)
@@ -226,9 +263,13 @@ def measure_short_requests(side: int) -> Iterator[bool]:
     costs = None, random_costs(occupancy, random)
     for _ in range(CHANGES):
         maps = [GridMap(occupancy, cost=cost) for cost in costs]
-        times.append([timed(new_planner().plan, it, (5, 5), (20, 20), RULE)[0] for it in maps])
+        times.append(
+            [timed(new_planner().plan, it, (5, 5), (20, 20), RULE)[0] for it in maps]
+        )
     without, with_costs = medians(times)
-    name = f"{side}x{side}, 15 cells: {without:.2f} ms; with costs {with_costs:.2f}; ratio"
+    name = (
+        f"{side}x{side}, 15 cells: {without:.2f} ms; with costs {with_costs:.2f}; ratio"
+    )
     yield report(name, with_costs / without, "x", 2.0)
 
 
@@ -246,7 +287,9 @@ def measure_first_request(side: int) -> Iterator[bool]:
             assert plan.cells
             times.append((ms, timed(read_cells, occupancy, cost)[0]))
         ms, reading_ms = medians(times)
-        figure = f"{side}x{side}{name}, 60 cells: all patches {reading_ms:.0f} ms; request"
+        figure = (
+            f"{side}x{side}{name}, 60 cells: all patches {reading_ms:.0f} ms; request"
+        )
         yield report(figure, ms, "ms", 60)
 
 
@@ -257,21 +300,33 @@ def measure_repairs(sides: tuple[int, int], with_costs: bool) -> Iterator[bool]:
         random = np.random.default_rng(0)
         occupancy = random.random((side, side)) < 0.2
         occupancy[100:140, 100:140] = occupancy[500:503, 500:503] = False
-        grid = GridMap(occupancy, cost=random_costs(occupancy, random) if with_costs else None)
+        grid = GridMap(
+            occupancy, cost=random_costs(occupancy, random) if with_costs else None
+        )
         known.append([random, new_planner(), grid])
         known[-1][1].plan(grid, (110, 110), (501, 501), RULE)
 
     def repair(of_side: list[Any]) -> None:
         random, planner, grid = of_side
-        (x, y), flipped = random.integers(112, 130, 2), random.choice(25, FLIPPED, replace=False)
+        (x, y), flipped = (
+            random.integers(112, 130, 2),
+            random.choice(25, FLIPPED, replace=False),
+        )
         patch = grid.occupancy[y : y + 5, x : x + 5].copy()
         patch.flat[flipped] ^= True
         of_side[2] = grid.with_patch(patch, x, y)
         assert planner.plan(of_side[2], (110, 110), (501, 501), RULE).cells
 
-    small, large = medians([[timed(repair, it)[0] for it in known] for _ in range(CHANGES)])
+    small, large = medians(
+        [[timed(repair, it)[0] for it in known] for _ in range(CHANGES)]
+    )
     name = f"{FLIPPED} cells near the robot{', costs' if with_costs else ''}: {small:.2f} ms"
-    yield report(f"{name} at {sides[0]}, {large:.2f} at {sides[1]}; ratio", large / small, "x", 1.5)
+    yield report(
+        f"{name} at {sides[0]}, {large:.2f} at {sides[1]}; ratio",
+        large / small,
+        "x",
+        1.5,
+    )
 
 
 def all_values(grid: GridMap, goal: Cell) -> QField:
@@ -295,11 +350,18 @@ def measure_whole_fields(side: int, costs: bool, bound: float) -> Iterator[bool]
                 new_map = GridMap(occupancy, cost=cost)
                 times.append((ms, timed(shortest_distances, new_map, goal, RULE)[0]))
             nbytes = max(nbytes, field.nbytes - field.value.nbytes)
-        ours, dijkstra = medians(times[rounds // 2 :])  # Python makes code faster that ran often
+        ours, dijkstra = medians(
+            times[rounds // 2 :]
+        )  # Python makes code faster that ran often
         ratios.append((ours / dijkstra, kind))
-        print(f"{name}, {kind}: field {ours:.1f} ms, Dijkstra {dijkstra:.1f} ms", flush=True)
+        print(
+            f"{name}, {kind}: field {ours:.1f} ms, Dijkstra {dijkstra:.1f} ms",
+            flush=True,
+        )
     worst, kind = max(ratios)
-    yield report(f"{name}: field / Dijkstra, worst kind ({kind})", 100 * worst, "%", bound)
+    yield report(
+        f"{name}: field / Dijkstra, worst kind ({kind})", 100 * worst, "%", bound
+    )
     yield report(f"{name}: bytes per cell of a field", nbytes / side**2, "B", 10)
 
 
@@ -308,7 +370,9 @@ class PaperFeatures(BaseFeaturesExtractor):
 
     def __init__(self, observation_space: gymnasium.spaces.Box, filters: int) -> None:
         height, width = observation_space.shape
-        super().__init__(observation_space, filters * ((height + 1) // 2) * ((width + 1) // 2))
+        super().__init__(
+            observation_space, filters * ((height + 1) // 2) * ((width + 1) // 2)
+        )
         self.convolution = nn.Conv2d(1, filters, kernel_size=3, stride=2, padding=1)
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
@@ -374,7 +438,10 @@ def main() -> int:
     for side in (256, 1024, 2048):
         missed += measure_straight_paths(side, MAP_KINDS)
     for side in (256, 1024, 2000):
-        missed += [*measure_whole_fields(side, False, 20), *measure_whole_fields(side, True, 25)]
+        missed += [
+            *measure_whole_fields(side, False, 20),
+            *measure_whole_fields(side, True, 25),
+        ]
     return int(any(missed))
 
 

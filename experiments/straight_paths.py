@@ -39,20 +39,39 @@ def main(_: Sequence[str]) -> int:
                 distance = clearance(grid.occupancy)
                 near = [distance[tuple(cells_along(each)[0].T[::-1])] for each in paths]
                 ratios = [cost_along(each, grid, RULE) / theta for each in paths]
-                figures.append((*ratios, *[d.min() for d in near], *[d.mean() for d in near]))
+                figures.append(
+                    (*ratios, *[d.min() for d in near], *[d.mean() for d in near])
+                )
             cells, straight, *distances = np.mean(figures, axis=0)
-            rows.append([kind, f"{cells:.4f}", f"{straight:.4f}", *(f"{d:.2f}" for d in distances)])
-        least_mean = "least distance: cells | straight | mean distance: cells | straight"
+            rows.append(
+                [
+                    kind,
+                    f"{cells:.4f}",
+                    f"{straight:.4f}",
+                    *(f"{d:.2f}" for d in distances),
+                ]
+            )
+        least_mean = (
+            "least distance: cells | straight | mean distance: cells | straight"
+        )
         print(f"\nCosts reach {inflation:g} cells")
         print(table(f"map | cells / Theta* | straight / Theta* | {least_mean}", rows))
     rows = []
     for kind in KINDS:
         planner, figures = Planner.load("any_map"), []
         for grid, start, goal in drawn_requests(kind, SMALL_SIDE):
-            paths = [*both_paths(planner, grid, start, goal), theta_star(grid, start, goal)]
+            paths = [
+                *both_paths(planner, grid, start, goal),
+                theta_star(grid, start, goal),
+            ]
             lengths = [cost_along(each, grid, RULE) for each in paths]
-            best = optimum(grid.occupancy, start, goal, 1), optimum(grid.occupancy, start, goal)
-            figures.append((*[length / best[0] for length in lengths], best[0] / best[1]))
+            best = (
+                optimum(grid.occupancy, start, goal, 1),
+                optimum(grid.occupancy, start, goal),
+            )
+            figures.append(
+                (*[length / best[0] for length in lengths], best[0] / best[1])
+            )
         rows.append([kind, *(f"{mean:.4f}" for mean in np.mean(figures, axis=0))])
     header = "map | cells | straight | Theta* | best over cell centres / true optimum"
     print(f"\n{SMALL_SIDE}x{SMALL_SIDE}: lengths over the best through cell centres")
@@ -60,9 +79,14 @@ def main(_: Sequence[str]) -> int:
     return 0
 
 
-def both_paths(planner: Planner, grid: GridMap, start: Cell, goal: Cell) -> list[NDArray[Any]]:
+def both_paths(
+    planner: Planner, grid: GridMap, start: Cell, goal: Cell
+) -> list[NDArray[Any]]:
     """Return the path in moves, and the straight one."""
-    return [planner.plan(grid, start, goal, RULE, simplified=way).path for way in (False, True)]
+    return [
+        planner.plan(grid, start, goal, RULE, simplified=way).path
+        for way in (False, True)
+    ]
 
 
 def drawn_requests(
@@ -71,7 +95,9 @@ def drawn_requests(
     """Draw a map of a kind, and requests on it."""
     random = np.random.default_rng(0)
     occupancy = generate_map(kind, (side, side), random)
-    grid = GridMap(occupancy, cost=inflated_costs(occupancy, inflation) if inflation else None)
+    grid = GridMap(
+        occupancy, cost=inflated_costs(occupancy, inflation) if inflation else None
+    )
     for start, goal in random_requests(occupancy, RULE, count, random):
         yield grid, start, goal
 
@@ -90,10 +116,16 @@ def measure_straight_paths(side: int, kinds: Sequence[str]) -> Iterator[bool]:
             times.append(statistics.median(of_path))
             if side <= SIDE:
                 theta = theta_star(grid, start, goal)
-                ratios.append(cost_along(simple, grid, RULE) / cost_along(theta, grid, RULE))
-        yield report(f"{side}x{side} {kind}: straight path", statistics.median(times), "ms", 0.2)
+                ratios.append(
+                    cost_along(simple, grid, RULE) / cost_along(theta, grid, RULE)
+                )
+        yield report(
+            f"{side}x{side} {kind}: straight path", statistics.median(times), "ms", 0.2
+        )
         if ratios:
-            yield report(f"{side}x{side} {kind}: over Theta*", statistics.mean(ratios), "x", 1.0)
+            yield report(
+                f"{side}x{side} {kind}: over Theta*", statistics.mean(ratios), "x", 1.0
+            )
 
 
 def theta_star(grid: GridMap, start: Cell, goal: Cell) -> NDArray[np.int64]:
@@ -130,7 +162,10 @@ def _theta_star(
             direct = cost[parent[cell]] + _cost(from_x, from_y, to_x, to_y, 0.0, layers)
             least = min(through, direct)
             if least < cost[number] * (1 - 1e-12):
-                cost[number], parent[number] = least, parent[cell] if direct <= through else cell
+                cost[number], parent[number] = (
+                    least,
+                    parent[cell] if direct <= through else cell,
+                )
                 order = least + np.hypot(goal_x - to_x, goal_y - to_y)
                 heapq.heappush(waiting, (order, -least, number))
     path = [goal]
@@ -151,10 +186,18 @@ def optimum(occupancy: Occupancy, start: Cell, goal: Cell, finer: int = FINER) -
     corners = np.argwhere(~occupancy)[:, ::-1]
     if finer > 1:
         padded = np.pad(fine, 1, constant_values=True)
-        beside = [padded[1 + y : len(fine) + 1 + y, 1 + x : len(fine) + 1 + x] for x, y in MOVES]
-        is_corner = [beside[n] & ~beside[n - 1] & ~beside[(n + 1) % 8] for n in (1, 3, 5, 7)]
+        beside = [
+            padded[1 + y : len(fine) + 1 + y, 1 + x : len(fine) + 1 + x]
+            for x, y in MOVES
+        ]
+        is_corner = [
+            beside[n] & ~beside[n - 1] & ~beside[(n + 1) % 8] for n in (1, 3, 5, 7)
+        ]
         corners = np.argwhere(~fine & np.any(is_corner, axis=0))[:, ::-1]
-    return float(_optimum(np.concatenate([ends, corners]), GridMap(fine).for_kernels(RULE)) / finer)
+    return float(
+        _optimum(np.concatenate([ends, corners]), GridMap(fine).for_kernels(RULE))
+        / finer
+    )
 
 
 @compiled

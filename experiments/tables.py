@@ -20,9 +20,13 @@ def table(header: str, rows: Sequence[Sequence[object]]) -> str:
     return "\n".join([lines[0], "|---" * len(names) + "|", *lines[1:]])
 
 
-def write_report(out: Path, sections: Mapping[str, str], page: Path | None = None) -> str:
+def write_report(
+    out: Path, sections: Mapping[str, str], page: Path | None = None
+) -> str:
     """Write ``report.md`` and return it; a page gets the sections that it has marks for."""
-    text = "\n".join(f"## {title}\n\n{section}\n" for title, section in sections.items())
+    text = "\n".join(
+        f"## {title}\n\n{section}\n" for title, section in sections.items()
+    )
     write_atomically(out / "report.md", text.encode())
     if page is not None:
         images = page.parent / "images" / page.stem
@@ -34,7 +38,9 @@ def write_report(out: Path, sections: Mapping[str, str], page: Path | None = Non
             shown = FIGURE.sub(rf"](images/{page.stem}/\1)", section)
             before, mark, rest = content.partition(f"<!-- {title} -->\n")
             if mark:
-                content = f"{before}{mark}{shown}\n\n{rest[rest.index('<!-- end -->') :]}"
+                content = (
+                    f"{before}{mark}{shown}\n\n{rest[rest.index('<!-- end -->') :]}"
+                )
         write_atomically(page, content.encode())
     return text
 
@@ -51,13 +57,19 @@ def median_and_range(values: Sequence[float], digits: int = 0) -> str:
     return middle if low == high else f"{middle} ({low} to {high})"
 
 
-def mean_and_worst(ratios: Sequence[Sequence[float] | NDArray[np.float64]]) -> list[str]:
+def mean_and_worst(
+    ratios: Sequence[Sequence[float] | NDArray[np.float64]],
+) -> list[str]:
     """Return two cells: the mean and the greatest ratio of each seed that has one."""
     some = [of_seed for of_seed in ratios if len(of_seed)]
-    return [median_and_range([float(f(of)) for of in some], 4) for f in (np.mean, np.max)]
+    return [
+        median_and_range([float(f(of)) for of in some], 4) for f in (np.mean, np.max)
+    ]
 
 
-def report(figure: str, value: float, unit: str, bound: float, at_most: bool = True) -> bool:
+def report(
+    figure: str, value: float, unit: str, bound: float, at_most: bool = True
+) -> bool:
     """Print a figure beside its bound, unless that is infinite; return whether it is missed."""
     missed = value > bound if at_most else value < bound
     sign, verdict = "at most" if at_most else "at least", "MISSED" if missed else "ok"

@@ -16,7 +16,9 @@ from ddqn_planner.training.trainer import Trainer
 class PaperModule(nn.Module):
     """The paper's network, see `PaperQNetwork`."""
 
-    def __init__(self, height: int, width: int, filters: int, hidden_units: int) -> None:
+    def __init__(
+        self, height: int, width: int, filters: int, hidden_units: int
+    ) -> None:
         super().__init__()
         self.convolution = nn.Conv2d(1, filters, kernel_size=3, stride=2, padding=1)
         features = filters * ((height + 1) // 2) * ((width + 1) // 2)
@@ -26,7 +28,9 @@ class PaperModule(nn.Module):
     def forward(self, observation_BHW: Tensor) -> Tensor:
         """Return Q(s, a): (B, 8)."""
         # On windows the convolution is a matrix product, which is faster on small maps.
-        window_BKL = functional.unfold(observation_BHW.unsqueeze(1), 3, padding=1, stride=2)
+        window_BKL = functional.unfold(
+            observation_BHW.unsqueeze(1), 3, padding=1, stride=2
+        )
         weight_BFK = self.convolution.weight.flatten(1).expand(len(window_BKL), -1, -1)
         bias_F1 = self.convolution.get_parameter("bias").unsqueeze(1)
         feature_BF = torch.baddbmm(bias_F1, weight_BFK, window_BKL).relu_().flatten(1)
@@ -41,7 +45,9 @@ class TorchLearner:
 
     def __init__(self, trainer: Trainer) -> None:
         self.environment = trainer.environment
-        self._online, self._target = (PaperModule(**trainer.network.sizes) for _ in range(2))
+        self._online, self._target = (
+            PaperModule(**trainer.network.sizes) for _ in range(2)
+        )
         online, target, *moments = trainer._parts
         for module, part in ((self._online, online), (self._target, target)):
             for name, weight in module.named_parameters():
@@ -60,7 +66,9 @@ class TorchLearner:
     def _observe(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
         return torch.from_numpy(self.environment.observe(scenario, cell))
 
-    def q_values(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> NDArray[Any]:
+    def q_values(
+        self, scenario: NDArray[np.int64], cell: NDArray[np.int64]
+    ) -> NDArray[Any]:
         """Return Q(s, a) of robots in `cell` (B,) on the maps `scenario` (B,): (B, 8)."""
         with torch.inference_mode():
             answer: Tensor = self._online(self._observe(scenario, cell))

@@ -18,7 +18,11 @@ from ddqn_planner.files import write_atomically, write_csv
 from ddqn_planner.grid import LENGTHS, neighbours
 from ddqn_planner.model import PaperQNetwork
 from ddqn_planner.planning import Planner
-from ddqn_planner.training.environment import GridVectorEnvironment, Scenario, paper_scenario
+from ddqn_planner.training.environment import (
+    GridVectorEnvironment,
+    Scenario,
+    paper_scenario,
+)
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.propagation import value_iteration
 from ddqn_planner.training.run import TrainingRun
@@ -27,8 +31,16 @@ from ddqn_planner.training.trainer import Trainer
 
 SCENARIO: Final = paper_scenario()
 MOVE_RULE: Final = SCENARIO.move_rule  # by it the paper's 22.97 is the shortest path
-BACKENDS: Final = ("loky", "ray", "dask", "sequential")  # of joblib: this machine, or a cluster
-HIDDEN_UNITS: Final = (0, 128)  # of the paper's network for goal iii; 0 for no hidden layer
+BACKENDS: Final = (
+    "loky",
+    "ray",
+    "dask",
+    "sequential",
+)  # of joblib: this machine, or a cluster
+HIDDEN_UNITS: Final = (
+    0,
+    128,
+)  # of the paper's network for goal iii; 0 for no hidden layer
 # How far from the path new obstacles lie, in cells, by two readings of section 5.3: the "free
 # positions that make up the optimal path", or their eight neighbours too.
 NOISE: Final = {"on_path": 0, "near_path": 1}
@@ -74,7 +86,9 @@ class Settings:
 
     def folders(self, name: str) -> list[Path]:
         """Return the folders of the trainings with a name, one per seed."""
-        return [self.out / "trainings" / name / f"seed_{seed}" for seed in range(self.seeds)]
+        return [
+            self.out / "trainings" / name / f"seed_{seed}" for seed in range(self.seeds)
+        ]
 
     def trainings(
         self,
@@ -100,18 +114,34 @@ class Settings:
         return [Planner.load(folder / file) for folder in self.folders(name)]
 
 
-def parser_of(program: str, description: str | None, out: str) -> argparse.ArgumentParser:
+def parser_of(
+    program: str, description: str | None, out: str
+) -> argparse.ArgumentParser:
     """Return a parser with the options of an experiment with seeds."""
     parser = argparse.ArgumentParser(
-        program, None, description, formatter_class=argparse.ArgumentDefaultsHelpFormatter
+        program,
+        None,
+        description,
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     add = parser.add_argument
-    add("--seeds", type=int, default=5, metavar="N", help="trainings, or worlds of each kind")
+    add(
+        "--seeds",
+        type=int,
+        default=5,
+        metavar="N",
+        help="trainings, or worlds of each kind",
+    )
     add("--out", type=file_of, default=Path(out), help="folder of what is written")
     add("--quick", action="store_true", help="a short trial, into the folder quick")
     words = "what runs the work: this machine's cores, or a cluster"
     add("--backend", choices=BACKENDS, default="loky", help=words)
-    add("--page", type=file_of, metavar="FILE", help="a page of the docs that gets the results too")
+    add(
+        "--page",
+        type=file_of,
+        metavar="FILE",
+        help="a page of the docs that gets the results too",
+    )
     return parser
 
 
@@ -125,7 +155,10 @@ def make_folder(options: argparse.Namespace) -> Path:
 
 
 def in_parallel(
-    job: Callable[[Any], Any], items: Sequence[Any], backend: str = "loky", unit: str = "training"
+    job: Callable[[Any], Any],
+    items: Sequence[Any],
+    backend: str = "loky",
+    unit: str = "training",
 ) -> list[Any]:
     """Return ``job(item)`` for each item, in order; the first exception ends all jobs."""
     if backend == "ray":
@@ -139,7 +172,9 @@ def in_parallel(
     jobs = (joblib.delayed(_in_one_thread)(job, item) for item in items)
     with joblib.parallel_config(backend, n_jobs=-1):
         # Ray's backend has no generator: its bar jumps to the end.
-        results = joblib.Parallel(return_as="list" if backend == "ray" else "generator")(jobs)
+        results = joblib.Parallel(
+            return_as="list" if backend == "ray" else "generator"
+        )(jobs)
         # disable=None: no bar if the output is not a terminal.
         return list(tqdm(results, total=len(items), unit=unit, disable=None))
 
@@ -157,20 +192,29 @@ def train(training: Training) -> None:
         trainer = run.trainer
         before = read_csv(folder / "evaluations.csv")
         before = before[before["step"] <= trainer.steps]
-        rows = [dict(zip(before.dtype.names or (), row, strict=True)) for row in before.tolist()]
+        rows = [
+            dict(zip(before.dtype.names or (), row, strict=True))
+            for row in before.tolist()
+        ]
         optimum = optimal_value(trainer.environment)
         for _ in run.steps(training.evaluation_interval):
             if trainer.steps // training.evaluation_interval > len(rows):
                 best = max((row["solved"] for row in rows), default=-1)
                 rows.append(evaluate_training(trainer, optimum))
-                write_csv(folder / "evaluations.csv", [*rows[0]], [[*row.values()] for row in rows])
+                write_csv(
+                    folder / "evaluations.csv",
+                    [*rows[0]],
+                    [[*row.values()] for row in rows],
+                )
                 if rows[-1]["solved"] >= best:
                     write_atomically(folder / "kept.safetensors", trainer.model_bytes())
     if run.save_error:
         raise OSError(run.save_error)
 
 
-def evaluate_training(trainer: Trainer, optimum: NDArray[np.float32]) -> dict[str, float]:
+def evaluate_training(
+    trainer: Trainer, optimum: NDArray[np.float32]
+) -> dict[str, float]:
     """Return figures of the current network's rollouts from the start of each scenario."""
     planner = trainer.planner()
     lengths, unmasked = rollouts(planner, trainer.environment)
@@ -181,7 +225,9 @@ def evaluate_training(trainer: Trainer, optimum: NDArray[np.float32]) -> dict[st
         q = planner.q_field(scenario.grid, scenario.goal).q
         free = ~scenario.grid.occupancy
         free[scenario.goal[::-1]] = False
-        overestimation = float((q.max(axis=0) - optimum.reshape(free.shape))[free].mean())
+        overestimation = float(
+            (q.max(axis=0) - optimum.reshape(free.shape))[free].mean()
+        )
     return {
         "step": trainer.steps,
         "updates": trainer.updates,
@@ -193,13 +239,19 @@ def evaluate_training(trainer: Trainer, optimum: NDArray[np.float32]) -> dict[st
     }
 
 
-def rollouts(planner: Planner, environment: GridVectorEnvironment) -> NDArray[np.float64]:
+def rollouts(
+    planner: Planner, environment: GridVectorEnvironment
+) -> NDArray[np.float64]:
     """Return each start's length, NaN if trapped, with and without action masking: (2, S)."""
     if not isinstance(planner.network, PaperQNetwork):
-        fields = [(planner.q_field(s.grid, s.goal), s.start) for s in environment.scenarios]
+        fields = [
+            (planner.q_field(s.grid, s.goal), s.start) for s in environment.scenarios
+        ]
         plans = [[f.rollout(start) for f, start in fields]]
         plans += [[f.unmasked().rollout(start) for f, start in fields]]
-        return np.array([[p.length if p.cells else np.nan for p in each] for each in plans])
+        return np.array(
+            [[p.length if p.cells else np.nan for p in each] for each in plans]
+        )
     # All maps at once, and the paths' cells alone: whole fields take 10 to 20 times as long.
     maps, background = np.arange(len(environment.start)), environment.background
     of_model, exact = planner.network, background.astype(np.float64)
@@ -214,17 +266,28 @@ def rollouts(planner: Planner, environment: GridVectorEnvironment) -> NDArray[np
             evaluate(network, windows, maps, cell)
             q, legal = network.q.astype(np.float32), environment.legal[maps, :, cell]
             action = np.where(legal | (not is_masked), q, -np.inf).argmax(axis=1)
-            cell = np.where(on_way & legal[maps, action], environment.next_cell[action, cell], cell)
-            length += np.where(on_way, np.where(visited[maps, cell], np.nan, LENGTHS[action]), 0)
+            cell = np.where(
+                on_way & legal[maps, action], environment.next_cell[action, cell], cell
+            )
+            length += np.where(
+                on_way, np.where(visited[maps, cell], np.nan, LENGTHS[action]), 0
+            )
     return lengths
 
 
 def optimal_value(environment: GridVectorEnvironment) -> NDArray[np.float32]:
     """Return V* of the first scenario, exact by value iteration: (C,) float32."""
     e, p, near_AC = environment, environment.parameters, neighbours(environment.shape)
-    given = e.legal[:1].astype(np.float32).swapaxes(1, 2), e.free_reward[:1].swapaxes(1, 2)
-    (return_CA,), _ = value_iteration(*given, e.goal[:1], near_AC, p.gamma, p.obstacle_reward)
-    return np.array(np.where(e.legal[0].T, return_CA, np.float32(p.obstacle_reward)).max(axis=1))
+    given = (
+        e.legal[:1].astype(np.float32).swapaxes(1, 2),
+        e.free_reward[:1].swapaxes(1, 2),
+    )
+    (return_CA,), _ = value_iteration(
+        *given, e.goal[:1], near_AC, p.gamma, p.obstacle_reward
+    )
+    return np.array(
+        np.where(e.legal[0].T, return_CA, np.float32(p.obstacle_reward)).max(axis=1)
+    )
 
 
 def read_csv(path: Path) -> NDArray[Any]:

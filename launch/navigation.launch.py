@@ -31,9 +31,18 @@ MANAGER = "lifecycle_manager_navigation"
 ARGUMENTS = {
     "namespace": ("", "Namespace of all nodes, such as robot1"),
     "use_sim_time": ("false", "Take the time from /clock"),
-    "params_file": ("", "Parameters of all nodes; empty: nav2_params.yaml of nav2_bringup"),
-    "model": ("", "A shipped model or a file; empty: that of params_file, else any_map"),
-    "planner_id": ("", "The planner's name in behavior trees; empty: that of params_file"),
+    "params_file": (
+        "",
+        "Parameters of all nodes; empty: nav2_params.yaml of nav2_bringup",
+    ),
+    "model": (
+        "",
+        "A shipped model or a file; empty: that of params_file, else any_map",
+    ),
+    "planner_id": (
+        "",
+        "The planner's name in behavior trees; empty: that of params_file",
+    ),
     "server_timeout": ("200", "Least default_server_timeout of bt_navigator, ms"),
     "map": ("", "The map's YAML file; empty: that of params_file"),
     "slam": ("false", "Make the map with slam_toolbox"),
@@ -49,7 +58,14 @@ ARGUMENTS = {
 }
 """The arguments, each with its default and its description."""
 
-SWITCHES = ("use_sim_time", "slam", "use_localization", "autostart", "use_respawn", "rviz")
+SWITCHES = (
+    "use_sim_time",
+    "slam",
+    "use_localization",
+    "autostart",
+    "use_respawn",
+    "rviz",
+)
 FILES = ("params_file", "map", "keepout_mask", "speed_mask", "graph", "rviz_config")
 
 # As Nav2's own launch files do: a robot in a namespace has transforms of its own.
@@ -75,7 +91,12 @@ SERVERS = (
     ("ddqn_planner", "planner_node", PLANNER, []),
     ("nav2_route", "route_server", "route_server", []),
     ("nav2_behaviors", "behavior_server", "behavior_server", [NAV_VELOCITY]),
-    ("nav2_velocity_smoother", "velocity_smoother", "velocity_smoother", [NAV_VELOCITY]),
+    (
+        "nav2_velocity_smoother",
+        "velocity_smoother",
+        "velocity_smoother",
+        [NAV_VELOCITY],
+    ),
     ("nav2_collision_monitor", "collision_monitor", "collision_monitor", []),
     ("nav2_bt_navigator", "bt_navigator", "bt_navigator", []),
     ("nav2_waypoint_follower", "waypoint_follower", "waypoint_follower", []),
@@ -112,16 +133,27 @@ RVIZ_TOPICS = {
 
 def is_true(name, value):
     """Return the truth value of an argument."""
-    truth = {"true": True, "1": True, "yes": True, "false": False, "0": False, "no": False}
+    truth = {
+        "true": True,
+        "1": True,
+        "yes": True,
+        "false": False,
+        "0": False,
+        "no": False,
+    }
     if value.lower() not in truth:
-        raise RuntimeError(f"{name}:={value} is neither true nor false; give one of them")
+        raise RuntimeError(
+            f"{name}:={value} is neither true nor false; give one of them"
+        )
     return truth[value.lower()]
 
 
 def milliseconds(name, value):
     """Return an argument that is a time in whole milliseconds."""
     if not value.isascii() or not value.isdigit() or int(value) == 0:
-        raise RuntimeError(f"{name}:={value} is no time; give whole milliseconds, such as 200")
+        raise RuntimeError(
+            f"{name}:={value} is no time; give whole milliseconds, such as 200"
+        )
     return int(value)
 
 
@@ -139,7 +171,9 @@ def read_parameter_file(path):
     except (OSError, ValueError, yaml.YAMLError) as error:
         raise RuntimeError(f"params_file:={path} cannot be read: {error}") from error
     if not isinstance(document, dict):
-        raise RuntimeError(f"params_file:={path} has no nodes; give a parameter file of ROS 2")
+        raise RuntimeError(
+            f"params_file:={path} has no nodes; give a parameter file of ROS 2"
+        )
     return document
 
 
@@ -191,7 +225,9 @@ def with_zones(value, zones):
 
 def saved(nodes):
     """Return a parameter file; Nav2's files may hold launch's substitutions."""
-    document = {name: {"ros__parameters": parameters} for name, parameters in nodes.items()}
+    document = {
+        name: {"ros__parameters": parameters} for name, parameters in nodes.items()
+    }
     options = {"prefix": "ddqn_planner_", "suffix": ".yaml", "delete": False}
     with tempfile.NamedTemporaryFile("w", encoding="utf-8", **options) as file:
         yaml.safe_dump(document, file, sort_keys=False)
@@ -211,7 +247,9 @@ def nav2_parameters(arguments, namespace):
     raise_parameter(nodes, namespace, "bt_navigator", "default_server_timeout", least)
     # The planner sees of the costmap what is published.
     costmap = f"{namespace}/global_costmap"
-    updates = parameters_of(nodes, costmap, "global_costmap").get("update_frequency", 5.0)
+    updates = parameters_of(nodes, costmap, "global_costmap").get(
+        "update_frequency", 5.0
+    )
     raise_parameter(nodes, costmap, "global_costmap", "publish_frequency", updates)
     if arguments["graph"]:
         route = nodes.setdefault(f"{namespace}/route_server", {})
@@ -222,7 +260,10 @@ def nav2_parameters(arguments, namespace):
 def planner_parameters(nodes, arguments, namespace):
     """Return what planner_node takes: defaults for Nav2, its section, and the arguments."""
     costmap = parameters_of(nodes, f"{namespace}/global_costmap", "global_costmap")
-    defaults = {"robot_frame": costmap.get("robot_base_frame", "base_link"), **PLANNER_DEFAULTS}
+    defaults = {
+        "robot_frame": costmap.get("robot_base_frame", "base_link"),
+        **PLANNER_DEFAULTS,
+    }
     parameters = {**defaults, **parameters_of(nodes, namespace, PLANNER)}
     for name in ("model", "planner_id"):
         if arguments[name]:
@@ -306,7 +347,11 @@ def nav2_launch_file(name, arguments, namespace, **options):
     include = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(path),
         # Absolute, as some releases go into the namespace once more.
-        launch_arguments={"namespace": namespace, "use_composition": "False", **options}.items(),
+        launch_arguments={
+            "namespace": namespace,
+            "use_composition": "False",
+            **options,
+        }.items(),
     )
     return GroupAction([*([PushROSNamespace(namespace)] if namespace else []), include])
 
@@ -320,7 +365,9 @@ def localization(arguments, namespace):
         else:
             options = {"map": arguments["map"]}
             actions.append(
-                nav2_launch_file("localization_launch.py", arguments, namespace, **options)
+                nav2_launch_file(
+                    "localization_launch.py", arguments, namespace, **options
+                )
             )
     for zone in ("keepout", "speed"):
         mask = f"{zone}_mask"
@@ -359,7 +406,9 @@ def actions_of(context):
     actions = [*localization(arguments, namespace), *nav2_nodes(arguments, namespace)]
     if arguments["rviz"]:
         actions.append(rviz(arguments, namespace))
-    return [GroupAction([SetParameter("use_sim_time", arguments["use_sim_time"]), *actions])]
+    return [
+        GroupAction([SetParameter("use_sim_time", arguments["use_sim_time"]), *actions])
+    ]
 
 
 def generate_launch_description():
@@ -368,7 +417,9 @@ def generate_launch_description():
         [
             SetEnvironmentVariable("RCUTILS_LOGGING_BUFFERED_STREAM", "1"),
             *(
-                DeclareLaunchArgument(name, default_value=default, description=description)
+                DeclareLaunchArgument(
+                    name, default_value=default, description=description
+                )
                 for name, (default, description) in ARGUMENTS.items()
             ),
             OpaqueFunction(function=actions_of),

@@ -13,7 +13,9 @@ os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
 
 # Read by the first node. Tests have several nodes in one process, and Fast DDS 2.14 was seen to
 # deadlock when one of them ended while it told the others by a call instead of a message.
-os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(Path(__file__).with_name("fastdds.xml"))
+os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(
+    Path(__file__).with_name("fastdds.xml")
+)
 
 from shared import paper as paper
 from shared import small as small
@@ -22,7 +24,16 @@ from ddqn_planner.cli import main
 
 ROOT = Path(__file__).resolve().parent.parent
 NOBODY = 65534
-NOT_SOURCE = (".*", "__pycache__", "*.egg-info", "build", "dist", "install", "log", "runs")
+NOT_SOURCE = (
+    ".*",
+    "__pycache__",
+    "*.egg-info",
+    "build",
+    "dist",
+    "install",
+    "log",
+    "runs",
+)
 # Their tests take long, and share nothing.
 ANY_WORKER = {"test_cli.py", "test_demo.py", "test_plan_command.py"}
 

@@ -13,10 +13,18 @@ from ddqn_planner.grid import MOVES, Cell
 
 def shares(first: Cell, last: Cell) -> dict[Cell, Fraction]:
     """Return the share of a segment that lies within each cell that it passes, in their order."""
-    columns, rows = (range(min(ends), max(ends) + 1) for ends in zip(first, last, strict=True))
+    columns, rows = (
+        range(min(ends), max(ends) + 1) for ends in zip(first, last, strict=True)
+    )
     found = {(x, y): share_within((x, y), first, last) for x in columns for y in rows}
-    passed = sorted((cell for cell in found if found[cell]), key=lambda c: math.dist(c, first))
-    return {cell: found[cell] for cell in passed} if first != last else {first: Fraction(1)}
+    passed = sorted(
+        (cell for cell in found if found[cell]), key=lambda c: math.dist(c, first)
+    )
+    return (
+        {cell: found[cell] for cell in passed}
+        if first != last
+        else {first: Fraction(1)}
+    )
 
 
 def share_within(cell: Cell, first: Cell, last: Cell) -> Fraction:
@@ -48,17 +56,26 @@ def exact_cost(first: Cell, last: Cell, grid: GridMap, rule: MoveRule) -> float:
         straight = np.where([wide >= high, high >= wide], np.sign(vector), 0)
         steps, toward = np.divmod(grid.uphill[y, x], 8)
         rises = (
-            steps * np.maximum(np.cos(np.arctan2(*way[::-1]) - toward * np.pi / 4), 0) * way.any()
+            steps
+            * np.maximum(np.cos(np.arctan2(*way[::-1]) - toward * np.pi / 4), 0)
+            * way.any()
             for way in (np.sign(vector), straight)
         )
         diagonally, straight_on = (np.exp(0.15 * rise) for rise in rises)
         multipliers *= slant * diagonally + (1 - slant) * straight_on
-    mean = sum(share * Fraction(m) for share, m in zip(found.values(), multipliers, strict=True))
+    mean = sum(
+        share * Fraction(m)
+        for share, m in zip(found.values(), multipliers, strict=True)
+    )
     return float(length * float(mean))
 
 
 def is_legal(
-    first: Cell, last: Cell, grid: GridMap, rule: MoveRule, begin: Fraction = Fraction(0)
+    first: Cell,
+    last: Cell,
+    grid: GridMap,
+    rule: MoveRule,
+    begin: Fraction = Fraction(0),
 ) -> bool:
     """Say whether a segment is legal from a share of it on, by all cells that it touches there."""
     if not (grid.contains(first) and grid.contains(last)):
@@ -66,7 +83,11 @@ def is_legal(
     step = [last[0] - first[0], last[1] - first[1]]
     angle = np.arctan2(step[1], step[0]) / (np.pi / 4)
     actions = {int(np.floor(angle + 1e-9)) % 8, int(np.ceil(angle - 1e-9)) % 8}
-    forbidden = np.zeros(grid.occupancy.shape, int) if grid.forbidden is None else grid.forbidden
+    forbidden = (
+        np.zeros(grid.occupancy.shape, int)
+        if grid.forbidden is None
+        else grid.forbidden
+    )
     passed, until = [*shares(first, last).items()], Fraction(0)
     for number, ((x, y), share) in enumerate(passed):
         until += share

@@ -7,20 +7,32 @@ import numpy as np
 from ddqn_planner.grid import MoveRule
 from ddqn_planner.grid.footprint import read_footprint
 from ddqn_planner.grid.motions import make_motions
-from ddqn_planner.model import NETWORKS, ModelMetadata, QNetwork, RobotNetwork, save_model
+from ddqn_planner.model import (
+    NETWORKS,
+    ModelMetadata,
+    QNetwork,
+    RobotNetwork,
+    save_model,
+)
 from ddqn_planner.planning import Planner
 
 
-def random_network(name: str, seed: int = 0, scale: float = 0.5, **sizes: int) -> QNetwork:
+def random_network(
+    name: str, seed: int = 0, scale: float = 0.5, **sizes: int
+) -> QNetwork:
     random = np.random.default_rng(seed)
     shapes = NETWORKS[name].shapes(sizes)
     tensors = {key: random.normal(0, scale, shape) for key, shape in shapes.items()}
-    return NETWORKS[name](sizes, {key: t.astype(np.float32) for key, t in tensors.items()})
+    return NETWORKS[name](
+        sizes, {key: t.astype(np.float32) for key, t in tensors.items()}
+    )
 
 
 def turning_network(size: int) -> QNetwork:
     """A network that always goes to -x, or where it cannot, to +x: it turns round for ever."""
-    network = random_network("paper", height=size, width=size, filters=1, hidden_units=0)
+    network = random_network(
+        "paper", height=size, width=size, filters=1, hidden_units=0
+    )
     network.tensors["fully_connected.weight"][:] = 0
     network.tensors["fully_connected.bias"][:] = [1, 0, 0, 0, 2, 0, 0, 0]
     return network
@@ -29,7 +41,9 @@ def turning_network(size: int) -> QNetwork:
 def turning_planner(size: int = 6) -> Planner:
     """A planner with this network: its greedy steps are trapped."""
     network = turning_network(size)
-    metadata = ModelMetadata("paper", network.sizes, MoveRule.ROBOT_SAFE, 0.9, "", 1, 0, "")
+    metadata = ModelMetadata(
+        "paper", network.sizes, MoveRule.ROBOT_SAFE, 0.9, "", 1, 0, ""
+    )
     return Planner(network, metadata)
 
 
@@ -48,9 +62,13 @@ def robot_model(path: Path, motion: str, cell: float) -> None:
     """Write the model of a small robot that has learned its body exactly."""
     front, back, side = BODY
     corners = [(front, side), (-back, side), (-back, -side), (front, -side)]
-    untrained = RobotNetwork.untrained(read_footprint(corners), make_motions(motion, 0.4, cell))
+    untrained = RobotNetwork.untrained(
+        read_footprint(corners), make_motions(motion, 0.4, cell)
+    )
     swept = untrained.swept_by_unit.astype(np.float32)
     learned = {"weight": 2 * swept, "threshold": np.ones(len(swept), np.float32)}
     network = RobotNetwork(untrained.sizes, {**untrained.tensors, **learned})
     rule = MoveRule.ROBOT_SAFE
-    save_model(path, network, ModelMetadata("robot", network.sizes, rule, 1.0, "", 0, 0, ""))
+    save_model(
+        path, network, ModelMetadata("robot", network.sizes, rule, 1.0, "", 0, 0, "")
+    )

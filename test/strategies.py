@@ -12,7 +12,9 @@ Place = tuple[GridMap, Cell]
 Data = st.DataObject
 RULES = st.sampled_from(list(MoveRule))
 shapes = numpy_st.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9)
-occupancies = numpy_st.arrays(np.bool_, shapes, elements=st.sampled_from([False, False, True]))
+occupancies = numpy_st.arrays(
+    np.bool_, shapes, elements=st.sampled_from([False, False, True])
+)
 
 
 @st.composite
@@ -58,7 +60,9 @@ def grids_uphill(draw: st.DrawFn) -> Place:
     grid, cell = draw(grids_with_directions() | grids_with_costs())
     codes = st.sampled_from([0, 0, *range(8, 256, 19)])
     uphill = draw(numpy_st.arrays(np.uint8, grid.occupancy.shape, elements=codes))
-    return GridMap(grid.occupancy, cost=grid.cost, forbidden=grid.forbidden, uphill=uphill), cell
+    return GridMap(
+        grid.occupancy, cost=grid.cost, forbidden=grid.forbidden, uphill=uphill
+    ), cell
 
 
 def json_values(scalars: st.SearchStrategy[object]) -> st.SearchStrategy[object]:
@@ -75,7 +79,10 @@ def cells_of(grid: GridMap) -> st.SearchStrategy[Cell]:
 def patched(draw: st.DrawFn, grid: GridMap) -> GridMap:
     """The same place with other cells, or other directions, in a box."""
     width, height = draw(st.integers(1, grid.width)), draw(st.integers(1, grid.height))
-    x, y = draw(st.integers(0, grid.width - width)), draw(st.integers(0, grid.height - height))
+    x, y = (
+        draw(st.integers(0, grid.width - width)),
+        draw(st.integers(0, grid.height - height)),
+    )
     if grid.forbidden is not None and draw(st.booleans()):
         forbidden = grid.forbidden.copy()
         forbidden[y : y + height, x : x + width] = draw(st.integers(0, 255))

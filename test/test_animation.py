@@ -11,7 +11,9 @@ from ddqn_planner import GridMap, Planner
 from ddqn_planner.pictures import PATH_COLOUR
 
 
-def test_cells_appear_then_the_path_grows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cells_appear_then_the_path_grows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(animation, "LAST_FRAMES", 2)
     planner, grid = Planner.load("any_map"), GridMap(np.zeros((8, 12), dtype=bool))
     plan = planner.plan(grid, (1, 4), (10, 4))
@@ -35,5 +37,8 @@ def test_a_film_of_a_shipped_map(monkeypatch: pytest.MonkeyPatch) -> None:
     saved: list[str] = []
     monkeypatch.setattr(animation, "save_film", lambda path, *_: saved.append(path))
     assert animation.main(["dilemma", "plan.gif"]) == 0
-    assert animation.main(["dilemma", "no.gif", "--start", "6", "19", "--goal", "1", "19"]) == 1
+    assert (
+        animation.main(["dilemma", "no.gif", "--start", "6", "19", "--goal", "1", "19"])
+        == 1
+    )
     assert saved == ["plan.gif"]

@@ -51,7 +51,9 @@ CALLS: dict[Callable[..., Any], dict[str, Any]] = {
     GRID.world_to_cell: {"x": 0.0, "y": 0.0},
     load_map: {"path": MAP, **FLAGS},
     inflate: {"grid": GRID, "robot_radius": 1.0, "clearance_weight": 0.5},
-    Experience: dict.fromkeys(("nominal_speed", "robot_width", "half_life", "max_pause"), 1.0),
+    Experience: dict.fromkeys(
+        ("nominal_speed", "robot_width", "half_life", "max_pause"), 1.0
+    ),
     EXPERIENCE.record: {"seconds": [0, 1], "positions": [(0, 0), (0, 1)]},
     EXPERIENCE.record_failure: {"position": (0, 0)},
     EXPERIENCE.apply: {"grid": GRID},
@@ -60,11 +62,22 @@ CALLS: dict[Callable[..., Any], dict[str, Any]] = {
     EXPERIENCE.expected_time: {"grid": GRID, "cells": CELLS},
     Planner: {"network": PLANNER.network, "metadata": PLANNER.metadata},
     Planner.load: {"model": "any_map"},
-    PLANNER.plan: {"grid": GRID, "start": (0, 0), "goal": (3, 3), "tolerance": 0.0, **AT_START},
+    PLANNER.plan: {
+        "grid": GRID,
+        "start": (0, 0),
+        "goal": (3, 3),
+        "tolerance": 0.0,
+        **AT_START,
+    },
     PLANNER.plan_nearest: {"grid": GRID, "start": (0, 0), "goals": CELLS, **AT_START},
     PLANNER.plan_through: {"grid": GRID, "start": (0, 0), "goals": CELLS, **AT_START},
     PLANNER.q_field: {"grid": GRID, "goal": (3, 3), "move_rule": "unit"},
-    Plan: {"status": PlanStatus.SUCCEEDED, "path": CELLS, "method": "greedy", "move_rule": "unit"},
+    Plan: {
+        "status": PlanStatus.SUCCEEDED,
+        "path": CELLS,
+        "method": "greedy",
+        "move_rule": "unit",
+    },
     QField: {"goal": (0, 0), "q": Q, "legal": LEGAL, "move_rule": "unit"},
     QField((0, 0), Q, LEGAL).rollout: {"start": (0, 0)},
     PLANNER.q_field(GRID, (3, 3)).rollout: {"start": (0, 0)},
@@ -74,17 +87,68 @@ ARGUMENTS = [(call, name) for call, arguments in CALLS.items() for name in argum
 
 # Right for no argument.
 WRONG = [
-    *(object(), 1j, len, b"x", "no such", [object()], [[1], [1, 2]], (None, None), np.ones(3, "U")),
-    *({"x": 1, "y": 2}, np.full(SHAPE, None), [[1j]], np.full(SHAPE, "a"), [["a", "b"]]),
+    *(
+        object(),
+        1j,
+        len,
+        b"x",
+        "no such",
+        [object()],
+        [[1], [1, 2]],
+        (None, None),
+        np.ones(3, "U"),
+    ),
+    *(
+        {"x": 1, "y": 2},
+        np.full(SHAPE, None),
+        [[1j]],
+        np.full(SHAPE, "a"),
+        [["a", "b"]],
+    ),
 ]
 
 # Right for some arguments.
 ANY = [
-    *(None, True, np.nan, np.inf, -np.inf, -1, 0.5, 10**30, 10**400, -(10**400), "", "1", "a\0b"),
-    *([], {}, iter(()), [1, 2], (1, 2, 3), (-1, -1), (7, 5), (0.5, 1), (10**30, 0), (np.inf, 0)),
+    *(
+        None,
+        True,
+        np.nan,
+        np.inf,
+        -np.inf,
+        -1,
+        0.5,
+        10**30,
+        10**400,
+        -(10**400),
+        "",
+        "1",
+        "a\0b",
+    ),
+    *(
+        [],
+        {},
+        iter(()),
+        [1, 2],
+        (1, 2, 3),
+        (-1, -1),
+        (7, 5),
+        (0.5, 1),
+        (10**30, 0),
+        (np.inf, 0),
+    ),
     *([(-1, -1)], [(7, 5)], [(0.5, 1)], [(10**30, 0)], np.array(1.0), np.zeros((0, 0))),
-    *(np.full(SHAPE, np.nan), np.full(SHAPE, -np.inf), np.full(SHAPE, 1e5), np.ones((7, 7))),
-    *(np.array([[-1, -1]]), np.array([[7, 5]]), np.array([[2**63, 0]], np.uint64), Fraction(1, 2)),
+    *(
+        np.full(SHAPE, np.nan),
+        np.full(SHAPE, -np.inf),
+        np.full(SHAPE, 1e5),
+        np.ones((7, 7)),
+    ),
+    *(
+        np.array([[-1, -1]]),
+        np.array([[7, 5]]),
+        np.array([[2**63, 0]], np.uint64),
+        Fraction(1, 2),
+    ),
     *(np.float32(1), np.int64(1), np.uint8(1), np.bool_(True), np.str_("unit")),
 ]
 
@@ -108,10 +172,14 @@ def test_a_wrong_argument_is_a_value_error_that_names_it(
     right = CALLS[call]
     call(**right)
     monkeypatch.chdir(tmp_path)
-    names = dict.fromkeys(("move_rule", "method", "status"), "MoveRule|PlanMethod|PlanStatus")
+    names = dict.fromkeys(
+        ("move_rule", "method", "status"), "MoveRule|PlanMethod|PlanStatus"
+    )
     names |= dict.fromkeys("xy", "first cell|point")
     for wrong in WRONG:
-        with pytest.raises(ValueError, match=f"(?s){names.get(name, name.removesuffix('s'))}"):
+        with pytest.raises(
+            ValueError, match=f"(?s){names.get(name, name.removesuffix('s'))}"
+        ):
             call(**{**right, name: wrong})
     for value in ANY:
         with suppress(ValueError):
@@ -121,12 +189,16 @@ def test_a_wrong_argument_is_a_value_error_that_names_it(
 
 
 def test_a_path_for_experience_is_a_path() -> None:
-    for wrong, call in product((3, None, b"x", ["x"]), (EXPERIENCE.save, Experience.load)):
+    for wrong, call in product(
+        (3, None, b"x", ["x"]), (EXPERIENCE.save, Experience.load)
+    ):
         with pytest.raises(ValueError, match="path is"):
             call(wrong)
 
 
-@pytest.mark.parametrize("cell", [(-1, 0), (0, -1), (7, 0), (0, 5), (10**30, 0), (0.5, 0)])
+@pytest.mark.parametrize(
+    "cell", [(-1, 0), (0, -1), (7, 0), (0, 5), (10**30, 0), (0.5, 0)]
+)
 def test_cells_outside_the_map_and_fractions_are_refused(cell: Any) -> None:
     timed = GRID.with_patch([[1]], 6, 4)  # what the cell (-1, -1) would be
     field = PLANNER.q_field(timed, (3, 3))
@@ -139,7 +211,9 @@ def test_cells_outside_the_map_and_fractions_are_refused(cell: Any) -> None:
         lambda: field.rollout(cell),
     ]
     for call in calls:
-        with pytest.raises(ValueError, match=r"outside the map of 7 x 5|give two whole numbers"):
+        with pytest.raises(
+            ValueError, match=r"outside the map of 7 x 5|give two whole numbers"
+        ):
             call()
     with pytest.raises(ValueError, match=r"holds 0\.5"):
         Plan(PlanStatus.SUCCEEDED, [(0.5, 0)])  # type: ignore[arg-type]

@@ -50,33 +50,56 @@ sys.meta_path.insert(0, Absent)
 def without(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
     """Run an executable of the package as if neither ROS nor some libraries were installed."""
 
-    def run(libraries: Sequence[str], *command: str) -> subprocess.CompletedProcess[str]:
+    def run(
+        libraries: Sequence[str], *command: str
+    ) -> subprocess.CompletedProcess[str]:
         (tmp_path / "sitecustomize.py").write_text(ABSENT.format(libraries=libraries))
         path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
-        environment, program = {**os.environ, "PYTHONPATH": path}, executable(command[0])
+        environment, program = (
+            {**os.environ, "PYTHONPATH": path},
+            executable(command[0]),
+        )
         arguments = [program, *command[1:]]
-        return subprocess.run(arguments, env=environment, capture_output=True, text=True)
+        return subprocess.run(
+            arguments, env=environment, capture_output=True, text=True
+        )
 
     return run
 
 
 @pytest.mark.parametrize("library", ["torch", "gymnasium"])
-def test_training_says_what_it_needs(without: Any, tmp_path: Path, library: str) -> None:
-    for command in (["train", "dilemma"], ["train-any-map"])[: 1 + (library == "torch")]:
-        done = without([library], "ddqn-planner", *command, "--out", str(tmp_path / "run"))
-        expected = f"ddqn-planner: No module named '{library}'; pip install torch gymnasium\n"
+def test_training_says_what_it_needs(
+    without: Any, tmp_path: Path, library: str
+) -> None:
+    for command in (["train", "dilemma"], ["train-any-map"])[
+        : 1 + (library == "torch")
+    ]:
+        done = without(
+            [library], "ddqn-planner", *command, "--out", str(tmp_path / "run")
+        )
+        expected = (
+            f"ddqn-planner: No module named '{library}'; pip install torch gymnasium\n"
+        )
         assert (done.stderr, done.returncode) == (expected, 2)
 
 
 @pytest.mark.parametrize("node", ["map_server_node", "planner_node", "trainer_node"])
-def test_a_node_without_ros_says_in_one_line_how_to_get_it(without: Any, node: str) -> None:
+def test_a_node_without_ros_says_in_one_line_how_to_get_it(
+    without: Any, node: str
+) -> None:
     done = without(["rclpy"], node)
-    remedy = "install ROS 2 Jazzy and source it, or in the repository: pip install '.[ros]'"
-    assert re.fullmatch(rf"{node}: No module named '\w+'; {re.escape(remedy)}\n", done.stderr)
+    remedy = (
+        "install ROS 2 Jazzy and source it, or in the repository: pip install '.[ros]'"
+    )
+    assert re.fullmatch(
+        rf"{node}: No module named '\w+'; {re.escape(remedy)}\n", done.stderr
+    )
     assert done.returncode == 1
 
 
-def test_bad_input_ends_in_2(console: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bad_input_ends_in_2(
+    console: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     save_map(GridMap(np.zeros((2, 2))), "bare.yaml")
     for command, named in (
@@ -87,7 +110,10 @@ def test_bad_input_ends_in_2(console: Any, tmp_path: Path, monkeypatch: pytest.M
         ("plan dilemma --clearance-weight 2", r"clearance_weight is 2\.0"),
         ("plan dilemma --tolerance nan", "--tolerance is nan; give metres"),
         ("plan dilemma --tolerance -1", r"--tolerance is -1\.0; give metres"),
-        ("plan dilemma --start-clearing-radius -1", r"--start-clearing-radius is -1\.0; give met"),
+        (
+            "plan dilemma --start-clearing-radius -1",
+            r"--start-clearing-radius is -1\.0; give met",
+        ),
         ("plan dilemma --model car", r"0\.05 m, and the map's have 0\.5 m; give a map"),
         ("train dilemma --gamma 2", r"gamma is 2\.0"),
         ("train dilemma --start 1 19", r"start \(1, 19\)"),
@@ -117,9 +143,13 @@ def test_each_hyper_parameter_can_be_given(
     console("train --seed 5", small_map, "--out", tmp_path / "run", *arguments)
     scenario = replace(small, move_rule=MoveRule.CORNER_CUTTING)
     trainer = Trainer([scenario], HyperParameters(**given), seed=5)
-    trainer.restore(tmp_path / "run" / "checkpoint.safetensors")  # of these parameters alone
+    trainer.restore(
+        tmp_path / "run" / "checkpoint.safetensors"
+    )  # of these parameters alone
     assert trainer.steps == 4
-    assert not given.items() & {entry.name: entry.default for entry in PARAMETERS}.items()
+    assert (
+        not given.items() & {entry.name: entry.default for entry in PARAMETERS}.items()
+    )
     assert load_model(tmp_path / "run" / "model.safetensors")[1].seed == 5
 
 
@@ -134,8 +164,16 @@ def test_the_model_for_any_map_is_trained_with_parameters_of_its_own(
 
 
 @pytest.mark.slow
-def test_an_interrupted_training_is_saved_and_resumed(small_map: str, tmp_path: Path) -> None:
-    command = [executable("ddqn-planner"), "train", small_map, "--out", str(tmp_path / "run")]
+def test_an_interrupted_training_is_saved_and_resumed(
+    small_map: str, tmp_path: Path
+) -> None:
+    command = [
+        executable("ddqn-planner"),
+        "train",
+        small_map,
+        "--out",
+        str(tmp_path / "run"),
+    ]
     command += ["--filters", "4", "--steps", "1000000"]
     curves, steps = tmp_path / "run" / "episodes.csv", 0
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -151,13 +189,20 @@ def test_an_interrupted_training_is_saved_and_resumed(small_map: str, tmp_path: 
         assert child.returncode == 0
         assert f"from step {steps} to" in printed
         assert "run the same command to resume" in printed
-        before, steps = steps, load_model(tmp_path / "run" / "model.safetensors")[1].steps
+        before, steps = (
+            steps,
+            load_model(tmp_path / "run" / "model.safetensors")[1].steps,
+        )
         assert steps > before
 
 
 @pytest.mark.parametrize(
     "command",
-    ["train dilemma", "train-any-map", "train-robot --footprint 0.2 --motion differential"],
+    [
+        "train dilemma",
+        "train-any-map",
+        "train-robot --footprint 0.2 --motion differential",
+    ],
 )
 def test_a_place_that_cannot_be_written_is_named_before_a_training(
     console: Any, tmp_path: Path, command: str
@@ -171,18 +216,24 @@ def test_a_place_that_cannot_be_written_is_named_before_a_training(
     assert "the seed is -1; give a whole number" in wrong
 
 
-def test_files_that_cannot_be_written_are_named_before_a_plan(console: Any, tmp_path: Path) -> None:
+def test_files_that_cannot_be_written_are_named_before_a_plan(
+    console: Any, tmp_path: Path
+) -> None:
     for option in ("--csv", "--picture"):
         for wrong in (tmp_path, "/dev/null", "/proc/none/x.png"):
             error = console("plan dilemma", option, wrong, status=2).err
-            assert re.search(f"(no regular file|cannot be written).*; give another {option}", error)
+            assert re.search(
+                f"(no regular file|cannot be written).*; give another {option}", error
+            )
     assert not any(tmp_path.iterdir())
 
 
 def test_an_interrupted_compilation_ends_with_one_line(tmp_path: Path) -> None:
     command = [executable("ddqn-planner"), "warm-up"]
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    child = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
+    child = subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, env=environment
+    )
     assert child.stderr is not None
     assert "compiles its functions" in child.stderr.readline()
     child.send_signal(signal.SIGINT)

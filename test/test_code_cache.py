@@ -141,7 +141,9 @@ def test_a_damaged_file_is_replaced_with_one_warning(
     assert len(caplog.records) == 1
 
 
-def test_a_folder_with_files_in_the_place_of_code_stays(folder: Path, caplog: Any) -> None:
+def test_a_folder_with_files_in_the_place_of_code_stays(
+    folder: Path, caplog: Any
+) -> None:
     compile_area()
     path = file_of(folder, ".nbi")
     replace_by_folder(path)
@@ -155,7 +157,9 @@ def test_a_folder_with_files_in_the_place_of_code_stays(folder: Path, caplog: An
     assert (path / "file").exists()
 
 
-def test_code_that_is_missing_is_compiled_without_a_warning(folder: Path, caplog: Any) -> None:
+def test_code_that_is_missing_is_compiled_without_a_warning(
+    folder: Path, caplog: Any
+) -> None:
     compile_area()
     file_of(folder, ".nbc").unlink()
     assert hits(compile_area()) == 1
@@ -166,7 +170,9 @@ def test_code_that_is_missing_is_compiled_without_a_warning(folder: Path, caplog
     assert not caplog.records
 
 
-def test_a_folder_that_vanishes_between_two_signatures_is_made_again(folder: Path) -> None:
+def test_a_folder_that_vanishes_between_two_signatures_is_made_again(
+    folder: Path,
+) -> None:
     dispatcher = compiled(area).dispatcher()  # type: ignore[attr-defined]
     dispatcher(3, 2)
     shutil.rmtree(folder)
@@ -174,18 +180,24 @@ def test_a_folder_that_vanishes_between_two_signatures_is_made_again(folder: Pat
     assert hits(compile_area()) == 1
 
 
-def test_a_full_disk_costs_a_compilation_and_a_warning(folder: Path, caplog: Any) -> None:
+def test_a_full_disk_costs_a_compilation_and_a_warning(
+    folder: Path, caplog: Any
+) -> None:
     with files_no_longer_than(1000):
         assert hits(compile_area()) == 0
     (record,) = caplog.records
     assert "cannot be kept in" in record.getMessage()
     assert "File too large" in record.getMessage()
-    assert not [path for path in folder.rglob("*") if path.suffix not in ("", *SUFFIXES)]
+    assert not [
+        path for path in folder.rglob("*") if path.suffix not in ("", *SUFFIXES)
+    ]
     assert hits(compile_area()) == 0
     assert hits(compile_area()) == 2
 
 
-def test_a_folder_that_becomes_a_file_costs_a_warning(folder: Path, caplog: Any) -> None:
+def test_a_folder_that_becomes_a_file_costs_a_warning(
+    folder: Path, caplog: Any
+) -> None:
     dispatcher = compiled(area).dispatcher()  # type: ignore[attr-defined]
     (subfolder,) = folder.iterdir()
     subfolder.rmdir()

@@ -43,7 +43,9 @@ def function_of(source: str, **scope: Any) -> Any:
 
 
 def digest(constant: object, body: str = "CONSTANT") -> str:
-    return digest_of(function_of(f"def f(x):\n    return {body}", CONSTANT=constant), {})
+    return digest_of(
+        function_of(f"def f(x):\n    return {body}", CONSTANT=constant), {}
+    )
 
 
 def changed_table(kind: Any) -> np.ndarray:
@@ -55,7 +57,10 @@ def changed_table(kind: Any) -> np.ndarray:
 CONSTANTS = [
     None,
     *(True, 1, 1.0, 1j, "1", b"1", -0.0, 0.0, math.nan, math.inf),
-    *(kind(1) for kind in (np.bool_, np.int8, np.uint64, np.float32, np.float64, np.complex64)),
+    *(
+        kind(1)
+        for kind in (np.bool_, np.int8, np.uint64, np.float32, np.float64, np.complex64)
+    ),
     *(
         np.uint64(2),
         np.float32(1.0000001),
@@ -63,11 +68,37 @@ CONSTANTS = [
         np.datetime64(1, "s"),
         np.datetime64(1, "m"),
     ),
-    *(np.zeros(2304), np.zeros((48, 48)), np.zeros((48, 48), np.float32), changed_table(float)),
-    *(changed_table(np.uint8), changed_table(np.int8), changed_table(bool), np.zeros((0, 3))),
-    *(np.array(1), np.array([1]), np.array([(1, 2)], "i4,i4"), np.array([(1, 2)], "i4,u4")),
+    *(
+        np.zeros(2304),
+        np.zeros((48, 48)),
+        np.zeros((48, 48), np.float32),
+        changed_table(float),
+    ),
+    *(
+        changed_table(np.uint8),
+        changed_table(np.int8),
+        changed_table(bool),
+        np.zeros((0, 3)),
+    ),
+    *(
+        np.array(1),
+        np.array([1]),
+        np.array([(1, 2)], "i4,i4"),
+        np.array([(1, 2)], "i4,u4"),
+    ),
     *(np.array([None]), np.array(["1"], object)),
-    *((), (1,), ((1,),), (1, 1), ((1, 1),), (1, (1,)), ((1,), 1), (np.uint8(1),), (1.0,), ("1",)),
+    *(
+        (),
+        (1,),
+        ((1,),),
+        (1, 1),
+        ((1, 1),),
+        (1, (1,)),
+        ((1,), 1),
+        (np.uint8(1),),
+        (1.0,),
+        ("1",),
+    ),
     *(
         [1],
         {1},
@@ -90,7 +121,17 @@ CONSTANTS = [
         Vector,
         Color,
     ),
-    *(math.sin, math.cos, np.sin, np.cos, np.uint8, np.uint16, int, float, np.dtype("i4")),
+    *(
+        math.sin,
+        math.cos,
+        np.sin,
+        np.cos,
+        np.uint8,
+        np.uint16,
+        int,
+        float,
+        np.dtype("i4"),
+    ),
     *(numba.types.int32, numba.types.int64, np.linalg.norm),
 ]
 
@@ -134,10 +175,22 @@ def test_constants_count_wherever_the_function_gets_them() -> None:
 
     sources: list[tuple[str, Callable[[Any], dict[str, Any]]]] = [
         ("def f(x): return x + VALUE.CONSTANT", lambda value: {"VALUE": module(value)}),
-        ("def f(x): return x + VALUE.inner.CONSTANT", lambda value: {"VALUE": outer(value)}),
-        ("def f(x): return x + VALUE.CONSTANT", lambda value: {"VALUE": in_class(value)}),
-        ("def f(x):\n def g(y): return y + VALUE\n return g(x)", lambda value: {"VALUE": value}),
-        ("def f(x): return sum([y + VALUE for y in x])", lambda value: {"VALUE": value}),
+        (
+            "def f(x): return x + VALUE.inner.CONSTANT",
+            lambda value: {"VALUE": outer(value)},
+        ),
+        (
+            "def f(x): return x + VALUE.CONSTANT",
+            lambda value: {"VALUE": in_class(value)},
+        ),
+        (
+            "def f(x):\n def g(y): return y + VALUE\n return g(x)",
+            lambda value: {"VALUE": value},
+        ),
+        (
+            "def f(x): return sum([y + VALUE for y in x])",
+            lambda value: {"VALUE": value},
+        ),
         ("def f(x, y=VALUE): return x + y", lambda value: {"VALUE": value}),
         ("def f(x, *, y=VALUE): return x + y", lambda value: {"VALUE": value}),
         (
@@ -146,12 +199,16 @@ def test_constants_count_wherever_the_function_gets_them() -> None:
         ),
         (
             "def f(x): return g(x)",
-            lambda value: {"g": numba.njit(function_of("def f(x): return VALUE", VALUE=value))},
+            lambda value: {
+                "g": numba.njit(function_of("def f(x): return VALUE", VALUE=value))
+            },
         ),
     ]
     for source, scope in sources:
         values = np.uint64(1), np.uint64(2), np.uint32(1), (1, 2)
-        digests = [digest_of(function_of(source, **scope(value)), {}) for value in values]
+        digests = [
+            digest_of(function_of(source, **scope(value)), {}) for value in values
+        ]
         assert len({*digests}) == len(values), source
         again = digest_of(function_of(source, **scope(np.uint64(1))), {})
         assert again == digests[0], source
@@ -170,15 +227,36 @@ def test_constants_in_the_code_count() -> None:
             "None",
             "...",
         ),
-        *("x in {1, 2}", "x in {1, 3}", "x in (1, 3)", "x + 1", "x - 1", "x.real", "x.imag"),
-        *("(lambda y: y + 1)(x)", "(lambda y: y + 2)(x)", "x if x else 2", "x if x else 3"),
+        *(
+            "x in {1, 2}",
+            "x in {1, 3}",
+            "x in (1, 3)",
+            "x + 1",
+            "x - 1",
+            "x.real",
+            "x.imag",
+        ),
+        *(
+            "(lambda y: y + 1)(x)",
+            "(lambda y: y + 2)(x)",
+            "x if x else 2",
+            "x if x else 3",
+        ),
     ]
     assert len({digest(0, body) for body in bodies}) == len(bodies)
 
 
 def test_options_count() -> None:
-    options: list[dict[str, object]] = [{}, {"nogil": True}, {"nogil": False}, {"inline": "always"}]
-    assert len({digest_of(function_of("def f(x): return x"), each) for each in options}) == 4
+    options: list[dict[str, object]] = [
+        {},
+        {"nogil": True},
+        {"nogil": False},
+        {"inline": "always"},
+    ]
+    assert (
+        len({digest_of(function_of("def f(x): return x"), each) for each in options})
+        == 4
+    )
 
 
 def test_functions_that_call_each_other_have_a_digest() -> None:
@@ -190,7 +268,9 @@ def test_functions_that_call_each_other_have_a_digest() -> None:
     assert digest_with(1) == digest_with(1) != digest_with(2)
 
 
-def test_a_changed_constant_gives_new_code(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_changed_constant_gives_new_code(
+    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
     table = np.zeros(2304, np.uint8)
     other = table.copy()

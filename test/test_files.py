@@ -73,7 +73,9 @@ def test_without_the_variable_the_home_is_that_of_the_users_list(
         raise KeyError
 
     monkeypatch.setattr(pwd, "getpwuid", nobody)
-    with pytest.raises(ValueError, match="no home folder of this user is known; give the full"):
+    with pytest.raises(
+        ValueError, match="no home folder of this user is known; give the full"
+    ):
         as_path("~/x")
 
 
@@ -111,7 +113,10 @@ def test_a_file_of_such_a_name_can_be_named(tmp_path: Path, monkeypatch: Any) ->
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.text(max_size=20) | st.sampled_from(["~", "~/", "./~", "$", "${", "file://", "a://"]))
+@given(
+    st.text(max_size=20)
+    | st.sampled_from(["~", "~/", "./~", "$", "${", "file://", "a://"])
+)
 def test_any_text_is_a_path_or_a_value_error(home: Path, text: str) -> None:
     with suppress(ValueError):
         path = as_path(text)
@@ -167,7 +172,9 @@ def test_each_option_that_names_a_file_knows_the_home_folder(
     pictured = "--csv ~/out/p.csv --picture ~/p.png --model ~/m.safetensors"
     network, metadata = load_model("any_map")
     save_model("~/m.safetensors", network, metadata)
-    (home / "d.csv").write_text("seconds,x,y\n" + "".join(f"{t},{t / 2},1\n" for t in range(20)))
+    (home / "d.csv").write_text(
+        "seconds,x,y\n" + "".join(f"{t},{t / 2},1\n" for t in range(20))
+    )
     (home / "m.yaml").write_text(MAP)
     (home / "m.pgm").write_bytes(b"P5 20 3 255\n" + b"\xfe" * 60)
     console(f"plan ~/m.yaml --start 0 0 --goal 9 2 {pictured}")

@@ -37,8 +37,13 @@ move_costs(grid.cost_multiplier, "robot_safe")
 
 
 def run(code: str, *given: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    command, environ = [sys.executable, "-c", code, *given], {**os.environ, **environment}
-    return subprocess.run(command, env=environ, check=True, capture_output=True, text=True)
+    command, environ = (
+        [sys.executable, "-c", code, *given],
+        {**os.environ, **environment},
+    )
+    return subprocess.run(
+        command, env=environ, check=True, capture_output=True, text=True
+    )
 
 
 def loaded(code: str) -> set[str]:
@@ -63,13 +68,20 @@ UNUSED = {
     COMMAND.format("--help"): {"numpy"},
     COMMAND.format("plan --help"): {"rclpy", "matplotlib"},
     COMMAND.format("plan dilemma"): {"torch", "matplotlib", "gymnasium", "tqdm"},
-    COMMAND.format("plan office --model car"): {"torch", "matplotlib", "gymnasium", "tqdm"},
+    COMMAND.format("plan office --model car"): {
+        "torch",
+        "matplotlib",
+        "gymnasium",
+        "tqdm",
+    },
     COMMAND.format("certify"): {"torch", "numba", "scipy"},
 }
 
 
 @pytest.mark.parametrize("code", UNUSED)
-def test_no_import_and_no_command_loads_a_library_that_it_does_not_need(code: str) -> None:
+def test_no_import_and_no_command_loads_a_library_that_it_does_not_need(
+    code: str,
+) -> None:
     assert not loaded(code) & UNUSED[code]
 
 
@@ -89,14 +101,19 @@ else:
     assert "torch" not in loaded(code)
 
 
-def test_compiling_is_announced_once_and_a_load_from_the_cache_is_not(tmp_path: Path) -> None:
+def test_compiling_is_announced_once_and_a_load_from_the_cache_is_not(
+    tmp_path: Path,
+) -> None:
     code = """if True:
         import numpy as np
         from ddqn_planner.model.move_costs import read_cells
         for kind in (bool, np.uint8):
             read_cells(np.zeros((2, 2), kind), None)
     """
-    for words in (f"ddqn_planner compiles its functions, once, and keeps them in {tmp_path}/", ""):
+    for words in (
+        f"ddqn_planner compiles its functions, once, and keeps them in {tmp_path}/",
+        "",
+    ):
         said = run(code, NUMBA_CACHE_DIR=str(tmp_path)).stderr
         assert said.startswith(words)
         assert said.count("\n") == bool(words)
@@ -183,5 +200,7 @@ print(sorted(signatures() - before), f"planning.{sys.argv[2]}" in str(before))
 @pytest.mark.parametrize(
     ("model", "other"), [("any_map", "pose_kernels"), ("differential_robot", "kernels")]
 )
-def test_a_warm_up_compiles_what_requests_need_and_no_more(model: str, other: str) -> None:
+def test_a_warm_up_compiles_what_requests_need_and_no_more(
+    model: str, other: str
+) -> None:
     assert run(CODE, model, other).stdout == "[] False\n"

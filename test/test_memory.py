@@ -55,7 +55,9 @@ def test_no_mapping_with_written_pages_is_given_back() -> None:
     assert not written & given_back
 
 
-def test_without_files_of_mappings_nothing_happens(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_files_of_mappings_nothing_happens(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def missing(*_: object, **options: object) -> str:
         raise FileNotFoundError(options)
 

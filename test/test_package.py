@@ -32,13 +32,22 @@ def test_imports_run_downwards(room: str) -> None:
                 modules = [alias.name for alias in node.names]
             for module in modules:
                 assert not module.startswith(tuple(above)), f"{path} imports {module}"
-                assert room == "nodes" or not module.startswith("rclpy"), f"{path}: {module}"
+                assert room == "nodes" or not module.startswith("rclpy"), (
+                    f"{path}: {module}"
+                )
 
 
 @pytest.fixture(scope="module")
 def wheel(source_copy: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("wheel")
-    build = ["wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", folder, source_copy]
+    build = [
+        "wheel",
+        "--no-deps",
+        "--no-build-isolation",
+        "--wheel-dir",
+        folder,
+        source_copy,
+    ]
     subprocess.run([*PIP, *build], check=True)
     (path,) = folder.glob("*.whl")
     return path
@@ -82,13 +91,19 @@ print(figures.__file__)
 # last two do.
 @pytest.mark.slow
 @pytest.mark.parametrize("option", [None, "--target", "--prefix"])
-def test_maps_and_models_come_everywhere(wheel: Path, tmp_path: Path, option: str | None) -> None:
+def test_maps_and_models_come_everywhere(
+    wheel: Path, tmp_path: Path, option: str | None
+) -> None:
     environment = tmp_path / "environment"
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", environment], check=True)
+    subprocess.run(
+        [sys.executable, "-m", "venv", "--without-pip", environment], check=True
+    )
     python, folder = environment / "bin" / "python", tmp_path / "elsewhere"
     into = [option, folder] if option else []
     folder = folder if option else environment
-    subprocess.run([*PIP, "--python", python, "install", "--no-deps", *into, wheel], check=True)
+    subprocess.run(
+        [*PIP, "--python", python, "install", "--no-deps", *into, wheel], check=True
+    )
     (package,) = folder.glob("**/ddqn_planner/__init__.py")
     # The libraries of this environment; its editable install of the package is not among them.
     path = [str(package.parents[1]), sysconfig.get_path("purelib")]
@@ -103,12 +118,16 @@ def test_maps_and_models_come_everywhere(wheel: Path, tmp_path: Path, option: st
     assert "4,096" in run(program, "certify")
     for name in ("map_server_node", "planner_node", "trainer_node"):
         assert (program.parent / name).is_file()
-    (marker,) = folder.glob("**/resource_index/packages/ddqn_planner")  # where ROS looks
+    (marker,) = folder.glob(
+        "**/resource_index/packages/ddqn_planner"
+    )  # where ROS looks
     share = marker.parents[3] / "ddqn_planner"
     for name in ("launch", "rviz"):
         # pip compiles also what is written in Python here.
         shipped = {path.name: path.read_bytes() for path in (ROOT / name).glob("*.*")}
-        assert {path.name: path.read_bytes() for path in (share / name).glob("*.*")} == shipped
+        assert {
+            path.name: path.read_bytes() for path in (share / name).glob("*.*")
+        } == shipped
     # An example finds its helpers.
     helper = run("-c", IMPORT_EXAMPLE, share / "examples")
     assert Path(helper.strip()).parent == share / "experiments"
@@ -118,14 +137,21 @@ def test_maps_and_models_come_everywhere(wheel: Path, tmp_path: Path, option: st
             assert {path.name: path.read_bytes() for path in copy.iterdir()} == shipped
 
 
-def test_a_map_is_shipped_or_of_a_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_map_is_shipped_or_of_a_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     shipped = ROOT / "maps" / "dilemma.yaml"
     for name in ("dilemma", "dilemma.yaml", "package://ddqn_planner/maps/dilemma.yaml"):
         assert find_map(name).resolve() == shipped
     assert find_map("file:///somewhere/map.yaml") == Path("/somewhere/map.yaml")
     with pytest.raises(FileNotFoundError, match=r"no_such.*dilemma, office"):
         find_map("no_such")
-    for name in ("ddqn_planner/maps/../../x", "ddqn_planner//etc/x", "no/../x", "no//etc/x"):
+    for name in (
+        "ddqn_planner/maps/../../x",
+        "ddqn_planner//etc/x",
+        "no/../x",
+        "no//etc/x",
+    ):
         with pytest.raises(FileNotFoundError, match="leads out of its package"):
             find_map(f"package://{name}")
     monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
@@ -142,7 +168,9 @@ def test_a_map_is_shipped_or_of_a_package(tmp_path: Path, monkeypatch: pytest.Mo
     assert find_map("office").resolve().parent == shipped.parent
 
 
-def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "file"
     write_atomically(path, b"old")
     (tmp_path / "other").touch()
@@ -164,7 +192,9 @@ while True:
 """
 
 
-def test_a_kill_leaves_a_complete_file_and_a_temporary_that_can_be_removed(tmp_path: Path) -> None:
+def test_a_kill_leaves_a_complete_file_and_a_temporary_that_can_be_removed(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "file"
     left = 0
     while not left:
@@ -176,7 +206,9 @@ def test_a_kill_leaves_a_complete_file_and_a_temporary_that_can_be_removed(tmp_p
             writer.send_signal(signal.SIGKILL)
         assert path.read_bytes() == b"whole" * 100_000
         left = len(list(tmp_path.iterdir())) - 1
-    others = [tmp_path / name for name in (".another", ".file.swp", "file.0123456789abcdef")]
+    others = [
+        tmp_path / name for name in (".another", ".file.swp", "file.0123456789abcdef")
+    ]
     for other in others:
         other.touch()
     WorkFolder(tmp_path, ["file"], "files", "writes").close()

@@ -6,7 +6,13 @@ import pytest
 from PIL import Image, ImageColor
 
 from ddqn_planner.grid import GridMap
-from ddqn_planner.pictures import OBSTACLE_COLOUR, PATH_COLOUR, draw_body, draw_text, save_picture
+from ddqn_planner.pictures import (
+    OBSTACLE_COLOUR,
+    PATH_COLOUR,
+    draw_body,
+    draw_text,
+    save_picture,
+)
 
 
 def test_a_map_as_text_has_its_first_row_below() -> None:
@@ -16,13 +22,18 @@ def test_a_map_as_text_has_its_first_row_below() -> None:
     assert draw_text(grid, [(2, 1)]) == ". # G\n. . #"
     # All moves to the east, north, west and south are arrows; no zone is none.
     forbidden = [[0b10000011, 0b00111000, 0], [0b00001110, 0b11100000, 255]]
-    assert draw_text(GridMap([[0, 0, 0], [0, 0, 1]], forbidden=forbidden), []) == "v ^ #\n< > ."
+    assert (
+        draw_text(GridMap([[0, 0, 0], [0, 0, 1]], forbidden=forbidden), [])
+        == "v ^ #\n< > ."
+    )
 
 
 def test_a_wide_map_shows_of_each_square_what_matters_most() -> None:
     occupancy = np.zeros((5, 130))  # 3 cells a side
     occupancy[4, 129] = occupancy[4, 128] = occupancy[0, 8] = 1
-    drawn = draw_text(GridMap(occupancy), [(0, 0), (1, 1), (3, 0), (6, 0), (6, 1)]).splitlines()
+    drawn = draw_text(
+        GridMap(occupancy), [(0, 0), (1, 1), (3, 0), (6, 0), (6, 1)]
+    ).splitlines()
     assert [len(line) for line in drawn] == [2 * 44 - 1] * 2
     assert drawn[0] == ". " * 42 + "# #"
     assert drawn[1] == "S * G " + ". " * 40 + "."
@@ -33,7 +44,11 @@ def test_a_picture_shows_the_value_the_path_and_one_way_zones(tmp_path: Path) ->
     value = np.arange(60 * 50, dtype=np.float32).reshape(60, 50)
     value[0, 0] = -np.inf
     pictures = []
-    for cells, forbidden in (([], None), ([(0, 0), (9, 9)], None), ([], np.full((60, 50), 56))):
+    for cells, forbidden in (
+        ([], None),
+        ([(0, 0), (9, 9)], None),
+        ([], np.full((60, 50), 56)),
+    ):
         grid = GridMap(np.zeros((60, 50)), forbidden=forbidden)
         save_picture(tmp_path / "map.png", grid, cells, value, "a title")
         with Image.open(tmp_path / "map.png") as picture:
@@ -53,7 +68,10 @@ def test_a_body_stands_where_it_is_with_its_nose_ahead(yaw: float) -> None:
     canvas = FigureCanvasAgg(Figure(figsize=(4, 4), dpi=100))  # 4 pixels per cell
     axes = canvas.figure.add_axes((0, 0, 1, 1))
     axes.set_axis_off()
-    body, along = np.array([[10, 5], [-4, 5], [-4, -5], [10, -5]]), np.linspace(-25, 25, 100)
+    body, along = (
+        np.array([[10, 5], [-4, 5], [-4, -5], [10, -5]]),
+        np.linspace(-25, 25, 100),
+    )
     x, y = 50 + math.cos(yaw) * along, 50 + math.sin(yaw) * along
     poses = np.column_stack([x, y, np.full(100, yaw)])
     draw_body(axes, body, poses, poses[[0, -1]])

@@ -39,7 +39,11 @@ ASKED: dict[str, tuple[dict[str, Any], tuple[float, float], dict[str, Any]]] = {
     "--occupied-threshold 60": ({"occupied_threshold": 60}, (0, 0), {}),
     "--allow-unknown": ({"allow_unknown": True}, (0, 0), {}),
     "--use-map-costs": ({"use_map_costs": True}, (0, 0), {}),
-    "--allow-unknown --use-map-costs": ({"allow_unknown": True, "use_map_costs": True}, (0, 0), {}),
+    "--allow-unknown --use-map-costs": (
+        {"allow_unknown": True, "use_map_costs": True},
+        (0, 0),
+        {},
+    ),
     "--robot-radius 0.1": ({}, (0.1, 0), {}),
     "--clearance-weight 1": ({}, (0, 1), {}),
     "--move-rule unit": ({}, (0, 0), {"move_rule": "unit"}),
@@ -59,7 +63,9 @@ def test_plan_gives_as_the_library(console: Any, tmp_path: Path) -> None:
         grid = inflate(map_file.grid(**rules), *body)
         plan = planner.plan(grid, **{"start": (0, 0), "goal": (29, 29), **asked})
         given, status = options.split(), 0 if plan.cells else 1
-        printed = console("plan --json", tmp_path / "map.yaml", *given, status=status).out
+        printed = console(
+            "plan --json", tmp_path / "map.yaml", *given, status=status
+        ).out
         answer = json.loads(printed)
         assert answer["cells"] == [list(cell) for cell in plan.cells]
         assert (answer["status"], answer["length"]) == (plan.status.name, plan.length)
@@ -84,7 +90,9 @@ def test_plan_gives_every_cell(console: Any, tmp_path: Path) -> None:
     file = tmp_path / "path.csv"
     *cells, start, length = console("plan office --cells --csv", file).out.splitlines()
     assert start == "start (15, 15), goal (550, 330), 39.50 m"
-    assert length.startswith("length 789.95 cells, optimum 789.95 under robot_safe, greedy, ")
+    assert length.startswith(
+        "length 789.95 cells, optimum 789.95 under robot_safe, greedy, "
+    )
     assert (cells[0], cells[-1]) == ("15 15", "550 330")
     header, *rows = file.read_text().splitlines()
     assert (header, rows[0]) == ("x,y,x_metres,y_metres", "15,15,0.775,0.775")
@@ -100,13 +108,21 @@ def test_plan_writes_json_and_a_picture(console: Any, tmp_path: Path) -> None:
 
     answer = plan("plan.png")
     assert (answer["cells"][0], answer["cells"][-1]) == ([6, 6], [17, 19])
-    assert (answer["status"], answer["length"]) == ("SUCCEEDED", pytest.approx(answer["optimum"]))
+    assert (answer["status"], answer["length"]) == (
+        "SUCCEEDED",
+        pytest.approx(answer["optimum"]),
+    )
     with Image.open(tmp_path / "plan.png") as picture:
-        assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 100
+        assert (
+            len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0))
+            > 100
+        )
     moved = plan("moved.png", "--goal", 1, 19, "--tolerance", 9)
     assert moved["cells"][-1] != [1, 19]
     plan("there.png", "--goal", *moved["cells"][-1])  # the value is that of the end
-    assert (tmp_path / "moved.png").read_bytes() == (tmp_path / "there.png").read_bytes()
+    assert (tmp_path / "moved.png").read_bytes() == (
+        tmp_path / "there.png"
+    ).read_bytes()
 
 
 def test_missing_matplotlib_is_named(
@@ -162,9 +178,14 @@ def test_plan_drives_a_body_as_the_library_and_without_a_collision(
         body = str(planner.pose_planner.footprint.tolist())
         plan = planner.plan_poses(grid, start, goal, **{"bound": 1.0, **asked})
         given, status = [path, "--csv", file, *options.split()], 0 if plan.cells else 1
-        answer = json.loads(console("plan --model car --json", *given, status=status).out)
+        answer = json.loads(
+            console("plan --model car --json", *given, status=status).out
+        )
         assert answer["poses"] == plan.poses.tolist()
-        assert (answer["status"], answer["reason"]) == (plan.status.name, plan.status.value)
+        assert (answer["status"], answer["reason"]) == (
+            plan.status.name,
+            plan.status.value,
+        )
         assert (answer["bound"], answer["cost"]) == (plan.bound, plan.cost)
         assert answer["metres"] == pytest.approx(plan.length * 0.05)
         header, *rows = csv.reader(file.read_text().splitlines())
@@ -178,7 +199,9 @@ def test_plan_drives_a_body_as_the_library_and_without_a_collision(
     assert len(seen) == len(BODY_ASKED)  # each option counts
 
 
-def test_plan_tells_how_a_body_drives_or_why_it_cannot(rooms: Any, console: Any) -> None:
+def test_plan_tells_how_a_body_drives_or_why_it_cannot(
+    rooms: Any, console: Any
+) -> None:
     words = r"\d\.\d\d m, \d+ poses, at most 1\.000 times the least cost, planned in \d+\.\d ms\n"
     assert re.fullmatch(words, console("plan --model car", rooms[1]).out)
     for options, reason in (
@@ -210,7 +233,9 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("options", REFUSED)
-def test_plan_refuses_what_a_model_cannot_follow(rooms: Any, console: Any, options: str) -> None:
+def test_plan_refuses_what_a_model_cannot_follow(
+    rooms: Any, console: Any, options: str
+) -> None:
     assert REFUSED[options] in console(f"plan {options}", rooms[1], status=2).err
 
 
@@ -232,8 +257,14 @@ def test_a_picture_shows_what_a_body_sweeps_and_where_it_has_no_room(
         printed = console(words, file, rooms[1], status=status).out
         # Cells, counted from the centre of the first one, are the metres of the plan.
         _, footprint, *poses = drawn[-1]
-        swept, marked = ((placed(footprint, each) + 0.5) * 0.05 + (1, -2) for each in poses)
+        swept, marked = (
+            (placed(footprint, each) + 0.5) * 0.05 + (1, -2) for each in poses
+        )
         driven = np.reshape(json.loads(printed)["poses"], (-1, 3))
-        asked = np.array([[1.775, -0.725, 0], [6.125, -1.375, 0]]) if status else driven[[0, -1]]
+        asked = (
+            np.array([[1.775, -0.725, 0], [6.125, -1.375, 0]])
+            if status
+            else driven[[0, -1]]
+        )
         np.testing.assert_allclose(swept, placed(planner.footprint, driven), atol=1e-9)
         np.testing.assert_allclose(marked, placed(planner.footprint, asked), atol=1e-9)

@@ -39,10 +39,16 @@ READERS: dict[str, Callable[[Path], Any]] = {
 def test_only_regular_files_of_some_size_are_read(
     tmp_path: Path, reader: Callable[[Path], Any]
 ) -> None:
-    pipe, device, large = (tmp_path / f"{name}.yaml" for name in ("pipe", "device", "large"))
+    pipe, device, large = (
+        tmp_path / f"{name}.yaml" for name in ("pipe", "device", "large")
+    )
     os.mkfifo(pipe)
     device.symlink_to("/dev/zero")
-    for path, kind in ((pipe, "a named pipe"), (device, "a device"), (tmp_path / ".", "a folder")):
+    for path, kind in (
+        (pipe, "a named pipe"),
+        (device, "a device"),
+        (tmp_path / ".", "a folder"),
+    ):
         if reader != Experience.load or kind != "a folder":  # which has experience.npz
             with pytest.raises(ValueError, match=f"is {kind}; give"):
                 reader(path)
@@ -64,7 +70,9 @@ def test_a_limit_holds_for_files_without_a_size(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_written_is_named_and_stays(tmp_path: Path) -> None:
-    pipe, device, file = (tmp_path / name for name in ("pipe.npz", "device.npz", "file"))
+    pipe, device, file = (
+        tmp_path / name for name in ("pipe.npz", "device.npz", "file")
+    )
     os.mkfifo(pipe)
     device.symlink_to("/dev/full")
     file.touch()
@@ -94,7 +102,9 @@ def test_the_model_of_a_planner_is_saved(tmp_path: Path) -> None:
 
 def test_a_merge_needs_another_experience() -> None:
     for other in (None, 5, "x"):
-        with pytest.raises(ValueError, match=r"the other experience is .*; give an Experience"):
+        with pytest.raises(
+            ValueError, match=r"the other experience is .*; give an Experience"
+        ):
             Experience(0.5).merge(other)  # type: ignore[arg-type]
 
 
@@ -111,11 +121,15 @@ def test_a_map_has_cells_that_can_be_told_apart() -> None:
     grid = GridMap(free, 0.05, (0.04 * most, 0.0, 0.0))
     assert grid.world_to_cell(*grid.cell_to_world((1, 2))) == (1, 2)
     for resolution in (1e-320, 1e-7, 1e7, 1e38):
-        with pytest.raises(ValueError, match=r"resolution is .*give metres per cell, 1e-06 to"):
+        with pytest.raises(
+            ValueError, match=r"resolution is .*give metres per cell, 1e-06 to"
+        ):
             GridMap(free, resolution)
     for x in (0.06 * most, -1e18, 1e300):
         for origin in ((x, 0.0, 0.0), (0.0, x, 0.0)):
-            with pytest.raises(ValueError, match=r"origin is .*told apart; give .* at most 5.5e"):
+            with pytest.raises(
+                ValueError, match=r"origin is .*told apart; give .* at most 5.5e"
+            ):
                 GridMap(free, 0.05, origin)
     with pytest.raises(ValueError, match="give its yaw in radians"):
         GridMap(free, 1.0, (0.0, 0.0, 1e300))
@@ -145,7 +159,9 @@ def test_an_output_replaces_no_other_file(
 
 
 def test_a_reader_that_stops_is_no_error() -> None:
-    program = "import sys; from ddqn_planner.cli import main; sys.exit(main(['--help']))"
+    program = (
+        "import sys; from ddqn_planner.cli import main; sys.exit(main(['--help']))"
+    )
     child = subprocess.Popen(
         [sys.executable, "-c", program],
         stdout=subprocess.PIPE,

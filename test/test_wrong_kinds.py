@@ -27,7 +27,20 @@ START, GOAL = (0.7, 1.0, 0.0), (1.2, 1.0, 0.0)
 CELLS = np.zeros((2, 2), np.int8)
 RANDOM = np.random.default_rng(0)
 # What stands in for any number, cell, pose, map or file.
-KINDS = (None, "text", math.nan, math.inf, -math.inf, -1, 1e300, 10**400, True, 2j, b"1", object())
+KINDS = (
+    None,
+    "text",
+    math.nan,
+    math.inf,
+    -math.inf,
+    -1,
+    1e300,
+    10**400,
+    True,
+    2j,
+    b"1",
+    object(),
+)
 LISTS: tuple[Any, ...] = (
     [],
     [[]],
@@ -81,7 +94,9 @@ def calls(wrong: Any) -> Iterator[Any]:
     yield lambda: GridMap(wrong)
     yield lambda: GridMap(np.zeros((2, 2), np.bool_), resolution=wrong)
     yield lambda: GridMap(np.zeros((2, 2), np.bool_), origin=wrong)
-    yield lambda: GridMap.from_occupancy_values(np.zeros((2, 2)), occupied_threshold=wrong)
+    yield lambda: GridMap.from_occupancy_values(
+        np.zeros((2, 2)), occupied_threshold=wrong
+    )
     yield lambda: GRID.with_layers(body_radius=wrong)
     yield lambda: MapFile(wrong)
     yield lambda: MapFile(CELLS, resolution=wrong)
@@ -124,7 +139,9 @@ def calls(wrong: Any) -> Iterator[Any]:
 
 
 @pytest.mark.parametrize("wrong", [*KINDS, *LISTS], ids=lambda wrong: repr(wrong)[:20])
-def test_each_error_about_a_wrong_kind_is_a_value_error_with_a_remedy(wrong: Any) -> None:
+def test_each_error_about_a_wrong_kind_is_a_value_error_with_a_remedy(
+    wrong: Any,
+) -> None:
     unclear = []
     for number, call in enumerate(calls(wrong)):
         try:
@@ -136,16 +153,21 @@ def test_each_error_about_a_wrong_kind_is_a_value_error_with_a_remedy(wrong: Any
 
 
 @pytest.mark.parametrize(
-    ("tolerance", "said"), [(0.5, "0.5"), ((1,), r"\(1,\)"), ("12", "'12'"), ((0, -1), "-1")]
+    ("tolerance", "said"),
+    [(0.5, "0.5"), ((1,), r"\(1,\)"), ("12", "'12'"), ((0, -1), "-1")],
 )
 def test_a_tolerance_of_poses_is_two_numbers(tolerance: Any, said: str) -> None:
-    with pytest.raises(ValueError, match=rf"tolerance is {said}; give two numbers \(metres, rad"):
+    with pytest.raises(
+        ValueError, match=rf"tolerance is {said}; give two numbers \(metres, rad"
+    ):
         body().plan_poses(GRID, START, GOAL, tolerance)
 
 
 @pytest.mark.parametrize("bound", [math.inf, 1e300, 10**400, 1e6])
 def test_any_path_is_within_an_infinite_bound(bound: float) -> None:
-    walled = GridMap(np.zeros((80, 80), np.bool_), 0.05).with_patch(np.ones((20, 2)), 40, 30)
+    walled = GridMap(np.zeros((80, 80), np.bool_), 0.05).with_patch(
+        np.ones((20, 2)), 40, 30
+    )
     least = body().plan_poses(walled, (1, 1, 0), (3, 3, 1), bound=1.0)
     planned = Planner.load("differential_robot").plan_poses(
         walled, (1, 1, 0), (3, 3, 1), bound=bound
@@ -164,7 +186,9 @@ def test_a_model_with_a_body_has_no_q_field_of_cells() -> None:
 
 
 def test_no_path_is_sought_from_an_occupied_cell() -> None:
-    with pytest.raises(ValueError, match=r"the cell \(30, 31\) is occupied; give free cells"):
+    with pytest.raises(
+        ValueError, match=r"the cell \(30, 31\) is occupied; give free cells"
+    ):
         GRID.reachable([(1, 1), (30, 31)], "unit")
 
 
@@ -191,7 +215,10 @@ def lattice() -> dict[str, Any]:
     ("changes", "reason"),
     [
         ({"heading_angles": [0.1] * 15}, "it has 15 headings; give 16"),
-        ({"heading_angles": [math.nan] * 16}, "heading_angles holds nan; give finite radians"),
+        (
+            {"heading_angles": [math.nan] * 16},
+            "heading_angles holds nan; give finite radians",
+        ),
         ({"heading_angles": [True] * 16}, "heading_angles holds True; give numbers"),
         ({"heading_angles": "north"}, "heading_angles.*give numbers"),
         ({"num_of_headings": -16}, "num_of_headings is -16; give 16"),
@@ -199,25 +226,67 @@ def lattice() -> dict[str, Any]:
         ({"grid_resolution": 0}, "grid_resolution is 0; give metres per cell"),
         ({"grid_resolution": True}, "grid_resolution is True; give metres per cell"),
         ({"grid_resolution": "0.05"}, "grid_resolution is '0.05'; give metres"),
-        ({"grid_resolution": 1e300}, r"grid_resolution is 1e\+300; give metres per cell, 0.001 to"),
-        ({"start_angle_index": 16}, "start_angle_index of primitive 0 is 16; give .* 0 to 15"),
-        ({"end_angle_index": -1}, "end_angle_index of primitive 0 is -1; give .* 0 to 15"),
-        ({"end_angle_index": 0.5}, "end_angle_index of primitive 0 is 0.5; give a whole number"),
-        ({"trajectory_length": math.nan}, "trajectory_length of primitive 0 is nan; give metres"),
-        ({"trajectory_length": 0.01}, "trajectory_length of .* is 0.01, .* lead 0.15 m far; give"),
+        (
+            {"grid_resolution": 1e300},
+            r"grid_resolution is 1e\+300; give metres per cell, 0.001 to",
+        ),
+        (
+            {"start_angle_index": 16},
+            "start_angle_index of primitive 0 is 16; give .* 0 to 15",
+        ),
+        (
+            {"end_angle_index": -1},
+            "end_angle_index of primitive 0 is -1; give .* 0 to 15",
+        ),
+        (
+            {"end_angle_index": 0.5},
+            "end_angle_index of primitive 0 is 0.5; give a whole number",
+        ),
+        (
+            {"trajectory_length": math.nan},
+            "trajectory_length of primitive 0 is nan; give metres",
+        ),
+        (
+            {"trajectory_length": 0.01},
+            "trajectory_length of .* is 0.01, .* lead 0.15 m far; give",
+        ),
         ({"poses": []}, r"the poses of primitive 0 have shape \(0,\); give 1 to"),
-        ({"poses": [[0.05, 0.0]]}, r"the poses of primitive 0 have shape \(1, 2\); give"),
-        ({"poses": [[0.05, 0.0], [0.1]]}, "the poses of primitive 0: .*give rows of one length"),
-        ({"poses": [[math.nan, 0, 0]]}, "the poses of primitive 0 holds nan; give metres"),
-        ({"poses": [[0.15, 0, math.nan]]}, "the poses of primitive 0 holds nan; give radians"),
-        ({"poses": [[0.15, 1e300, 0]]}, r"the poses of primitive 0 holds 1e\+300; give metres"),
+        (
+            {"poses": [[0.05, 0.0]]},
+            r"the poses of primitive 0 have shape \(1, 2\); give",
+        ),
+        (
+            {"poses": [[0.05, 0.0], [0.1]]},
+            "the poses of primitive 0: .*give rows of one length",
+        ),
+        (
+            {"poses": [[math.nan, 0, 0]]},
+            "the poses of primitive 0 holds nan; give metres",
+        ),
+        (
+            {"poses": [[0.15, 0, math.nan]]},
+            "the poses of primitive 0 holds nan; give radians",
+        ),
+        (
+            {"poses": [[0.15, 1e300, 0]]},
+            r"the poses of primitive 0 holds 1e\+300; give metres",
+        ),
         ({"poses": {"x": 1}}, "the poses of primitive 0.*give numbers"),
-        ({"grid_resolution": 0.07}, "off the centres of cells; give a file of the same"),
+        (
+            {"grid_resolution": 0.07},
+            "off the centres of cells; give a file of the same",
+        ),
         ({"primitives": []}, "its primitives are no list of one or more; give a file"),
         ({"primitives": {}}, "its primitives are no list of one or more; give a file"),
         ({"primitives": [3]}, "primitive 0 has no start_angle_index; give a file"),
-        ({"primitives": lattice()["primitives"][:9]}, r"starts with the headings \[8, 9.*; give"),
-        ({"lattice_metadata": {}}, "lattice_metadata has no grid_resolution; give a file"),
+        (
+            {"primitives": lattice()["primitives"][:9]},
+            r"starts with the headings \[8, 9.*; give",
+        ),
+        (
+            {"lattice_metadata": {}},
+            "lattice_metadata has no grid_resolution; give a file",
+        ),
     ],
 )
 def test_a_wrong_lattice_is_named(tmp_path: Path, changes: Any, reason: str) -> None:
@@ -226,12 +295,15 @@ def test_a_wrong_lattice_is_named(tmp_path: Path, changes: Any, reason: str) -> 
         part |= {key: value for key, value in changes.items() if key in part}
     file = tmp_path / "lattice.json"
     file.write_text(json.dumps(wrong))
-    with pytest.raises(ValueError, match=f"(?s)lattice {re.escape(str(file))}: .*{reason}"):
+    with pytest.raises(
+        ValueError, match=f"(?s)lattice {re.escape(str(file))}: .*{reason}"
+    ):
         read_lattice(file)
 
 
 @pytest.mark.parametrize(
-    "text", ["", "[]", "3", "nothing", "{}", "[" * 10**5, "1" * 5000, "\ud800", '{"a": 1}}']
+    "text",
+    ["", "[]", "3", "nothing", "{}", "[" * 10**5, "1" * 5000, "\ud800", '{"a": 1}}'],
 )
 def test_a_file_that_is_no_lattice_is_named(tmp_path: Path, text: str) -> None:
     file = tmp_path / "lattice.json"

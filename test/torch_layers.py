@@ -15,7 +15,9 @@ def layer(weights: Mapping[str, Tensor], name: str, inputs: Tensor) -> Tensor:
 def papers_layers(weights: Mapping[str, Tensor], observations: Tensor) -> Tensor:
     """The paper's network in torch: Q(s, a), (B, 8), of observations (B, H, W)."""
     kernel, bias = weights["convolution.weight"], weights["convolution.bias"]
-    features = functional.conv2d(observations.unsqueeze(1), kernel, bias, stride=2, padding=1)
+    features = functional.conv2d(
+        observations.unsqueeze(1), kernel, bias, stride=2, padding=1
+    )
     features = features.relu().flatten(1)
     if "hidden.weight" in weights:
         features = layer(weights, "hidden", features).relu()
@@ -24,7 +26,9 @@ def papers_layers(weights: Mapping[str, Tensor], observations: Tensor) -> Tensor
 
 def propagation_layers(weights: Mapping[str, Tensor], features: Tensor) -> list[Tensor]:
     """A propagation network in torch: p(s, a) and, where it learns them, cost multipliers."""
-    hidden = layer(weights, "hidden", layer(weights, "convolution", features).relu()).relu()
+    hidden = layer(
+        weights, "hidden", layer(weights, "convolution", features).relu()
+    ).relu()
     answers = [layer(weights, "moves", hidden).sigmoid()]
     if "prices.weight" in weights:
         answers.append(1 + layer(weights, "prices", features).relu())

@@ -18,14 +18,26 @@ version = ".".join(map(str, sys.version_info[:2]))
 remedy = "name another one, such as make PYTHON=python3.12"
 
 if sys.version_info[:2] < OLDEST:
-    sys.exit(sys.executable + " is Python " + version + "; 3.10 or later is needed: " + remedy)
+    sys.exit(
+        sys.executable
+        + " is Python "
+        + version
+        + "; 3.10 or later is needed: "
+        + remedy
+    )
 
 try:
     import ensurepip  # noqa: F401
     import venv  # noqa: F401
 except ImportError:
     package = "apt install python" + version + "-venv"
-    sys.exit(sys.executable + " cannot make virtual environments: " + package + ", or " + remedy)
+    sys.exit(
+        sys.executable
+        + " cannot make virtual environments: "
+        + package
+        + ", or "
+        + remedy
+    )
 
 
 def answer(python, program):
@@ -46,8 +58,14 @@ if distribution and distribution not in SUPPORTED:
     )
 if distribution and answer(sys.executable, "import rclpy") is None:
     sys.exit(
-        "ROS_DISTRO is " + distribution + ", but " + sys.executable + " cannot import its rclpy. "
-        "Source /opt/ros/" + distribution + "/setup.bash and give make PYTHON=/usr/bin/python3, "
+        "ROS_DISTRO is "
+        + distribution
+        + ", but "
+        + sys.executable
+        + " cannot import its rclpy. "
+        "Source /opt/ros/"
+        + distribution
+        + "/setup.bash and give make PYTHON=/usr/bin/python3, "
         "or unset ROS_DISTRO to take ROS 2 Jazzy from PyPI"
     )
 

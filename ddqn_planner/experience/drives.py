@@ -39,7 +39,9 @@ from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.rotations import Rotation
 
 Float64 = NDArray[np.float64]
-Sample = tuple[float, float, float]  # seconds, and x and y in metres in the frame of the map
+Sample = tuple[
+    float, float, float
+]  # seconds, and x and y in metres in the frame of the map
 # Of each frame: its parent, and where it is there, shifted and turned in the complex plane.
 Transforms = dict[str, tuple[str, complex, complex]]
 
@@ -48,7 +50,9 @@ LOCK = "driving.lock"  # a folder with this file belongs to a robot's drives
 
 HEADER = b"episode,outcome,start_time,seconds,metres,samples\r\n"
 NUMBER = rb"-?\d{1,12}(?:\.\d{1,9})?"  # below `LATEST`
-ROW = re.compile(rb"(\d{1,18}),([a-z_]{1,20}),(%b),%b,%b,((?:%b:%b:%b ?)+)\r\n" % ((NUMBER,) * 6))
+ROW = re.compile(
+    rb"(\d{1,18}),([a-z_]{1,20}),(%b),%b,%b,((?:%b:%b:%b ?)+)\r\n" % ((NUMBER,) * 6)
+)
 
 SAMPLE_DISTANCE, SAMPLE_PERIOD = 0.05, 0.5  # from the last kept pose, metres or seconds
 STAND_PERIOD = 2.0  # seconds after which a robot that stands at its goal has arrived
@@ -56,9 +60,16 @@ ARRIVAL_DISTANCE = 0.5  # metres from the goal
 PAUSE = 120.0  # seconds: a robot that stands for longer waits for no door and no crowd
 SHORTEST = 0.5  # metres: a robot that went no farther away has not driven
 MAX_CSV_BYTES = 2**28  # of a recording: some 8 million poses
-MOST_SAMPLES = 2000  # a drive is cut there, so that the robot learns while it drives for hours
-JUMP = 1.0  # seconds back by which a clock begins anew: a bag loops, a simulator is reset
-WINDOW, STEP = 0.5, 0.25  # a drive's length joins means of so many seconds, so many metres apart
+MOST_SAMPLES = (
+    2000  # a drive is cut there, so that the robot learns while it drives for hours
+)
+JUMP = (
+    1.0  # seconds back by which a clock begins anew: a bag loops, a simulator is reset
+)
+WINDOW, STEP = (
+    0.5,
+    0.25,
+)  # a drive's length joins means of so many seconds, so many metres apart
 
 POSES = (
     "geometry_msgs/msg/PoseStamped",
@@ -66,7 +77,9 @@ POSES = (
     "nav_msgs/msg/Odometry",
 )
 BASE = "base_link"
-BACKWARDS = 0.1  # share of poses earlier than the one before: a clock jumps back less often
+BACKWARDS = (
+    0.1  # share of poses earlier than the one before: a clock jumps back less often
+)
 APART = 1.0  # metres: two topics that are farther apart, mostly, tell of two robots
 FEW = 0.1  # goals are poses, too, but a topic with a lesser share of poses than this tells of none
 
@@ -98,7 +111,9 @@ class Drive(NamedTuple):
 
     def teach(self, experience: Experience, grid: GridMap | None = None) -> Learned:
         """Let experience learn from it; where the robot gave up, moves fail."""
-        if grid is not None:  # its time, compared with the expected one, tells how sure that is
+        if (
+            grid is not None
+        ):  # its time, compared with the expected one, tells how sure that is
             experience.apply(grid)
         learned = experience.record(self.seconds, self.positions)
         if self.outcome is DriveEnd.ABORTED and learned.is_possible:
@@ -154,7 +169,10 @@ class DriveRecorder:
         if self._last is not None and seconds < self._last[0] - JUMP:
             self.end()
             self.forget()
-        if self._stands is None or math.dist(self._stands[1:], sample[1:]) > STAND_DISTANCE:
+        if (
+            self._stands is None
+            or math.dist(self._stands[1:], sample[1:]) > STAND_DISTANCE
+        ):
             if self._last is not None and not self._samples:
                 self._samples.append(self._last)
             self._stands = sample
@@ -162,7 +180,10 @@ class DriveRecorder:
         if not self._samples:
             return
         time, *at = self._samples[-1]
-        if math.dist(at, (x, y)) >= SAMPLE_DISTANCE or abs(seconds - time) >= SAMPLE_PERIOD:
+        if (
+            math.dist(at, (x, y)) >= SAMPLE_DISTANCE
+            or abs(seconds - time) >= SAMPLE_PERIOD
+        ):
             self._samples.append(sample)
         stood = abs(seconds - self._stands[0])
         if stood >= STAND_PERIOD and self._is_at_goal:
@@ -176,7 +197,11 @@ class DriveRecorder:
     @property
     def _is_at_goal(self) -> bool:
         at, goal = self.position, self.goal
-        return at is not None and goal is not None and math.dist(at, goal) <= ARRIVAL_DISTANCE
+        return (
+            at is not None
+            and goal is not None
+            and math.dist(at, goal) <= ARRIVAL_DISTANCE
+        )
 
     def set_goal(self, x: float, y: float) -> None:
         """Take a new goal; the same one again changes nothing."""
@@ -204,11 +229,18 @@ class DriveFolder(WorkFolder):
 
     # A new folder begins with the older experience, if there is one.
     def __init__(
-        self, folder: str | Path, nominal_speed: float, robot_width: float, older: str = ""
+        self,
+        folder: str | Path,
+        nominal_speed: float,
+        robot_width: float,
+        older: str = "",
     ) -> None:
         after = "the recording continues, and saving is tried again"
         super().__init__(folder, [LOCK], "drives", "records", after)
-        self.record_path, self.experience_path = self.folder / RECORD, self.folder / EXPERIENCE
+        self.record_path, self.experience_path = (
+            self.folder / RECORD,
+            self.folder / EXPERIENCE,
+        )
         self.experience = Experience(nominal_speed, robot_width)
         with self.opening():
             self.drives = _cut_incomplete_row(self.record_path)
@@ -242,7 +274,9 @@ class DriveFolder(WorkFolder):
         """Forget all that was learned; return the file that keeps it, if there was one."""
         kept = None
         if self.experience_path.exists():
-            kept = self.experience_path.replace(self.folder / "experience_forgotten.npz")
+            kept = self.experience_path.replace(
+                self.folder / "experience_forgotten.npz"
+            )
         self.experience.forget()
         self.try_to_save()
         return kept
@@ -270,7 +304,10 @@ def read_recording(path: Path, grid: GridMap, *how: str) -> tuple[str, list[Driv
     A ValueError says what is wrong with a recording that teaches nothing.
     """
     if path.name == RECORD or (path / RECORD).is_file():
-        name, drives = RECORD, list(read_drives(path / RECORD if path.is_dir() else path))
+        name, drives = (
+            RECORD,
+            list(read_drives(path / RECORD if path.is_dir() else path)),
+        )
     else:
         if path.suffix.lower() == ".csv":
             name, samples = path.name, read_csv(path)
@@ -332,7 +369,9 @@ def read_csv(path: Path) -> list[Sample]:
             try:
                 seconds, x, y = (float(row[name]) for name in names)
             except (TypeError, ValueError):
-                raise ValueError(f"{path}: {row} has no numbers; give seconds, x and y") from None
+                raise ValueError(
+                    f"{path}: {row} has no numbers; give seconds, x and y"
+                ) from None
             samples.append((seconds, x, y))
     return samples
 
@@ -360,34 +399,50 @@ def read_mcap(
                     kind, name = schema.name if schema else "", channel.topic
                     if kind in POSES:
                         frames[name].add(message.header.frame_id)
-                        if message.header.frame_id.lstrip("/") == frame and not robot_frame:
+                        if (
+                            message.header.frame_id.lstrip("/") == frame
+                            and not robot_frame
+                        ):
                             at = getattr(message.pose, "pose", message.pose).position
                             found[name, "", ""].append((_seconds(message), at.x, at.y))
                     elif kind == "tf2_msgs/msg/TFMessage":
                         name = name.removesuffix("_static")
-                        frames[name].update(t.child_frame_id for t in message.transforms)
+                        frames[name].update(
+                            t.child_frame_id for t in message.transforms
+                        )
                         for robot, moved, sample in _moves(
                             message, trees[name], frame, robot_frame
                         ):
                             found[name, robot, moved].append(sample)
-            except Exception as error:  # broken bytes make the reader raise many kinds of errors
+            except (
+                Exception
+            ) as error:  # broken bytes make the reader raise many kinds of errors
                 raise ValueError(
                     f"{path}: cannot be read as MCAP ({error!r}); `mcap recover` repairs a "
                     "recording that a crash cut"
                 ) from error
-    poses = {source: samples for source, samples in found.items() if topic in ("", source[0])}
+    poses = {
+        source: samples for source, samples in found.items() if topic in ("", source[0])
+    }
     options = "give --topic, --frame or --robot-frame"
     if not poses:
-        seen = ", ".join(f"{name} in {sorted(frames[name])}" for name in sorted(frames)) or "none"
+        seen = (
+            ", ".join(f"{name} in {sorted(frames[name])}" for name in sorted(frames))
+            or "none"
+        )
         raise ValueError(
             f"{paths[0]} has no poses in the frame {frame!r} (topics, and their frames: {seen}); "
             f"{options}"
         )
     best = max(poses, key=lambda source: len(poses[source]))
     robots = {
-        one[:2] for one in poses if one[:2] == best[:2] or _are_apart(poses[one], poses[best])
+        one[:2]
+        for one in poses
+        if one[:2] == best[:2] or _are_apart(poses[one], poses[best])
     }
-    names = ", ".join(f"{of} of {robot}" if robot else of for of, robot in sorted(robots))
+    names = ", ".join(
+        f"{of} of {robot}" if robot else of for of, robot in sorted(robots)
+    )
     if len(robots) > 1:
         raise ValueError(f"{paths[0]} has poses of several robots: {names}; {options}")
     return names, poses[best]
@@ -396,7 +451,9 @@ def read_mcap(
 def _are_apart(few: list[Sample], many: list[Sample]) -> bool:
     """Return whether poses are those of another robot than the most."""
     (t, x, y), (times, *others) = np.array(sorted(few)).T, np.array(sorted(many)).T
-    away = np.hypot(*(at - np.interp(t, times, of) for at, of in zip((x, y), others, strict=True)))
+    away = np.hypot(
+        *(at - np.interp(t, times, of) for at, of in zip((x, y), others, strict=True))
+    )
     return len(few) >= FEW * len(many) and bool(np.median(away) > APART)
 
 
@@ -413,14 +470,21 @@ def _moves(
         turn = Rotation(sent.x, sent.y, sent.z, sent.w)
         if not turn.is_rounded:  # tf2 ignores such transforms, too
             continue
-        child, parent = stamped.child_frame_id.lstrip("/"), stamped.header.frame_id.lstrip("/")
+        child, parent = (
+            stamped.child_frame_id.lstrip("/"),
+            stamped.header.frame_id.lstrip("/"),
+        )
         turned = cmath.rect(1, turn.yaw)
         tree[child] = parent, complex(moved.x, moved.y), turned
         for robot in tree:
-            if robot != robot_frame and (robot_frame or robot.rpartition("/")[2] != BASE):
+            if robot != robot_frame and (
+                robot_frame or robot.rpartition("/")[2] != BASE
+            ):
                 continue
             position, at, chain = 0j, robot, set[str]()
-            while at != frame and at in tree and at not in chain:  # they may form a circle
+            while (
+                at != frame and at in tree and at not in chain
+            ):  # they may form a circle
                 chain.add(at)
                 at, shift, turned = tree[at]
                 position = shift + turned * position

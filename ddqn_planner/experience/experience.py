@@ -20,7 +20,13 @@ from ddqn_planner.experience.evidence import FARTHEST, Evidence, Visits
 from ddqn_planner.experience.prior import Prior
 from ddqn_planner.files import as_path, differences, locked, read_file, write_atomically
 from ddqn_planner.grid import GridMap
-from ddqn_planner.grid.arguments import MAX_SLOWNESS, Cells, as_number, cells_inside, numbers
+from ddqn_planner.grid.arguments import (
+    MAX_SLOWNESS,
+    Cells,
+    as_number,
+    cells_inside,
+    numbers,
+)
 from ddqn_planner.grid.grid_map import Exploration
 from ddqn_planner.grid.moves import MOVES, UPHILL, actions_along, cells_along
 
@@ -31,7 +37,13 @@ MAX_FILE_BYTES = 2**27  # a larger file is refused before it is read
 VERSION = 3  # 2 was never released
 PRIOR = "prior_"  # before the names of its arrays in a file
 EXPERIENCE = "experience.npz"  # the name of the file in a folder
-ARRAYS = "evidence", "directed", "driven", "errors", "surprises"  # see `Evidence.restore`
+ARRAYS = (
+    "evidence",
+    "directed",
+    "driven",
+    "errors",
+    "surprises",
+)  # see `Evidence.restore`
 SPEEDS = 0.001, 1000.0  # metres per second
 WIDTHS = 0.01, 100.0  # metres
 # The range of each option, and its unit.
@@ -43,15 +55,28 @@ OPTIONS = {
 }
 
 LATEST = 1e12  # seconds of a clock: a pose of a later time is not believed
-MOST_SPEED = 10.0  # times the nominal speed: a robot that usually drives faster is not believed
-WINDOW, LONGEST_WINDOW = 0.15, 0.3  # metres at nominal speed, in whose time poses are averaged
+MOST_SPEED = (
+    10.0  # times the nominal speed: a robot that usually drives faster is not believed
+)
+WINDOW, LONGEST_WINDOW = (
+    0.15,
+    0.3,
+)  # metres at nominal speed, in whose time poses are averaged
 LEFT_NOISE = 0.015  # metres: the deviation of these means; more would hide slowness
 STAND_DISTANCE = 0.1  # metres within which a robot stands
-STAND = 1.5  # metres at nominal speed: a robot that drives needs less time to leave a place
+STAND = (
+    1.5  # metres at nominal speed: a robot that drives needs less time to leave a place
+)
 FAST_STEP = 0.1  # of the log speed, by which the fastest move that a map knows of becomes faster
-CORRECTION = 0.25  # metres by which a localisation may move a pose at once: the drive goes on
-RELOCATION = 1.0  # a jump by this many metres more puts the robot at a place not believed
-MEMORY = 60.0  # seconds over which a robot whose pose is not believed counts as driving on
+CORRECTION = (
+    0.25  # metres by which a localisation may move a pose at once: the drive goes on
+)
+RELOCATION = (
+    1.0  # a jump by this many metres more puts the robot at a place not believed
+)
+MEMORY = (
+    60.0  # seconds over which a robot whose pose is not believed counts as driving on
+)
 
 
 class ExperienceFileError(ValueError):
@@ -72,7 +97,9 @@ class Learned(NamedTuple):
     places: int  # that were passed, or waited at
     seconds: float  # that were spent there
     reason: str = ""  # why nothing was learned, and what to do
-    is_possible: bool = True  # no robot with the nominal speed can have driven so, if False
+    is_possible: bool = (
+        True  # no robot with the nominal speed can have driven so, if False
+    )
 
     def __bool__(self) -> bool:
         return self.places > 0
@@ -169,22 +196,24 @@ class Experience:
                 return Learned(0, 0.0, self._too_slow(fastest), is_possible=False)
             self._learn(partial(Evidence.add, visits=visits))
             if places:
-                return Learned(places, float(visits.seconds.sum() + visits.waits[:, 2].sum()))
+                return Learned(
+                    places, float(visits.seconds.sum() + visits.waits[:, 2].sum())
+                )
         return Learned(0, 0.0, self._why_nothing(time, position, count))
 
     def _why_nothing(self, time: Float64, position: Float64, count: int) -> str:
         """Return why poses (N,) that are possible, of so many, are no drive."""
         if len(time) < 2:
-            given = f"{len(time)} of {count} poses are possible and differ in their time"
+            given = (
+                f"{len(time)} of {count} poses are possible and differ in their time"
+            )
             limits = f"finite seconds, and metres up to {FARTHEST:g}"
             return f"{given}; give two or more, in {limits}"
         elapsed, metres = np.diff(time), np.hypot(*np.diff(position, axis=0).T)
         if (elapsed < 0).any():
             return f"{np.count_nonzero(elapsed < 0)} times are earlier than those before; sort them"
         if (elapsed > self.max_pause).any():
-            return (
-                f"the times are up to {elapsed.max():.3g} s apart; give at most {self.max_pause:g}"
-            )
+            return f"the times are up to {elapsed.max():.3g} s apart; give at most {self.max_pause:g}"
         fastest = float((metres / elapsed).max())
         if fastest > self.max_speed:
             return self._too_fast(fastest)
@@ -221,15 +250,21 @@ class Experience:
         rows = np.concatenate(steps)
         rows = rows[step <= max_speed * rows[:, 2]]
         squares = np.floor(rows[:, :2] / side)
-        entered = np.flatnonzero((np.diff(squares, axis=0, prepend=np.nan) != 0).any(axis=1))
+        entered = np.flatnonzero(
+            (np.diff(squares, axis=0, prepend=np.nan) != 0).any(axis=1)
+        )
         count, sums = np.diff(entered, append=len(rows)), np.add.reduceat(rows, entered)
         middle, waited = sums[:, :2] / count[:, None], np.concatenate(waits)
-        return Visits(middle, sums[:, 2], step * count, actions_along(sums[:, 3:]), waited)
+        return Visits(
+            middle, sums[:, 2], step * count, actions_along(sums[:, 3:]), waited
+        )
 
     def record_failure(self, position: Sequence[float]) -> None:
         """Learn that the robot failed at a place: it costs as much as a wait of `max_pause`."""
         near, remedy = (-FARTHEST, FARTHEST), f"metres, at most {FARTHEST:g}"
-        point = numbers("the position", position, (2,), between=near, whole=False, remedy=remedy)
+        point = numbers(
+            "the position", position, (2,), between=near, whole=False, remedy=remedy
+        )
         none, waits = np.zeros((0, 2)), np.array([[*point, self.max_pause]])
         visits = Visits(none, none[:, 0], none[:, 0], actions_along(none), waits)
         self._learn(partial(Evidence.add, visits=visits))
@@ -257,7 +292,9 @@ class Experience:
             remedy = "give an Experience, as Experience.load returns it"
             raise ValueError(f"the other experience is {reprlib.repr(other)}; {remedy}")
         if changed := differences(other.options, self.options):
-            raise ValueError(f"the other experience has {changed}; give those of one kind of robot")
+            raise ValueError(
+                f"the other experience has {changed}; give those of one kind of robot"
+            )
 
     @property
     def max_speed(self) -> float:
@@ -298,27 +335,40 @@ class Experience:
         """
         share = as_number("exploration", exploration, 0, 10, "0 to 10")
         evidence, posterior = self.evidence, self.evidence.over(grid)
-        uphill = posterior.layer("uphill", posterior.uphill, 0) if posterior.uphill.any() else None
+        uphill = (
+            posterior.layer("uphill", posterior.uphill, 0)
+            if posterior.uphill.any()
+            else None
+        )
         fastest = FAST_STEP * min(0, math.floor(evidence.fastest / FAST_STEP + 0.5))
 
         def hoping(name: str, hope: Float64 | float, most: float) -> GridMap:
             slowness = posterior.paint(name, hope, fastest - most)
             seconds = grid.resolution / self.nominal_speed * math.exp(fastest - most)
-            return grid.with_layers(slowness=slowness, seconds_per_cell=seconds, uphill=uphill)
+            return grid.with_layers(
+                slowness=slowness, seconds_per_cell=seconds, uphill=uphill
+            )
 
         expected = hoping("expected", 0.0, 0.0)
         if not share:
             return expected
-        most, hope = math.log(1 + share), math.sqrt(evidence.variance) * posterior.unknown
+        most, hope = (
+            math.log(1 + share),
+            math.sqrt(evidence.variance) * posterior.unknown,
+        )
         safe = hoping("safe", np.minimum(hope, most), most)
-        bold = hoping("bold", hope, FAST_STEP * math.ceil(hope.max(initial=0) / FAST_STEP))
+        bold = hoping(
+            "bold", hope, FAST_STEP * math.ceil(hope.max(initial=0) / FAST_STEP)
+        )
         return expected.with_layers(exploration=Exploration(share, bold, safe))
 
     def slowness(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: seconds, with waits, over nominal ones; the mean of directions."""
         posterior = self.evidence.over(grid)
         of_directions = UPHILL[posterior.uphill, : len(MOVES)].mean(axis=1)
-        return posterior.over((posterior.slowness * of_directions).astype(np.float32), 1)
+        return posterior.over(
+            (posterior.slowness * of_directions).astype(np.float32), 1
+        )
 
     def uncertainty(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: the standard deviation of the log slowness, most if unknown."""
@@ -349,7 +399,9 @@ class Experience:
         level = metres / self.nominal_speed * (slowness[1:] + slowness[:-1]) / 2
         toward = actions_along(np.diff(path, axis=0))
         seconds, deviation = posterior.time(level, places[1:], toward)
-        low, middle, high = (seconds * np.exp(self.evidence.quantiles() * deviation)).tolist()
+        low, middle, high = (
+            seconds * np.exp(self.evidence.quantiles() * deviation)
+        ).tolist()
         return ExpectedTime(middle, low, high)
 
     def save(self, path: str | Path) -> None:
@@ -402,25 +454,41 @@ class Experience:
             If the bytes are broken, or no experience.
         """
         try:
-            with np.lib.npyio.NpzFile(io.BytesIO(data)) as file:  # which unpickles nothing
+            with np.lib.npyio.NpzFile(
+                io.BytesIO(data)
+            ) as file:  # which unpickles nothing
                 size = sum(entry.file_size for entry in file.zip.infolist())
                 if size > MAX_FILE_BYTES:  # a small file can claim arrays of any size
-                    raise ValueError(f"it unpacks to {size} bytes, over {MAX_FILE_BYTES}")
-                arrays = dict.fromkeys(ARRAYS, np.zeros(0)) | dict(file)  # older ones lack some
+                    raise ValueError(
+                        f"it unpacks to {size} bytes, over {MAX_FILE_BYTES}"
+                    )
+                arrays = dict.fromkeys(ARRAYS, np.zeros(0)) | dict(
+                    file
+                )  # older ones lack some
             version = int(arrays["version"])
             if version not in (1, VERSION):
                 raise ValueError(f"it has version {version}, not {VERSION}")
             options = dict(zip(OPTIONS, arrays["options"].tolist(), strict=True))
             experience = cls(**options)
-            if version == 1:  # until 0.4.0 failures stood there, and when a place was visited
+            if (
+                version == 1
+            ):  # until 0.4.0 failures stood there, and when a place was visited
                 table = arrays["evidence"]
                 age = (arrays["driven"] - table[:, 5:]) / experience.half_life
                 faded = table[:, :2] * 0.5**age
-                arrays["evidence"] = np.hstack([faded, np.zeros((len(faded), 3)), table[:, 3:5]])
+                arrays["evidence"] = np.hstack(
+                    [faded, np.zeros((len(faded), 3)), table[:, 3:5]]
+                )
             experience.evidence.restore(*(arrays[name] for name in ARRAYS))
-            prior = {n.removeprefix(PRIOR): a for n, a in arrays.items() if n.startswith(PRIOR)}
+            prior = {
+                n.removeprefix(PRIOR): a
+                for n, a in arrays.items()
+                if n.startswith(PRIOR)
+            }
             experience.evidence.prior = Prior.from_arrays(prior) if prior else None
-        except Exception as error:  # broken bytes make zipfile and NumPy raise many kinds of errors
+        except (
+            Exception
+        ) as error:  # broken bytes make zipfile and NumPy raise many kinds of errors
             raise ExperienceFileError(f"no experience: {error}") from error
         return experience
 
@@ -487,9 +555,13 @@ def _window(time: Float64, position: Float64, speed: float) -> float:
     return min(max(least, WINDOW), LONGEST_WINDOW) / speed
 
 
-def averaged(time: Float64, position: Float64, window: float) -> tuple[Float64, Float64]:
+def averaged(
+    time: Float64, position: Float64, window: float
+) -> tuple[Float64, Float64]:
     """Return the means of poses over windows of time: noise of poses is no way that is driven."""
-    begins = np.flatnonzero(np.diff(np.floor((time - time[:1]) / window), prepend=np.nan) != 0)
+    begins = np.flatnonzero(
+        np.diff(np.floor((time - time[:1]) / window), prepend=np.nan) != 0
+    )
     count = np.diff(begins, append=len(time))[:, None]
     means = np.add.reduceat(np.column_stack([time, position]), begins) / count
     return means[:, 0], means[:, 1:]
@@ -509,6 +581,8 @@ def _steps(seconds: Float64, position: Float64, step: float) -> Float64:
     metres = np.hypot(*np.diff(position, axis=0).T)
     along, clock = (np.cumsum(np.append(0, values)) for values in (metres, seconds))
     ends = np.arange(0, along[-1], step)
-    points = np.column_stack([np.interp(ends, along, axis) for axis in (*position.T, clock)])
+    points = np.column_stack(
+        [np.interp(ends, along, axis) for axis in (*position.T, clock)]
+    )
     middle = (points[1:] + points[:-1]) / 2
     return np.column_stack([middle[:, :2], np.diff(points, axis=0)[:, [2, 0, 1]]])

@@ -26,15 +26,21 @@ STEP = 0.02  # slowness is told in steps of this share: fields need no repair fo
 STEPS = (1 + STEP) ** np.arange(1 + round(math.log(MAX_SLOWNESS) / math.log(1 + STEP)))
 STEPS = np.minimum(STEPS, MAX_SLOWNESS).astype(np.float32)
 STEEPEST = 15  # steps of `GridMap.uphill`: of more, fields would need more memory
-ACCURACY = 0.01  # of the log slowness: no place is farther from the solution of its equations
+ACCURACY = (
+    0.01  # of the log slowness: no place is farther from the solution of its equations
+)
 OVER_RELAXATION = 1.4  # of the solver: neighbours agree sooner
-WAIT_PLACES = 0.1  # so many places around each one are assumed to be driven without a wait
+WAIT_PLACES = (
+    0.1  # so many places around each one are assumed to be driven without a wait
+)
 FEW_PLACES = 16.0  # it is assumed that so many were driven where nothing was slow
 # Standard deviations of the log time of a drive: on ways that are known, and that are not.
 DRIVE_NOISE, UNSURE = 0.05, 0.42
 
 SQUARE = 1.0  # metres: the side of squares of the world in which a climb is alike
-ROW = np.array([1, 1 << 32])  # from the number of a square to that of the next column, and row
+ROW = np.array(
+    [1, 1 << 32]
+)  # from the number of a square to that of the next column, and row
 
 
 def squares_of(position: Float64) -> Int64:
@@ -56,7 +62,9 @@ class Posterior:
         self.grid = grid
         self.size = max(1, round(side / grid.resolution))
         self.spacing = self.size * grid.resolution
-        self.place, self.middle = _places_of(grid, self.size)  # (H, W), -1 where occupied
+        self.place, self.middle = _places_of(
+            grid, self.size
+        )  # (H, W), -1 where occupied
         away, (y, x) = distance_transform_edt(self.place < 0, return_indices=True)
         self.nearest = np.where(away <= 1.5 * self.size, self.place[y, x], -1)
         count = len(self.middle)
@@ -70,9 +78,13 @@ class Posterior:
         squares = squares_of(np.column_stack(grid.centres(*self.middle.T)))
         self.square, self.in_square = np.unique(squares, return_inverse=True)
         self.turned = round(grid.origin[2] / (math.pi / 4))  # by so many actions
-        self.painted: dict[str, tuple[NDArray[Any], NDArray[Any]]] = {}  # steps, and the map
+        self.painted: dict[
+            str, tuple[NDArray[Any], NDArray[Any]]
+        ] = {}  # steps, and the map
 
-    def time(self, seconds: Float64, places: Int64, toward: Int64) -> tuple[float, float]:
+    def time(
+        self, seconds: Float64, places: Int64, toward: Int64
+    ) -> tuple[float, float]:
         """Return the seconds of a way, and the deviation of their log, by those in level places."""
         seconds = seconds * UPHILL[self.uphill[places], toward]
         total = float(seconds.sum())
@@ -95,7 +107,9 @@ class Posterior:
         self.expected = evidence.trust[0] + evidence.trust[1] * self.foretold
         places = self.places_at(evidence.table[:, 5:])
         on, count = places >= 0, len(self.middle)
-        sums: list[Any] = [np.bincount(places[on], rows[on], count) for rows in evidence.sums]
+        sums: list[Any] = [
+            np.bincount(places[on], rows[on], count) for rows in evidence.sums
+        ]
         weight, log, passed, waited = sums
         # A lattice whose links have strength 1 has about the variance ln(32 / kappa) / 4 pi;
         # 1 is added for cells of many metres, where that would be negative.
@@ -115,14 +129,20 @@ class Posterior:
         # which is left, and expected seconds over those at nominal speed, with waits.
         self.known = np.clip(self.solution.imag, 0, 1)
         self.unknown = np.sqrt(1 - self.known)
-        self.mean = self.expected + self.solution.real + evidence.surplus * (1 - self.known)
+        self.mean = (
+            self.expected + self.solution.real + evidence.surplus * (1 - self.known)
+        )
         self.slowness = np.exp(self.mean)
         toward, rise = evidence.climbs.at(self.square)
         steps = np.minimum(np.rint(rise / STEEPER), STEEPEST).astype(np.int64)
-        codes = np.where(steps > 0, len(MOVES) * steps + (toward - self.turned) % len(MOVES), 0)
+        codes = np.where(
+            steps > 0, len(MOVES) * steps + (toward - self.turned) % len(MOVES), 0
+        )
         self.uphill = codes.astype(np.uint8)[self.in_square]
         if waited.any():
-            self.slowness += evidence.nominal_speed * self._waits(passed, waited, evidence.side)
+            self.slowness += evidence.nominal_speed * self._waits(
+                passed, waited, evidence.side
+            )
 
     def _waits(self, passed: Float64, waited: Float64, side: float) -> Float64:
         """Return the seconds that a robot waits for each metre through each place.
@@ -146,7 +166,9 @@ class Posterior:
             values = (values + self.links @ values) / 5
         return values
 
-    def paint(self, name: str, hope: Float64 | float, fastest: float) -> NDArray[np.float32]:
+    def paint(
+        self, name: str, hope: Float64 | float, fastest: float
+    ) -> NDArray[np.float32]:
         """Return (H, W) float32: the slowness over that of the fastest place, which has this log.
 
         Each place counts as faster by its hope (P,), a logarithm, too.
@@ -157,13 +179,17 @@ class Posterior:
 
     def layer(self, name: str, values: NDArray[Any], occupied: int) -> NDArray[Any]:
         """Return the same as `over`, and the same array while no value changes."""
-        if name not in self.painted or not np.array_equal(values, self.painted[name][0]):
+        if name not in self.painted or not np.array_equal(
+            values, self.painted[name][0]
+        ):
             self.painted[name] = values, self.over(values, occupied)
         return self.painted[name][1]
 
     def over(self, values: NDArray[Any], occupied: int) -> NDArray[Any]:
         """Return (H, W): of each cell the value of its place."""
-        return np.append(values, values.dtype.type(occupied)).take(self.place, mode="wrap")
+        return np.append(values, values.dtype.type(occupied)).take(
+            self.place, mode="wrap"
+        )
 
 
 def _places_of(grid: GridMap, size: int) -> tuple[Int64, Int64]:
@@ -171,7 +197,9 @@ def _places_of(grid: GridMap, size: int) -> tuple[Int64, Int64]:
     from scipy.ndimage import label
 
     # Between the blocks are rows and columns that connect nothing.
-    rows, columns = (np.arange(cells) + np.arange(cells) // size for cells in grid.occupancy.shape)
+    rows, columns = (
+        np.arange(cells) + np.arange(cells) // size for cells in grid.occupancy.shape
+    )
     apart = np.zeros((rows[-1] + 1, columns[-1] + 1), dtype=np.bool_)
     apart[np.ix_(rows, columns)] = ~grid.occupancy
     place = label(apart, output=np.int64)[0][np.ix_(rows, columns)] - 1

@@ -23,7 +23,9 @@ UNUSUAL = 3.0  # standard deviations: features are no farther off than those of 
 def map_features(grid: GridMap) -> Float32:
     """Return what the map says around each cell: (H, W, FEATURES). A wall stands around it."""
     occupied = grid.occupancy if grid.obstacles is None else grid.obstacles
-    cells = clearance(np.pad(occupied, 1, constant_values=True))[1:-1, 1:-1].astype(np.float32)
+    cells = clearance(np.pad(occupied, 1, constant_values=True))[1:-1, 1:-1].astype(
+        np.float32
+    )
     metres = np.minimum((cells - 0.5) * np.float32(grid.resolution), REACH)
     widths = _widths(occupied, grid.resolution), _widths(occupied.T, grid.resolution).T
     narrow, wide = np.minimum(*widths), np.maximum(*widths)
@@ -36,7 +38,9 @@ def _widths(occupied: Occupancy, resolution: float) -> Float32:
     """Return how many metres of its row are free around each cell: (H, W)."""
     at = np.arange(occupied.shape[1], dtype=np.int32)
     left = np.maximum.accumulate(np.where(occupied, at, -1), axis=1)
-    right = np.minimum.accumulate(np.where(occupied, at, len(at))[:, ::-1], axis=1)[:, ::-1]
+    right = np.minimum.accumulate(np.where(occupied, at, len(at))[:, ::-1], axis=1)[
+        :, ::-1
+    ]
     cells = np.maximum(right - left - 1, 0).astype(np.float32)
     return np.asarray(np.minimum(cells * np.float32(resolution), 2 * REACH))
 
@@ -59,7 +63,9 @@ class Prior(NamedTuple):
     def log_slowness(self, features: Float32) -> Float32:
         """Return the expected log slowness of places: (..., F) to (...,)."""
         x = np.clip((features - self.mean) / self.scale, -UNUSUAL, UNUSUAL)
-        hidden = np.tanh(np.tanh(x @ self.weights_1 + self.bias_1) @ self.weights_2 + self.bias_2)
+        hidden = np.tanh(
+            np.tanh(x @ self.weights_1 + self.bias_1) @ self.weights_2 + self.bias_2
+        )
         return np.asarray(self.level + x @ self.direct + hidden @ self.weights_3)
 
     @classmethod
@@ -67,12 +73,21 @@ class Prior(NamedTuple):
         """Return the prior of these arrays by name; a ValueError if they are no prior's."""
         try:
             prior = cls(
-                *(arrays[name].astype(np.float32, casting="same_kind") for name in cls._fields)
+                *(
+                    arrays[name].astype(np.float32, casting="same_kind")
+                    for name in cls._fields
+                )
             )
-            possible = prior.log_slowness(np.zeros(FEATURES, dtype=np.float32)).shape == ()
-            possible &= bool(np.isfinite(np.concatenate([array.ravel() for array in prior])).all())
+            possible = (
+                prior.log_slowness(np.zeros(FEATURES, dtype=np.float32)).shape == ()
+            )
+            possible &= bool(
+                np.isfinite(np.concatenate([array.ravel() for array in prior])).all()
+            )
             possible &= prior.replay.shape[1:] == (FEATURES + 4,)
-            possible &= bool((prior.scale > 0).all() and (prior.replay[:, -1] >= 0).all())
+            possible &= bool(
+                (prior.scale > 0).all() and (prior.replay[:, -1] >= 0).all()
+            )
         except (KeyError, TypeError, ValueError):
             possible = False
         if not possible:

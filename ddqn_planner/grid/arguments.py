@@ -16,7 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 Cell: TypeAlias = tuple[int, int]
 """(x, y): x is the column, y is the row of ``occupancy[y, x]``."""
 
-Cells: TypeAlias = Sequence[Cell] | NDArray[np.integer[Any]]  # of a path: pairs, or (N, 2)
+Cells: TypeAlias = (
+    Sequence[Cell] | NDArray[np.integer[Any]]
+)  # of a path: pairs, or (N, 2)
 Occupancy: TypeAlias = NDArray[np.bool_]  # (H, W): True where a cell is occupied
 
 OCCUPIED, UNKNOWN = 100, -1  # values of ``nav_msgs/OccupancyGrid``
@@ -39,7 +41,9 @@ class Choice(str, Enum, metaclass=_ByHash):
     @classmethod
     def _missing_(cls, value: object) -> Choice:
         known = ", ".join(member.value for member in cls)
-        raise ValueError(f"{cls.__name__} {reprlib.repr(value)} is unknown; give one of {known}")
+        raise ValueError(
+            f"{cls.__name__} {reprlib.repr(value)} is unknown; give one of {known}"
+        )
 
 
 def is_flag(value: Any) -> bool:
@@ -65,13 +69,19 @@ def cell_inside(cell: Any, shape: tuple[int, ...], name: str = "the cell") -> Ce
     height, width = shape
     if not (0 <= x < width and 0 <= y < height):
         size = f"{width} x {height}"
-        raise ValueError(f"{name} {(x, y)} lies outside the map of {size} cells; give one inside")
+        raise ValueError(
+            f"{name} {(x, y)} lies outside the map of {size} cells; give one inside"
+        )
     return x, y
 
 
 def cells_inside(cells: Any, shape: tuple[int, ...]) -> NDArray[np.int64]:
     """Return cells of a map of shape (H, W): (N, 2) int64."""
-    is_array = isinstance(cells, np.ndarray) and cells.dtype.kind == "i" and cells.shape[1:] == (2,)
+    is_array = (
+        isinstance(cells, np.ndarray)
+        and cells.dtype.kind == "i"
+        and cells.shape[1:] == (2,)
+    )
     if not is_array or not ((cells >= 0) & (cells < shape[::-1])).all():
         cells = [cell_inside(cell, shape) for cell in listed(cells, "the cells")]
     return np.array(cells, dtype=np.int64).reshape(-1, 2)
@@ -94,11 +104,15 @@ def real(value: Any) -> float:
         return math.copysign(math.inf, value > 0 or -1)
 
 
-def as_number(name: str, value: Any, lowest: float, highest: float, remedy: str = "") -> float:
+def as_number(
+    name: str, value: Any, lowest: float, highest: float, remedy: str = ""
+) -> float:
     """Return a number from `lowest` to `highest` as a float."""
     if lowest <= (number := real(value)) <= highest:
         return number
-    raise ValueError(f"{name} is {_short(value)}; give {remedy or f'{lowest:g} to {highest:g}'}")
+    raise ValueError(
+        f"{name} is {_short(value)}; give {remedy or f'{lowest:g} to {highest:g}'}"
+    )
 
 
 def as_whole(name: str, value: Any, lowest: int, highest: int) -> int:
@@ -106,7 +120,9 @@ def as_whole(name: str, value: Any, lowest: int, highest: int) -> int:
     number = real(value)
     if lowest <= number <= highest and number.is_integer():
         return int(value)
-    raise ValueError(f"{name} is {_short(value)}; give a whole number, {lowest} to {highest}")
+    raise ValueError(
+        f"{name} is {_short(value)}; give a whole number, {lowest} to {highest}"
+    )
 
 
 def _short(value: Any) -> str:
@@ -146,20 +162,32 @@ def numbers(
     try:
         array = np.asarray(values)
     except ValueError as error:  # rows of different lengths
-        raise ValueError(f"{name}: no array ({error}); give rows of one length") from None
+        raise ValueError(
+            f"{name}: no array ({error}); give rows of one length"
+        ) from None
     if shape is not None and array.shape != shape:
         raise ValueError(f"{name} has shape {array.shape}; give {shape}")
     if "b" not in kinds and not isinstance(values, np.ndarray):
         _refuse_flags(name, values)
     if array.dtype.kind not in kinds:
-        raise ValueError(f"{name}: the elements are of type {array.dtype}; give numbers")
+        raise ValueError(
+            f"{name}: the elements are of type {array.dtype}; give numbers"
+        )
     if between is None or array.dtype.kind == "b" or array.size == 0:
         return array
     lowest, highest = between
-    fractions = whole and array.dtype.kind == "f" and not (array == np.floor(array)).all()
+    fractions = (
+        whole and array.dtype.kind == "f" and not (array == np.floor(array)).all()
+    )
     if fractions or not lowest <= array.min() <= array.max() <= highest:  # or NaN
-        right = (array >= lowest) & (array <= highest) & (not whole or array == np.floor(array))
-        remedy = remedy or f"{'whole numbers ' if whole else ''}{lowest:g} to {highest:g}"
+        right = (
+            (array >= lowest)
+            & (array <= highest)
+            & (not whole or array == np.floor(array))
+        )
+        remedy = (
+            remedy or f"{'whole numbers ' if whole else ''}{lowest:g} to {highest:g}"
+        )
         raise ValueError(f"{name} holds {array[~right].flat[0]}; give {remedy}")
     return array
 
@@ -179,11 +207,15 @@ def as_pose(name: str, pose: Any) -> tuple[float, float, float]:
     except ValueError:
         x = y = yaw = math.nan
     if not all(map(math.isfinite, (x, y, yaw))):
-        raise ValueError(f"{name} is {reprlib.repr(pose)}; give three finite numbers x, y, yaw")
+        raise ValueError(
+            f"{name} is {reprlib.repr(pose)}; give three finite numbers x, y, yaw"
+        )
     return x, y, yaw
 
 
-def as_mask(name: str, cells: ArrayLike, shape: tuple[int, ...] | None = None) -> Occupancy:
+def as_mask(
+    name: str, cells: ArrayLike, shape: tuple[int, ...] | None = None
+) -> Occupancy:
     """Return a copy in C order, (H, W) bool."""
     remedy = "True or False (for percent, see from_occupancy_values)"
     array = numbers(name, cells, shape, "biuf", (0, 1), remedy=remedy)

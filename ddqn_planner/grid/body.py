@@ -37,7 +37,9 @@ def clearance(obstacles: Occupancy) -> NDArray[np.float64]:
     return distance
 
 
-def inflate(grid: GridMap, robot_radius: float, clearance_weight: float = 0.0) -> GridMap:
+def inflate(
+    grid: GridMap, robot_radius: float, clearance_weight: float = 0.0
+) -> GridMap:
     """Return the map for a robot with a body: cells too near to an obstacle become occupied.
 
     Distances are measured between the centres of cells, as in Nav2's inflation layer.
@@ -85,7 +87,9 @@ def with_unknown_free(grid: GridMap) -> GridMap:
     occupancy, obstacles = grid.occupancy & ~grid.unknown, None
     if grid.obstacles is not None:
         obstacles = grid.obstacles & ~grid.unknown
-        if grid.body_radius > 0:  # cells that were too near to unknown ones are free, too
+        if (
+            grid.body_radius > 0
+        ):  # cells that were too near to unknown ones are free, too
             metres = clearance(obstacles) * grid.resolution
             occupancy = obstacles | (metres < grid.body_radius * (1 - ROUNDING))
     cost = None if grid.cost is None else grid.cost * ~occupancy
@@ -99,9 +103,14 @@ class Inflation:
     def __init__(self) -> None:
         self._last: tuple[Any, ...] = (None, None, None)  # body, map, inflated map
 
-    def __call__(self, grid: GridMap, robot_radius: float, clearance_weight: float) -> GridMap:
+    def __call__(
+        self, grid: GridMap, robot_radius: float, clearance_weight: float
+    ) -> GridMap:
         """Return what `inflate` returns."""
-        body, (last_body, before, inflated) = (robot_radius, clearance_weight), self._last
+        body, (last_body, before, inflated) = (
+            (robot_radius, clearance_weight),
+            self._last,
+        )
         boxes = grid.patches_since(before) if any(body) and body == last_body else None
         near = None if boxes is None else _inflate_near(boxes, grid, inflated, body)
         inflated = near or inflate(grid, *body)
@@ -114,7 +123,9 @@ def _inflate_near(
 ) -> GridMap:
     """Return what `inflate` returns, given what it returned before boxes of the map changed."""
     # Farther away than this, an obstacle has no effect: the cost that it adds is rounded to 0.
-    reach = body[0] + max(np.cbrt(2 * (OCCUPIED - 1) * body[1]) - 1, 0) * CLEARANCE_SCALE
+    reach = (
+        body[0] + max(np.cbrt(2 * (OCCUPIED - 1) * body[1]) - 1, 0) * CLEARANCE_SCALE
+    )
     cells, shape = int(reach / grid.resolution) + 2, grid.occupancy.shape
     windows = sum(cells_in(wider(box, 2 * cells, shape)) for box in boxes)
     if boxes and windows > cells_in(wider(hull(boxes), 2 * cells, shape)):
@@ -122,7 +133,9 @@ def _inflate_near(
     for box in boxes:
         near, window = wider(box, cells, shape), wider(box, 2 * cells, shape)
         given = None if grid.cost is None else grid.cost[window]
-        part = inflate(GridMap(grid.occupancy[window], grid.resolution, cost=given), *body)
+        part = inflate(
+            GridMap(grid.occupancy[window], grid.resolution, cost=given), *body
+        )
         unknown = None if grid.unknown is None else grid.unknown[near]
         in_part = within(near, window)
         cost = None if part.cost is None else part.cost[in_part]
@@ -146,4 +159,6 @@ def grid_from_costmap(
     )
     assert grid.cost is not None
     obstacles = grid.occupancy & (np.asarray(values) != INSCRIBED)
-    return grid.with_layers(cost=_COSTS.take(grid.cost, mode="wrap"), obstacles=obstacles)
+    return grid.with_layers(
+        cost=_COSTS.take(grid.cost, mode="wrap"), obstacles=obstacles
+    )

@@ -20,7 +20,9 @@ APART = 16  # rows or columns between what gets boxes of its own
 FEW = 8  # boxes: each takes as long as some thousand cells
 BOX = 2**13  # cells that are copied as fast as a box is begun
 LARGE = 64  # copies share memory if they differ in less than one cell in so many
-MOST_ALIVE = 128  # copies that share memory: each takes one or two of a process's open files
+MOST_ALIVE = (
+    128  # copies that share memory: each takes one or two of a process's open files
+)
 
 
 class _File(list["_Pages"]):
@@ -30,7 +32,9 @@ class _File(list["_Pages"]):
         super().__init__()
         self.shape = array.shape
         self.io = os.fdopen(os.memfd_create("array"), "r+b", buffering=0)
-        finalize(self, self.io.close)  # Python warns of files that are left to be closed
+        finalize(
+            self, self.io.close
+        )  # Python warns of files that are left to be closed
         array.tofile(self.io)
 
 
@@ -48,7 +52,11 @@ def replaced(array: NDArray[Any] | None, box: Box, values: NDArray[Any]) -> Any:
     """Return a copy with other values in a box."""
     if array is None:
         return None
-    if array.nbytes > SMALL and len(_alive) < MOST_ALIVE and _effort([box]) * LARGE < array.size:
+    if (
+        array.nbytes > SMALL
+        and len(_alive) < MOST_ALIVE
+        and _effort([box]) * LARGE < array.size
+    ):
         with suppress(OSError):  # too many files are open
             return _replaced_pages(array, box, values)
     array = array.copy()
@@ -56,7 +64,9 @@ def replaced(array: NDArray[Any] | None, box: Box, values: NDArray[Any]) -> Any:
     return array
 
 
-def _replaced_pages(array: NDArray[Any], box: Box, values: NDArray[Any]) -> NDArray[Any]:
+def _replaced_pages(
+    array: NDArray[Any], box: Box, values: NDArray[Any]
+) -> NDArray[Any]:
     # Another view of all of it, as one of another shape, has it as its base.
     owner = array.base if isinstance(array.base, np.ndarray) else array
     before: Any = owner.base if owner.size == array.size else None
@@ -111,7 +121,9 @@ def _runs(is_set: NDArray[np.bool_], apart: int) -> list[slice]:
 def hull(boxes: list[Box]) -> Box:
     """Return the least box that holds some."""
     sides = zip(*boxes, strict=True)
-    return tuple(slice(min(s.start for s in of), max(s.stop for s in of)) for of in sides)
+    return tuple(
+        slice(min(s.start for s in of), max(s.stop for s in of)) for of in sides
+    )
 
 
 def cells_in(box: Box) -> int:
@@ -122,10 +134,15 @@ def cells_in(box: Box) -> int:
 def wider(box: Box, by: int, shape: tuple[int, ...]) -> Box:
     """Return a box with so many more cells on each side, as far as an array has them."""
     sides = zip(box, shape, strict=True)
-    return tuple(slice(max(side.start - by, 0), min(side.stop + by, size)) for side, size in sides)
+    return tuple(
+        slice(max(side.start - by, 0), min(side.stop + by, size))
+        for side, size in sides
+    )
 
 
 def within(box: Box, outer: Box, border: int = 0) -> Box:
     """Return where a box lies in another one, which may have a border."""
-    sides = [(side, other.start - border) for side, other in zip(box, outer, strict=True)]
+    sides = [
+        (side, other.start - border) for side, other in zip(box, outer, strict=True)
+    ]
     return tuple(slice(side.start - first, side.stop - first) for side, first in sides)

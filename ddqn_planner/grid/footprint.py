@@ -16,14 +16,20 @@ CORNERS: Final = 24  # of the polygon around a circle
 MAX_CORNERS: Final = 1000
 FARTHEST: Final = 100.0  # metres from the robot's origin to a corner, at most
 SAME: Final = 1e-6  # metres: nearer corners are the same one
-THINNEST: Final = 1e-4  # metres: a body whose corners lie so near to one line has no area
-SHARP: Final = 2 / 3  # cosine of half the angle of a corner that is cut where the body is padded
+THINNEST: Final = (
+    1e-4  # metres: a body whose corners lie so near to one line has no area
+)
+SHARP: Final = (
+    2 / 3
+)  # cosine of half the angle of a corner that is cut where the body is padded
 SHARPEST: Final = 1e-3
 MAX_DEPTH: Final = 4  # of open brackets, and the text around them
 MARGIN: Final = 0.1  # cells by which the swept cells are those of a larger body
 MAX_REACH: Final = 120  # cells that a primitive may sweep to each side
 
-REMEDY: Final = "give a radius, or points '[[x, y], ...]', metres from the robot's origin"
+REMEDY: Final = (
+    "give a radius, or points '[[x, y], ...]', metres from the robot's origin"
+)
 NUMBER: Final = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 TOKEN: Final = re.compile(rf"\s*(?:([\[(])|([\])])|(,)|({NUMBER.pattern})(?![\w.]))")
 
@@ -52,7 +58,9 @@ def read_footprint(footprint: Any, padding: float = 0.0) -> Corners:
         value = _parsed(footprint) if isinstance(footprint, str) else footprint
         corners = _around_circle(value) if _is_scalar(value) else _points(value)
     except (ValueError, TypeError, OverflowError) as error:
-        raise ValueError(f"the footprint is {_short(footprint)} ({error}); {REMEDY}") from None
+        raise ValueError(
+            f"the footprint is {_short(footprint)} ({error}); {REMEDY}"
+        ) from None
     if len(corners) < 3:
         problem = f"the footprint {_short(footprint)} has fewer than three or more points that"
         raise ValueError(f"{problem} differ; {REMEDY}")
@@ -67,7 +75,9 @@ def read_footprint(footprint: Any, padding: float = 0.0) -> Corners:
         padded = _without_repeats(_padded(corners, padding))
         if not _is_padded(padded, corners, padding):
             problem = f"a padding of {padding:g} m closes a gap in the footprint"
-            raise ValueError(f"{problem} {_short(footprint)}; give less, or points with that room")
+            raise ValueError(
+                f"{problem} {_short(footprint)}; give less, or points with that room"
+            )
         corners = padded
     return corners
 
@@ -87,7 +97,9 @@ def _parsed(text: str) -> Any:
     while position < len(text):
         token = TOKEN.match(text, position)
         if token is None:
-            raise ValueError(f"{text[position : position + 20]!r} is neither bracket nor number")
+            raise ValueError(
+                f"{text[position : position + 20]!r} is neither bracket nor number"
+            )
         opens, closes, _, number = token.groups()
         if opens:
             lists.append([])
@@ -115,7 +127,9 @@ def _is_scalar(value: Any) -> bool:
 def _around_circle(value: Any) -> Corners:
     """Return the polygon around a circle."""
     value = value[()] if isinstance(value, np.ndarray) else value
-    radius = as_number("the radius", value, 1e-3, FARTHEST, f"0.001 to {FARTHEST:g} metres")
+    radius = as_number(
+        "the radius", value, 1e-3, FARTHEST, f"0.001 to {FARTHEST:g} metres"
+    )
     turn = 2 * math.pi * (np.arange(CORNERS) + 0.5) / CORNERS
     around = np.column_stack([np.cos(turn), np.sin(turn)])
     return around * (radius / math.cos(math.pi / CORNERS))
@@ -125,7 +139,9 @@ def _points(value: Any) -> Corners:
     """Return points as an array, without those that repeat the one before."""
     points = numbers("the points", value)
     if points.ndim != 2 or points.shape[1] != 2:
-        raise ValueError(f"it has shape {points.shape}, and not three or more points (x, y)")
+        raise ValueError(
+            f"it has shape {points.shape}, and not three or more points (x, y)"
+        )
     points = points.astype(np.float64)
     if not (np.abs(points) <= FARTHEST).all():  # or NaN
         raise ValueError(
@@ -133,7 +149,9 @@ def _points(value: Any) -> Corners:
         )
     points = _without_repeats(points)
     if len(points) > MAX_CORNERS:
-        raise ValueError(f"it has {len(points)} corners, and at most {MAX_CORNERS} are possible")
+        raise ValueError(
+            f"it has {len(points)} corners, and at most {MAX_CORNERS} are possible"
+        )
     return points
 
 
@@ -172,9 +190,13 @@ def _padded(corners: Corners, padding: float) -> Corners:
     area = float((points.conj() * next_point).imag.sum())
     to_outside = -1j if area > 0 else 1j
     padded: list[complex] = []
-    for point, before, after in zip(points, np.roll(direction, 1), direction, strict=True):
+    for point, before, after in zip(
+        points, np.roll(direction, 1), direction, strict=True
+    ):
         turn = (before.conjugate() * after).imag * area
-        cosine = abs(before + after) / 2  # of half the angle by which the outline turns here
+        cosine = (
+            abs(before + after) / 2
+        )  # of half the angle by which the outline turns here
         if cosine > SHARP or turn < 0:
             mitre = to_outside * (before + after) / (2 * max(cosine, SHARPEST) ** 2)
             padded.append(point + padding * mitre)
@@ -182,7 +204,10 @@ def _padded(corners: Corners, padding: float) -> Corners:
         # Cut as far beyond the corner as the sides move.
         beyond = (before - after) / abs(before - after)
         aside = beyond / to_outside * (1 - cosine) / math.sqrt(1 - cosine**2)
-        padded += [point + padding * (beyond - aside), point + padding * (beyond + aside)]
+        padded += [
+            point + padding * (beyond - aside),
+            point + padding * (beyond + aside),
+        ]
     return np.column_stack([np.real(padded), np.imag(padded)])
 
 
@@ -209,7 +234,9 @@ def inside(points: NDArray[np.float64], corners: Corners) -> NDArray[np.bool_]:
     x, y = points.T
     for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         if y0 != y1:
-            is_left = ((y0 > y) != (y1 > y)) & (x < x0 + (y - y0) / (y1 - y0) * (x1 - x0))
+            is_left = ((y0 > y) != (y1 > y)) & (
+                x < x0 + (y - y0) / (y1 - y0) * (x1 - x0)
+            )
             winding += np.where(is_left, 1 if y1 > y0 else -1, 0)
     is_inside: NDArray[np.bool_] = winding != 0
     return is_inside
@@ -219,7 +246,9 @@ def outline(corners: NDArray[np.float64], spacing: float) -> NDArray[np.float64]
     """Return points along the sides of a polygon, (M, 2)."""
     sides = zip(corners, np.roll(corners, -1, axis=0), strict=True)
     counted = ((a, b, math.ceil(math.dist(a, b) / spacing)) for a, b in sides)
-    return np.concatenate([np.linspace(a, b, count, endpoint=False) for a, b, count in counted])
+    return np.concatenate(
+        [np.linspace(a, b, count, endpoint=False) for a, b, count in counted]
+    )
 
 
 def swept_cells(corners: NDArray[np.float64], motions: Motions) -> NDArray[np.bool_]:
@@ -233,7 +262,9 @@ def swept_cells(corners: NDArray[np.float64], motions: Motions) -> NDArray[np.bo
     reach = math.ceil(far + max(ways)) + 1
     if reach > MAX_REACH:
         problem = f"the body sweeps {reach} cells to a side; at most {MAX_REACH} can be learned"
-        raise ValueError(f"{problem}: give a coarser resolution than {motions.resolution} m")
+        raise ValueError(
+            f"{problem}: give a coarser resolution than {motions.resolution} m"
+        )
     edge = outline(body, MARGIN)
     square = MARGIN * np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)])
     cells = np.arange(-reach, reach + 1.0)
@@ -241,17 +272,23 @@ def swept_cells(corners: NDArray[np.float64], motions: Motions) -> NDArray[np.bo
     swept = np.zeros((len(motions.poses), len(cells), len(cells)), dtype=np.bool_)
     for mask, poses in zip(swept, motions.poses, strict=True):
         for x, y, yaw in closer(poses, MARGIN, far):
-            turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
+            turn = np.array(
+                [[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]]
+            )
             around = (edge @ turn + (x, y))[:, None] + square
             column, row = np.rint(around).astype(np.int64).reshape(-1, 2).T + reach
             mask[row, column] = True
         for x, y, yaw in poses:
-            turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+            turn = np.array(
+                [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
+            )
             mask |= inside((centres - (x, y)) @ turn, body).reshape(mask.shape)
     return swept
 
 
-def placed(corners: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def placed(
+    corners: NDArray[np.float64], poses: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return the corners (K, 2) of a body at poses (N, 3), in metres: (N, K, 2)."""
     x, y, yaw = poses.T[..., None]
     u, v = corners.T

@@ -13,23 +13,45 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.grid import arguments
-from ddqn_planner.grid.arguments import OCCUPIED, POSITIVE, UNKNOWN, Cell, Occupancy, as_number
+from ddqn_planner.grid.arguments import (
+    OCCUPIED,
+    POSITIVE,
+    UNKNOWN,
+    Cell,
+    Occupancy,
+    as_number,
+)
 from ddqn_planner.grid.copies import ORIGIN, Box, replaced
 from ddqn_planner.grid.moves import MoveRule, flood, legal_moves
 
 MAX_COST_MULTIPLIER = 5.0
 """That of a cell of value 100 or unknown; as in Nav2's NavFn planner: 50 if free, at most 253."""
 
-LAYERS = "occupancy", "cost", "forbidden", "slowness", "uphill"  # what its moves depend on
-PATCHED = {"occupancy", "cost", "obstacles", "unknown"}  # layers of which patches change some cells
+LAYERS = (
+    "occupancy",
+    "cost",
+    "forbidden",
+    "slowness",
+    "uphill",
+)  # what its moves depend on
+PATCHED = {
+    "occupancy",
+    "cost",
+    "obstacles",
+    "unknown",
+}  # layers of which patches change some cells
 RESOLUTIONS = 1e-6, 1e6
 METRES_PER_CELL = "metres per cell, {:g} to {:g}".format(*RESOLUTIONS)
-MAX_CELLS_AWAY = 2.0**40  # float64 tells points so far away apart by less than 1/1000 of a cell
+MAX_CELLS_AWAY = (
+    2.0**40
+)  # float64 tells points so far away apart by less than 1/1000 of a cell
 MAX_YAW = 1e6  # radians, of an origin
 MAX_PATCHES = 512  # so many are known of a map, one after the other
 
 # Directions, costs, slowness and climbs of maps without. Not to be written to, as those of maps.
-NO_LAYERS = [np.frombuffer(b"", dtype).reshape(0, 0) for dtype in ("u1", "i1", "f4", "u1")]
+NO_LAYERS = [
+    np.frombuffer(b"", dtype).reshape(0, 0) for dtype in ("u1", "i1", "f4", "u1")
+]
 
 # (101,): the multiplier of each cost, 0 to 100
 MULTIPLIERS = np.linspace(1, MAX_COST_MULTIPLIER, OCCUPIED + 1, dtype=np.float32)
@@ -98,14 +120,22 @@ class GridMap:
         if self.obstacles is not None:
             obstacles = arguments.as_mask("obstacles", self.obstacles, shape)
             if (obstacles & ~occupancy).any():
-                raise ValueError("obstacles lie on free cells; give some within the occupied cells")
+                raise ValueError(
+                    "obstacles lie on free cells; give some within the occupied cells"
+                )
             self._set(obstacles=obstacles)
         if self.forbidden is not None:
-            bits = arguments.numbers("forbidden", self.forbidden, shape, between=(0, 255))
-            self._set(forbidden=bits.astype(np.uint8, order="C") if bits.any() else None)
+            bits = arguments.numbers(
+                "forbidden", self.forbidden, shape, between=(0, 255)
+            )
+            self._set(
+                forbidden=bits.astype(np.uint8, order="C") if bits.any() else None
+            )
         if self.slowness is not None:
             slowest = 1, arguments.MAX_SLOWNESS
-            times = arguments.numbers("slowness", self.slowness, shape, "iuf", slowest, whole=False)
+            times = arguments.numbers(
+                "slowness", self.slowness, shape, "iuf", slowest, whole=False
+            )
             self._set(slowness=times.astype(np.float32, order="C"))
         if self.uphill is not None:
             codes = arguments.numbers("uphill", self.uphill, shape, between=(0, 255))
@@ -118,7 +148,9 @@ class GridMap:
         if self.unknown is not None:
             unknown = arguments.as_mask("unknown", self.unknown, shape)
             if (unknown & ~occupancy).any():
-                raise ValueError("unknown cells are free; give some within the occupied cells")
+                raise ValueError(
+                    "unknown cells are free; give some within the occupied cells"
+                )
             self._set(unknown=unknown if unknown.any() else None)
         limits = 0, sys.float_info.max, "metres, finite and 0 or more"
         self._set(body_radius=as_number("body_radius", self.body_radius, *limits))
@@ -162,7 +194,9 @@ class GridMap:
         as_number("occupied_threshold", occupied_threshold, 1, OCCUPIED)
         array = arguments.numbers("the array of values", values, between=(-128, 127))
         if array.dtype.kind == "f":  # these may be probabilities, 1.0 for occupied
-            raise ValueError(f"the values are of type {array.dtype}; give integers, percent")
+            raise ValueError(
+                f"the values are of type {array.dtype}; give integers, percent"
+            )
         array = array.astype(np.int8, copy=False)
         occupied, unknown = array >= occupied_threshold, None
         if not arguments.as_flag("allow_unknown", allow_unknown):
@@ -202,15 +236,25 @@ class GridMap:
         patch = arguments.as_mask("occupancy", occupancy)
         left, bottom = arguments.as_cell((x, y), "the first cell of the patch")
         height, width = patch.shape
-        if not (0 <= left <= self.width - width and 0 <= bottom <= self.height - height):
+        if not (
+            0 <= left <= self.width - width and 0 <= bottom <= self.height - height
+        ):
             size = f"{self.width} x {self.height}"
             part = f"{width} x {height} cells from {left, bottom}"
-            raise ValueError(f"a patch of {part} is not inside the map of {size}; cut it")
+            raise ValueError(
+                f"a patch of {part} is not inside the map of {size}; cut it"
+            )
         box = slice(bottom, bottom + height), slice(left, left + width)
         costs = self.cost
         if costs is not None or cost is not None:
-            costs = np.zeros(self.occupancy.shape, dtype=np.int8) if costs is None else costs
-            costs = replaced(costs, box, _costs(costs[box] if cost is None else cost, patch))
+            costs = (
+                np.zeros(self.occupancy.shape, dtype=np.int8)
+                if costs is None
+                else costs
+            )
+            costs = replaced(
+                costs, box, _costs(costs[box] if cost is None else cost, patch)
+            )
         closed = patch
         if obstacles is not None:
             closed = patch & arguments.as_mask("obstacles", obstacles, patch.shape)
@@ -221,7 +265,9 @@ class GridMap:
             unknown=self._unknown_with(patch, box, unknown),
         )
         # To look once at a map of which most is new takes less time than to look at the patch.
-        if (costs is None) == (self.cost is None) and 2 * patch.size <= self.occupancy.size:
+        if (costs is None) == (
+            self.cost is None
+        ) and 2 * patch.size <= self.occupancy.size:
             last_versions = self._history.versions[-MAX_PATCHES:]
             versions = *last_versions, (object(), box)
             patched._set(_history=History(self._history.lineage, versions))
@@ -254,14 +300,22 @@ class GridMap:
         older_version, _ = older._history.versions[-1]
         if older_version not in versions:
             return None
-        return [box for _, box in self._history.versions[versions.index(older_version) + 1 :]]
+        return [
+            box
+            for _, box in self._history.versions[versions.index(older_version) + 1 :]
+        ]
 
     def with_times_of(self, other: GridMap) -> GridMap:
         """Return the same map with the expected times of another, and those that are hoped for."""
         hopes = other.exploration
         if hopes is not None:
-            hopes = Exploration(hopes.share, *(self.with_times_of(each) for each in hopes[1:]))
-        times = {name: getattr(other, name) for name in ("slowness", "uphill", "seconds_per_cell")}
+            hopes = Exploration(
+                hopes.share, *(self.with_times_of(each) for each in hopes[1:])
+            )
+        times = {
+            name: getattr(other, name)
+            for name in ("slowness", "uphill", "seconds_per_cell")
+        }
         return self.with_layers(**times, exploration=hopes)
 
     def with_layers(self, **layers: Any) -> GridMap:
@@ -292,7 +346,11 @@ class GridMap:
     def cost_multiplier(self) -> NDArray[np.float32]:
         """(H, W) float32: what a path costs per cell of its length: 1 to 5, times the slowness."""
         if self.cost is None:
-            return np.ones(self.occupancy.shape, "f4") if self.slowness is None else self.slowness
+            return (
+                np.ones(self.occupancy.shape, "f4")
+                if self.slowness is None
+                else self.slowness
+            )
         multiplier: NDArray[np.float32]
         multiplier = MULTIPLIERS.take(self.cost, mode="wrap")  # -1 finds the last one
         return multiplier if self.slowness is None else multiplier * self.slowness
@@ -307,7 +365,9 @@ class GridMap:
         from scipy import ndimage
 
         # If a diagonal move needs both side cells free, two straight moves can replace it.
-        joined = ndimage.generate_binary_structure(2, 2 if MoveRule(move_rule).cuts_corners else 1)
+        joined = ndimage.generate_binary_structure(
+            2, 2 if MoveRule(move_rule).cuts_corners else 1
+        )
         labels: NDArray[np.int32] = ndimage.label(~self.occupancy, joined)[0]
         return labels
 
@@ -319,7 +379,10 @@ class GridMap:
         """Return what compiled code asks of the map; empty arrays for missing layers."""
         rule = MoveRule(move_rule)
         layers = self.forbidden, self.cost, self.slowness, self.uphill
-        known = [none if it is None else it for it, none in zip(layers, NO_LAYERS, strict=True)]
+        known = [
+            none if it is None else it
+            for it, none in zip(layers, NO_LAYERS, strict=True)
+        ]
         return self.occupancy, *known, rule.cuts_corners, rule is MoveRule.UNIT
 
     def reachable(
@@ -329,7 +392,9 @@ class GridMap:
         array = arguments.cells_inside(cells, self.occupancy.shape)
         occupied = array[self.occupancy[array[:, 1], array[:, 0]]].tolist()
         if occupied:
-            raise ValueError(f"the cell {tuple(occupied[0])} is occupied; give free cells")
+            raise ValueError(
+                f"the cell {tuple(occupied[0])} is occupied; give free cells"
+            )
         backward = arguments.as_flag("backward", backward)
         reached = np.zeros(self.occupancy.shape, dtype=np.bool_)
         reached[array[:, 1], array[:, 0]] = True
@@ -466,16 +531,22 @@ def _check_place(
     x, y, yaw = origin
     farthest = MAX_CELLS_AWAY * resolution
     if math.hypot(x, y) + math.hypot(*shape) * resolution > farthest:
-        problem = f"origin is {origin}, where cells of {resolution:g} m cannot be told apart"
+        problem = (
+            f"origin is {origin}, where cells of {resolution:g} m cannot be told apart"
+        )
         raise ValueError(f"{problem}; give x and y in metres, at most {farthest:.3g}")
     if abs(yaw) > MAX_YAW:
-        raise ValueError(f"origin is {origin}; give its yaw in radians, at most {MAX_YAW:g}")
+        raise ValueError(
+            f"origin is {origin}; give its yaw in radians, at most {MAX_YAW:g}"
+        )
 
 
 def _costs(cost: ArrayLike, occupancy: Occupancy) -> NDArray[np.int8]:
     """Return a copy with 0 in occupied cells."""
     given = arguments.numbers("cost", cost, occupancy.shape)
     # Whole numbers are multiplied, which takes a tenth of the time; others may be infinite.
-    of_free = np.where(occupancy, 0, given) if given.dtype.kind == "f" else given * ~occupancy
+    of_free = (
+        np.where(occupancy, 0, given) if given.dtype.kind == "f" else given * ~occupancy
+    )
     arguments.numbers("cost", of_free, between=(UNKNOWN, OCCUPIED - 1))
     return of_free.astype(np.int8, order="C", copy=False)

@@ -14,7 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.files import as_path, kind_of, read_file
-from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell, as_number, cell_inside, numbers
+from ddqn_planner.grid.arguments import (
+    OCCUPIED,
+    UNKNOWN,
+    Cell,
+    as_number,
+    cell_inside,
+    numbers,
+)
 from ddqn_planner.grid.grid_map import GridMap
 from ddqn_planner.grid.map_yaml import as_float, as_truth, read_yaml
 from ddqn_planner.resources import find_map
@@ -22,7 +29,15 @@ from ddqn_planner.resources import find_map
 MAX_CELLS = 2**26  # a larger map is refused before its cells are read
 MAX_YAML_BYTES = 2**16
 
-KEYS = {"image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode"}
+KEYS = {
+    "image",
+    "resolution",
+    "origin",
+    "negate",
+    "occupied_thresh",
+    "free_thresh",
+    "mode",
+}
 
 # In other layouts Pillow drops bits, or map_server takes the fourth byte of a pixel as its opacity.
 LAYOUTS = {"1", "1;I", "L", "L;2", "L;4", "LA", "I;16B", "P", "P;1", "P;2", "P;4"}
@@ -30,7 +45,9 @@ LAYOUTS |= {"RGB", "RGBA", "BGR", "BGRA", "CMYK;I"}
 """Pillow's names of the pixel layouts in files that it reads as map_server does."""
 
 _shortener = reprlib.Repr()
-_shortener.maxlevel = 2  # YAML aliases can nest lists that are huge when they are printed
+_shortener.maxlevel = (
+    2  # YAML aliases can nest lists that are huge when they are printed
+)
 _short = _shortener.repr
 
 
@@ -65,22 +82,33 @@ class MapFile:
     files: tuple[Path, ...] = ()  # from which it was read
 
     def __post_init__(self) -> None:
-        values = numbers("the array of values", self.values, between=(UNKNOWN, OCCUPIED))
+        values = numbers(
+            "the array of values", self.values, between=(UNKNOWN, OCCUPIED)
+        )
         values = values.astype(np.int8)
         values.flags.writeable = False
-        grid = GridMap(values == OCCUPIED, self.resolution, self.origin, forbidden=self.forbidden)
-        checked = {name: getattr(grid, name) for name in ("resolution", "origin", "forbidden")}
+        grid = GridMap(
+            values == OCCUPIED, self.resolution, self.origin, forbidden=self.forbidden
+        )
+        checked = {
+            name: getattr(grid, name) for name in ("resolution", "origin", "forbidden")
+        }
         for name in ("start", "goal"):
             if (cell := getattr(self, name)) is not None:
                 checked[name] = cell_inside(cell, values.shape, name)
         vars(self).update(checked, values=values)  # the dataclass is frozen
 
     def grid(
-        self, occupied_threshold: int = 65, allow_unknown: bool = False, use_map_costs: bool = False
+        self,
+        occupied_threshold: int = 65,
+        allow_unknown: bool = False,
+        use_map_costs: bool = False,
     ) -> GridMap:
         """Return the grid map; for the parameters see `GridMap.from_occupancy_values`."""
         options = (occupied_threshold, allow_unknown, use_map_costs, self.forbidden)
-        return GridMap.from_occupancy_values(self.values, self.resolution, self.origin, *options)
+        return GridMap.from_occupancy_values(
+            self.values, self.resolution, self.origin, *options
+        )
 
 
 def load_map(
@@ -138,7 +166,9 @@ def read_map_file(path: str | Path, only_below: bool = False) -> MapFile:
     if not os.path.isfile(path):
         raise MapNotFoundError(f"{str(path)!r}: no such file; give the path of a map")
     if path.suffix.lower() not in (".yaml", ".yml", ".map"):
-        raise MapMetadataError(f"{path}: ends in {path.suffix!r}; give a .yaml, .yml or .map file")
+        raise MapMetadataError(
+            f"{path}: ends in {path.suffix!r}; give a .yaml, .yml or .map file"
+        )
     try:
         is_moving_ai = path.suffix.lower() == ".map"
         return _read_moving_ai(path) if is_moving_ai else _read_ros(path, only_below)
@@ -152,7 +182,9 @@ def _read_bytes(path: Path, limit: int, error_class: type[MapFileError]) -> byte
     try:
         return read_file(path, limit)
     except OSError as error:
-        raise error_class(f"{path}: cannot be read ({error.strerror}); check its rights") from error
+        raise error_class(
+            f"{path}: cannot be read ({error.strerror}); check its rights"
+        ) from error
     except ValueError as error:
         raise error_class(str(error)) from None
 
@@ -164,16 +196,26 @@ def _read_moving_ai(path: Path) -> MapFile:
     header = re.match(pattern, content)
     if header is None:
         lines = "'type octile', 'height H', 'width W', 'map'"
-        raise ValueError(f"begins with {content[:40]!r}; the first four lines must be {lines}")
+        raise ValueError(
+            f"begins with {content[:40]!r}; the first four lines must be {lines}"
+        )
     height, width = int(header[1]), int(header[2])
     if not 1 <= height * width <= MAX_CELLS:
-        raise ValueError(f"height is {height}, width is {width}; give 1 to {MAX_CELLS} cells")
+        raise ValueError(
+            f"height is {height}, width is {width}; give 1 to {MAX_CELLS} cells"
+        )
     rows = content[header.end() :].replace(b"\r\n", b"\n").rstrip(b"\n") + b"\n"
     count, cells = rows.count(b"\n"), np.frombuffer(rows, dtype=np.uint8)
     ends = cells[width :: width + 1]
-    if cells.size != height * (width + 1) or count != height or (ends != ord("\n")).any():
+    if (
+        cells.size != height * (width + 1)
+        or count != height
+        or (ends != ord("\n")).any()
+    ):
         right = f"{height} rows of {width}, as its header says"
-        raise MapDataError(f"{path}: has {count} rows, {cells.size - count} cells; give {right}")
+        raise MapDataError(
+            f"{path}: has {count} rows, {cells.size - count} cells; give {right}"
+        )
     free = np.isin(cells.reshape(height, width + 1)[:, :-1], list(b".GS"))
     return MapFile(np.where(free, np.int8(0), np.int8(OCCUPIED)), files=(path,))
 
@@ -181,7 +223,9 @@ def _read_moving_ai(path: Path) -> MapFile:
 def _read_ros(path: Path, only_below: bool) -> MapFile:
     document = read_yaml(_read_bytes(path, MAX_YAML_BYTES, MapMetadataError))
     if not isinstance(document, dict):
-        raise ValueError("not a YAML mapping; give 'key: value' lines: image, resolution, ...")
+        raise ValueError(
+            "not a YAML mapping; give 'key: value' lines: image, resolution, ..."
+        )
     image = _image_path(path, document, "image", only_below)
     grey, clear = _read_image(image, ("PPM", "PNG", "BMP", "JPEG"), LAYOUTS)
     mode = _choice({"mode": "trinary", **document}, "mode", ("trinary", "scale", "raw"))
@@ -201,14 +245,18 @@ def _read_ros(path: Path, only_below: bool) -> MapFile:
         files.append(directions)
         if forbidden.shape != values.shape:
             has, right = (f"{w} x {h}" for h, w in (forbidden.shape, values.shape))
-            raise MapDataError(f"{name!r}: has {has} pixels; give {right}, as the map's image")
+            raise MapDataError(
+                f"{name!r}: has {has} pixels; give {right}, as the map's image"
+            )
         forbidden = forbidden[::-1]
     cells = {name: _numbers(ours, name) for name in ours}
     place = values[::-1], resolution, origin
     return MapFile(*place, **cells, forbidden=forbidden, files=tuple(files))
 
 
-def _image_path(path: Path, document: dict[str, Any], key: str, only_below: bool) -> Path:
+def _image_path(
+    path: Path, document: dict[str, Any], key: str, only_below: bool
+) -> Path:
     """Return the path of an image that a YAML file names."""
     name = _value(document, key)
     if not isinstance(name, str) or not name:
@@ -221,13 +269,17 @@ def _image_path(path: Path, document: dict[str, Any], key: str, only_below: bool
         reason = "a service reads no other files"
         raise ValueError(f"{problem}, and {reason}; put it beside")
     if kind := kind_of(file):
-        raise MapDataError(f"{str(file)!r} is {kind}; give an image as {key!r} in the YAML file")
+        raise MapDataError(
+            f"{str(file)!r} is {kind}; give an image as {key!r} in the YAML file"
+        )
     if not os.path.isfile(file):
         # Often the absolute path of the computer on which the map was saved.
         beside = re.split(r"[/\\]", name)[-1]
         remedy = f"check {key!r} in the YAML file"
         if beside != name and beside and os.path.isfile(path.parent / beside):
-            remedy = f"{beside!r} lies beside the YAML file: write '{key}: {beside}' there"
+            remedy = (
+                f"{beside!r} lies beside the YAML file: write '{key}: {beside}' there"
+            )
         raise MapDataError(f"{str(file)!r}: no such image; {remedy}")
     return file
 
@@ -255,11 +307,17 @@ def _read_image(
     except too_large as error:  # Pillow has another limit
         pixels = re.search(r"\d+", str(error))
         problem = f"{pixels[0]} pixels" if pixels else "too many pixels"
-        remedy = f"give an image of at most {MAX_CELLS} pixels, as at a coarser resolution"
+        remedy = (
+            f"give an image of at most {MAX_CELLS} pixels, as at a coarser resolution"
+        )
         raise MapDataError(f"{str(file)!r}: has {problem}; {remedy}") from None
-    except Exception as error:  # Pillow's decoders raise many exceptions on broken bytes
+    except (
+        Exception
+    ) as error:  # Pillow's decoders raise many exceptions on broken bytes
         remedy = f"give a {', '.join(formats)} image of at most {MAX_CELLS} pixels"
-        raise MapDataError(f"{str(file)!r}: not readable ({error}); {remedy}") from error
+        raise MapDataError(
+            f"{str(file)!r}: not readable ({error}); {remedy}"
+        ) from error
 
 
 def _check_layout(image: Any, layouts: set[str]) -> None:
@@ -272,11 +330,17 @@ def _check_layout(image: Any, layouts: set[str]) -> None:
     greatest = 65535 if image.mode == "I" else 255
     if codec.startswith("ppm") and rest not in ([], [greatest]):
         right = "255, or 65535 for grey"  # versions of map_server disagree on what others mean
-        raise ValueError(f"its greatest value is {rest[0]}; give {right}, or an 8-bit grey PNG")
+        raise ValueError(
+            f"its greatest value is {rest[0]}; give {right}, or an 8-bit grey PNG"
+        )
     if layout not in layouts or codec == "bmp_rle":
-        raise ValueError(f"its pixels are stored as {codec} {arguments}; save an 8-bit grey PNG")
+        raise ValueError(
+            f"its pixels are stored as {codec} {arguments}; save an 8-bit grey PNG"
+        )
     if "transparency" in image.info and image.mode != "P":
-        raise ValueError("one of its colours is transparent; save it with an alpha channel")
+        raise ValueError(
+            "one of its colours is transparent; save it with an alpha channel"
+        )
 
 
 def _grey(image: Any) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
@@ -324,9 +388,13 @@ def _numbers(document: dict[str, Any], key: str) -> Any:
 def _percent_of_grey(document: dict[str, Any], mode: str) -> NDArray[np.int8]:
     """Return (256,) int8: the occupancy of each grey value, by map_server's rules."""
     keys = "free_thresh", "occupied_thresh"
-    free_thresh, occupied_thresh = (as_number(key, _numbers(document, key), 0, 1) for key in keys)
+    free_thresh, occupied_thresh = (
+        as_number(key, _numbers(document, key), 0, 1) for key in keys
+    )
     if free_thresh > occupied_thresh:
-        raise ValueError(f"free_thresh is {free_thresh}; give at most {occupied_thresh}")
+        raise ValueError(
+            f"free_thresh is {free_thresh}; give at most {occupied_thresh}"
+        )
     negate = _value(document, "negate")
     try:
         is_negated = as_truth(negate)
@@ -345,7 +413,11 @@ def _percent_of_grey(document: dict[str, Any], mode: str) -> NDArray[np.int8]:
     if mode == "scale":
         between = (free < p) & (p < occupied)
         # map_server subtracts the thresholds in double precision.
-        scaled = (p[between] - free) / np.float32(occupied_thresh - free_thresh) * np.float32(100)
+        scaled = (
+            (p[between] - free)
+            / np.float32(occupied_thresh - free_thresh)
+            * np.float32(100)
+        )
         percent[between] = np.floor(scaled) + (scaled - np.floor(scaled) >= 0.5)
     percent[p >= occupied] = 100
     percent[p <= free] = 0

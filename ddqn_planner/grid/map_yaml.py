@@ -25,11 +25,20 @@ WITHOUT_MARK: Final = (
 
 # Characters that end a line or a file for PyYAML, but not for yaml-cpp.
 NOT_SPECIAL: Final = str.maketrans(dict.fromkeys("\0\x85\u2028\u2029", "\ufffd"))
-DIRECTIVES: Final = re.compile(r"(?:[ \t]*(?:#[^\r\n]*)?(?:\r\n?|\n)|%[^\r\n]*(?:\r\n?|\n))*")
+DIRECTIVES: Final = re.compile(
+    r"(?:[ \t]*(?:#[^\r\n]*)?(?:\r\n?|\n)|%[^\r\n]*(?:\r\n?|\n))*"
+)
 
 NUMBER: Final = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?\s*", re.ASCII)
-INTEGER: Final = re.compile(r"([-+]?)(?:0[xX]([0-9a-fA-F]+)|(0[0-7]*)|([1-9]\d*))\s*", re.ASCII)
-SPECIAL: Final = {".inf": math.inf, "+.inf": math.inf, "-.inf": -math.inf, ".nan": math.nan}
+INTEGER: Final = re.compile(
+    r"([-+]?)(?:0[xX]([0-9a-fA-F]+)|(0[0-7]*)|([1-9]\d*))\s*", re.ASCII
+)
+SPECIAL: Final = {
+    ".inf": math.inf,
+    "+.inf": math.inf,
+    "-.inf": -math.inf,
+    ".nan": math.nan,
+}
 YES: Final = ("y", "yes", "true", "on")
 NO: Final = ("n", "no", "false", "off")
 
@@ -133,7 +142,10 @@ def as_truth(text: Any) -> bool:
     if isinstance(text, str):
         if whole := INTEGER.fullmatch(text):
             sign, hexadecimal, octal, decimal = whole.groups()
-            number = int(hexadecimal or octal or decimal, 16 if hexadecimal else 8 if octal else 10)
+            number = int(
+                hexadecimal or octal or decimal,
+                16 if hexadecimal else 8 if octal else 10,
+            )
             if number < 2**31 + (sign == "-"):
                 return number != 0
         word = text.lower()

@@ -26,16 +26,28 @@ MAX_LATTICE_BYTES = 2**26  # Nav2's own files have up to 1 MB
 STRIDE = 0.4  # metres of a long step straight ahead
 BEHIND = 2.0  # what a metre counts that is not driven ahead; Nav2's reverse_penalty
 TURN = 0.5  # metres that a turn on the spot by one radian counts
-CELL_SIZES: Final = 0.001, 10.0  # metres: with finer cells a body covers too many to be learned
+CELL_SIZES: Final = (
+    0.001,
+    10.0,
+)  # metres: with finer cells a body covers too many to be learned
 MOST_CELLS: Final = 100  # of a turning radius
-FARTHEST: Final = 100.0  # metres from the begin of a lattice's primitive, and of its length
+FARTHEST: Final = (
+    100.0  # metres from the begin of a lattice's primitive, and of its length
+)
 MOST_TURNED: Final = 100.0  # radians of a yaw in a lattice
 MOST_POSES: Final = 10_000  # of a lattice's primitive
-OFF_CENTRE: Final = 0.01  # cells by which a lattice's primitive may miss the centre of a cell
-LEAST_LENGTH: Final = 0.9  # of the straight distance: a shorter trajectory_length is wrong
+OFF_CENTRE: Final = (
+    0.01  # cells by which a lattice's primitive may miss the centre of a cell
+)
+LEAST_LENGTH: Final = (
+    0.9  # of the straight distance: a shorter trajectory_length is wrong
+)
 LEAST_COST: Final = 1e-6
 OF_GENERATOR: Final = "give a file of Nav2's lattice generator"
-SPACING, ANGLE = 0.5, math.radians(5)  # between the poses of a primitive: at most so many cells
+SPACING, ANGLE = (
+    0.5,
+    math.radians(5),
+)  # between the poses of a primitive: at most so many cells
 
 
 class Motion(Choice):
@@ -56,7 +68,9 @@ class Motions:
     end: NDArray[np.int64]  # (P,) and after
     offset: NDArray[np.int64]  # (P, 2) cells, x and y
     cost: NDArray[np.float32]  # (P,) what it counts, in cells of its length
-    poses: tuple[Array, ...]  # P times (n, 3): x, y in cells from where it begins, and the yaw
+    poses: tuple[
+        Array, ...
+    ]  # P times (n, 3): x, y in cells from where it begins, and the yaw
 
 
 def turn_between(before: Any, after: Any) -> Any:
@@ -64,14 +78,20 @@ def turn_between(before: Any, after: Any) -> Any:
     return (np.asarray(after) - before + math.pi) % (2 * math.pi) - math.pi
 
 
-def make_motions(motion: Motion | str, turning_radius: float, resolution: float) -> Motions:
+def make_motions(
+    motion: Motion | str, turning_radius: float, resolution: float
+) -> Motions:
     """Make primitives: ahead, bends, behind; turns on the spot, or sideways, where it can."""
     motion = Motion(motion)
     cell = _cell_size("the resolution", resolution)
-    metres = as_number("the turning radius", turning_radius, 0, math.inf, "metres, 0 or more")
+    metres = as_number(
+        "the turning radius", turning_radius, 0, math.inf, "metres, 0 or more"
+    )
     radius = metres / cell
     if motion is Motion.ACKERMANN and radius < 1:
-        problem = f"the turning radius is {turning_radius} m; a car cannot turn on the spot"
+        problem = (
+            f"the turning radius is {turning_radius} m; a car cannot turn on the spot"
+        )
         raise ValueError(f"{problem}: give at least the resolution, {cell} m")
     if radius > MOST_CELLS:
         most = f"{MOST_CELLS} cells of {cell:g} m, {MOST_CELLS * cell:g} m"
@@ -87,7 +107,9 @@ def make_motions(motion: Motion | str, turning_radius: float, resolution: float)
             long = max(round(STRIDE / cell / math.hypot(*step)), 2)
             for count in (1, long) if towards in (0, 4, 12) else (1,):
                 poses = _straight(np.zeros(2), step * count, angle)
-                found += _both_ways(heading, heading, poses, 1.0 if towards == 0 else BEHIND)
+                found += _both_ways(
+                    heading, heading, poses, 1.0 if towards == 0 else BEHIND
+                )
         for side in (-1, 1):
             end = (heading + side) % HEADINGS
             found += _both_ways(heading, end, _bend(heading, end, angles, radius), 1.0)
@@ -139,9 +161,17 @@ def _field(owner: Any, field: str, name: str) -> Any:
 def _motions_in(lattice: Any) -> Motions:
     """Return the motion primitives of a lattice's JSON."""
     about = _field(lattice, "lattice_metadata", "it")
-    cell = _cell_size("grid_resolution", _field(about, "grid_resolution", "lattice_metadata"))
+    cell = _cell_size(
+        "grid_resolution", _field(about, "grid_resolution", "lattice_metadata")
+    )
     if "num_of_headings" in about:  # which not every lattice has
-        as_number("num_of_headings", about["num_of_headings"], HEADINGS, HEADINGS, f"{HEADINGS}")
+        as_number(
+            "num_of_headings",
+            about["num_of_headings"],
+            HEADINGS,
+            HEADINGS,
+            f"{HEADINGS}",
+        )
     angles = _angles(_field(about, "heading_angles", "lattice_metadata"))
     primitives = _field(lattice, "primitives", "it")
     if not isinstance(primitives, list) or not primitives:
@@ -154,7 +184,9 @@ def _motions_in(lattice: Any) -> Motions:
     for headings, verb in ((motions.start, "starts"), (motions.end, "ends")):
         if missing := sorted(set(range(HEADINGS)) - set(headings.tolist())):
             remedy = f"give primitives that start and end with each of the {HEADINGS}"
-            raise ValueError(f"no primitive {verb} with the headings {missing}; {remedy}")
+            raise ValueError(
+                f"no primitive {verb} with the headings {missing}; {remedy}"
+            )
     return motions
 
 
@@ -164,7 +196,9 @@ def _angles(values: Any) -> Array:
     if angles.shape != (HEADINGS,):
         raise ValueError(f"it has {angles.size} headings; give {HEADINGS}")
     turned = -MOST_TURNED, MOST_TURNED
-    numbers("heading_angles", angles, between=turned, whole=False, remedy="finite radians")
+    numbers(
+        "heading_angles", angles, between=turned, whole=False, remedy="finite radians"
+    )
     return angles.astype(np.float64)
 
 
@@ -177,8 +211,14 @@ def _primitive(
         for field in ("start_angle_index", "end_angle_index")
     )
     field, metres = "trajectory_length", f"metres, 0 to {FARTHEST:g}"
-    length = as_number(f"{field} of {name}", _field(primitive, field, name), 0, FARTHEST, metres)
-    poses = _poses(f"the poses of {name}", _field(primitive, "poses", name)) / (cell, cell, 1)
+    length = as_number(
+        f"{field} of {name}", _field(primitive, field, name), 0, FARTHEST, metres
+    )
+    poses = _poses(f"the poses of {name}", _field(primitive, "poses", name)) / (
+        cell,
+        cell,
+        1,
+    )
     poses[-1, 2] = angles[end]
     first = np.array([0, 0, angles[start]])
     if np.abs(poses[0] - first).max() > 1e-6:  # only old files begin with it
@@ -192,7 +232,9 @@ def _primitive(
     cost = length / cell or turn * TURN / cell
     distance = float(np.hypot(*poses[-1, :2])) * cell
     if length < LEAST_LENGTH * distance or cost < LEAST_COST:
-        problem = f"{field} of {name} is {length:g}, and its poses lead {distance:.3g} m far"
+        problem = (
+            f"{field} of {name} is {length:g}, and its poses lead {distance:.3g} m far"
+        )
         raise ValueError(f"{problem}; give the metres that it drives, or leave it out")
     return start, end, closer(poses, SPACING, SPACING / ANGLE), cost
 
@@ -201,14 +243,18 @@ def _poses(name: str, values: Any) -> Array:
     """Return the poses of a lattice's primitive, (N, 3): metres, metres and radians."""
     poses = numbers(name, values)
     if poses.ndim != 2 or poses.shape[1] != 3 or not 0 < len(poses) <= MOST_POSES:
-        raise ValueError(f"{name} have shape {poses.shape}; give 1 to {MOST_POSES} of [x, y, yaw]")
+        raise ValueError(
+            f"{name} have shape {poses.shape}; give 1 to {MOST_POSES} of [x, y, yaw]"
+        )
     for column, unit, most in (
         (0, "metres", FARTHEST),
         (1, "metres", FARTHEST),
         (2, "radians", MOST_TURNED),
     ):
         remedy = f"{unit}, {-most:g} to {most:g}"
-        numbers(name, poses[:, column], between=(-most, most), whole=False, remedy=remedy)
+        numbers(
+            name, poses[:, column], between=(-most, most), whole=False, remedy=remedy
+        )
     return poses.astype(np.float64)
 
 
@@ -217,7 +263,9 @@ def closer(poses: Array, spacing: float, lever: float) -> Array:
     parts = [poses[:1]]
     for before, after in pairwise(poses):
         moves = math.hypot(*(after - before)[:2]) + lever * abs(after[2] - before[2])
-        share = np.linspace(0, 1, max(math.ceil(moves / spacing - 1e-9), 1) + 1)[1:, None]
+        share = np.linspace(0, 1, max(math.ceil(moves / spacing - 1e-9), 1) + 1)[
+            1:, None
+        ]
         parts.append(before + share * (after - before))
     return np.concatenate(parts)
 
@@ -253,9 +301,14 @@ def _bend(start: int, end: int, angles: Array, radius: float) -> Array:
     (first, last), whole = lengths[best], cells[best]
     arc = min(first, last)
     arc_radius = arc / math.tan(abs(turn) / 2)
-    count = max(math.ceil(abs(turn) / ANGLE), math.ceil(abs(turn) * arc_radius / SPACING)) + 1
+    count = (
+        max(math.ceil(abs(turn) / ANGLE), math.ceil(abs(turn) * arc_radius / SPACING))
+        + 1
+    )
     yaw = angles[start] + turn * np.linspace(0, 1, count)
-    side = np.array([-math.sin(angles[start]), math.cos(angles[start])]) * math.copysign(1, turn)
+    side = np.array(
+        [-math.sin(angles[start]), math.cos(angles[start])]
+    ) * math.copysign(1, turn)
     centre = (first - arc) * ahead[:, 0] + arc_radius * side
     outward = np.column_stack([np.sin(yaw), -np.cos(yaw)]) * math.copysign(1, turn)
     on_arc = np.column_stack([centre + arc_radius * outward, yaw])
@@ -271,5 +324,11 @@ def _motions(cell: float, angles: Array, found: list[Any]) -> Motions:
     start, end, poses, cost = zip(*sorted(found, key=lambda it: it[:2]), strict=True)
     offset = np.array([np.rint(one[-1, :2]) for one in poses], dtype=np.int64)
     return Motions(
-        cell, angles, np.array(start), np.array(end), offset, np.array(cost, np.float32), poses
+        cell,
+        angles,
+        np.array(start),
+        np.array(end),
+        offset,
+        np.array(cost, np.float32),
+        poses,
     )

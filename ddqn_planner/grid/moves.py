@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from ddqn_planner.grid.grid_map import GridMap
 
 MOVES: NDArray[np.int64] = np.array(
-    [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)], dtype=np.int64
+    [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)],
+    dtype=np.int64,
 )
 """(8, 2) int64: (dx, dy) of each action, counter-clockwise; action k points at k * pi / 4."""
 
@@ -60,7 +61,9 @@ def _shifted(padded: NDArray[Any], dx: int, dy: int) -> NDArray[Any]:
 
 
 def legal_moves(
-    occupancy: Occupancy, move_rule: MoveRule | str, forbidden: NDArray[np.uint8] | None = None
+    occupancy: Occupancy,
+    move_rule: MoveRule | str,
+    forbidden: NDArray[np.uint8] | None = None,
 ) -> NDArray[np.bool_]:
     """Return (8, H, W) bool: whether action a may leave the cell (x, y), in ``[a, y, x]``."""
     rule = MoveRule(move_rule)
@@ -93,7 +96,9 @@ def move_costs(
         each = each * UPHILL.T[: len(MOVES), uphill]
     padded = np.pad(each, ((0, 0), (1, 1), (1, 1)), mode="edge")
     moves = enumerate(MOVES.tolist())
-    target = np.stack([_shifted(padded[a % len(padded)], dx, dy) for a, (dx, dy) in moves])
+    target = np.stack(
+        [_shifted(padded[a % len(padded)], dx, dy) for a, (dx, dy) in moves]
+    )
     lengths = MoveRule(move_rule).lengths[:, None, None]
     costs: NDArray[np.float64] = lengths * (each + target) / 2
     return costs
@@ -101,7 +106,9 @@ def move_costs(
 
 def actions_along(vectors: NDArray[Any]) -> NDArray[np.int64]:
     """Return the action whose direction is the nearest to that of each vector: (N, 2), (N,)."""
-    eighths: NDArray[np.float64] = np.arctan2(vectors[:, 1], vectors[:, 0]) / (np.pi / 4)
+    eighths: NDArray[np.float64] = np.arctan2(vectors[:, 1], vectors[:, 0]) / (
+        np.pi / 4
+    )
     return np.rint(eighths).astype(np.int64) % len(MOVES)
 
 
@@ -109,7 +116,9 @@ def path_length(cells: Cells, move_rule: MoveRule | str = MoveRule.ROBOT_SAFE) -
     """Return the length in cells of straight segments, or of moves under `MoveRule.UNIT`."""
     steps = np.diff(np.asarray(cells, dtype=np.int64).reshape(-1, 2).T)
     is_unit = MoveRule(move_rule) is MoveRule.UNIT
-    return float((np.abs(steps * 1.0).max(axis=0) if is_unit else np.hypot(*steps)).sum())
+    return float(
+        (np.abs(steps * 1.0).max(axis=0) if is_unit else np.hypot(*steps)).sum()
+    )
 
 
 def positions(parts: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -129,13 +138,17 @@ def cells_along(path: NDArray[Any]) -> tuple[NDArray[np.int32], NDArray[np.float
     return cells.astype(np.int32), position
 
 
-def shortest_distances(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> NDArray[np.float64]:
+def shortest_distances(
+    grid: GridMap, goal: Cell, move_rule: MoveRule | str
+) -> NDArray[np.float64]:
     """Return (H, W) float64: the exact least cost of a path to the goal, inf without one."""
     distances: NDArray[np.float64] = _dijkstra(grid, goal, move_rule)[0]
     return distances.reshape(grid.height, grid.width)
 
 
-def shortest_path(grid: GridMap, start: Cell, goal: Cell, move_rule: MoveRule | str) -> list[Cell]:
+def shortest_path(
+    grid: GridMap, start: Cell, goal: Cell, move_rule: MoveRule | str
+) -> list[Cell]:
     """Return the cells of one cheapest path, from start to goal; empty if there is none."""
     start = cell_inside(start, grid.occupancy.shape, "the start")
     goal = cell_inside(goal, grid.occupancy.shape, "the goal")
@@ -162,8 +175,12 @@ def _dijkstra(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> Any:
     next_NA = np.arange(len(legal_NA), dtype=np.int32)[:, None] + step[order]
     ends = np.cumsum(np.count_nonzero(legal_NA, axis=1), dtype=np.int32)
     rows = np.append(np.int32(0), ends)
-    graph = csr_array((cost_NA[legal_NA], next_NA[legal_NA], rows), shape=(len(ends), len(ends)))
-    if grid.forbidden is not None or grid.uphill is not None:  # else moves are alike both ways
+    graph = csr_array(
+        (cost_NA[legal_NA], next_NA[legal_NA], rows), shape=(len(ends), len(ends))
+    )
+    if (
+        grid.forbidden is not None or grid.uphill is not None
+    ):  # else moves are alike both ways
         graph = graph.T
     return dijkstra(graph, indices=y * grid.width + x, return_predecessors=True)
 

@@ -8,7 +8,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid.arguments import UNKNOWN, Cell, Occupancy, as_cell, as_whole, listed
+from ddqn_planner.grid.arguments import (
+    UNKNOWN,
+    Cell,
+    Occupancy,
+    as_cell,
+    as_whole,
+    listed,
+)
 from ddqn_planner.grid.grid_map import GridMap, check_grid
 from ddqn_planner.grid.moves import MoveRule
 
@@ -46,7 +53,9 @@ def scatter_obstacles(
         noisy = replace(grid, occupancy=occupancy)
         if noisy.reachable([start], move_rule)[goal[1], goal[0]]:
             return noisy, rejected
-    raise ValueError(f"none of {MAX_TRIES} draws of obstacles left a path from {start} to {goal}")
+    raise ValueError(
+        f"none of {MAX_TRIES} draws of obstacles left a path from {start} to {goal}"
+    )
 
 
 def random_requests(
@@ -60,13 +69,18 @@ def random_requests(
     first_of_label = np.cumsum(sizes) - sizes
     candidates = np.flatnonzero(sizes[label_of_cell] > 1)
     if not len(candidates):
-        raise ValueError("no two free cells of the map are joined; give a map with a path")
+        raise ValueError(
+            "no two free cells of the map are joined; give a map with a path"
+        )
     starts = random.choice(candidates, count)
     first, size = first_of_label[label_of_cell[starts]], sizes[label_of_cell[starts]]
     # The goal is 1 to size - 1 cells further in the list of the component, which is a ring.
     goals = first + (starts - first + random.integers(1, size)) % size
     y, x = np.divmod(cells[np.stack([starts, goals], axis=1)], occupancy.shape[1])
-    return [((sx, sy), (gx, gy)) for (sx, gx), (sy, gy) in zip(x.tolist(), y.tolist(), strict=True)]
+    return [
+        ((sx, sy), (gx, gy))
+        for (sx, gx), (sy, gy) in zip(x.tolist(), y.tolist(), strict=True)
+    ]
 
 
 def random_costs(occupancy: Occupancy, random: np.random.Generator) -> NDArray[np.int8]:

@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 from ddqn_planner.grid.grid_map import GridMap
 
 SAME_YAW = 1e-6  # radians; a forbidden direction is one of the eight along the cells of its map
-ON_EDGE = 1e-6  # cells: a centre so near to an edge lies beyond it, whatever rounding says
+ON_EDGE = (
+    1e-6  # cells: a centre so near to an edge lies beyond it, whatever rounding says
+)
 
 Indices = NDArray[np.int64]
 
@@ -38,7 +40,9 @@ def forbidden_on(grid: GridMap, zones: GridMap) -> NDArray[np.uint8] | None:
         return None
     yaw, yaw_of_zones = grid.origin[2], zones.origin[2]
     if abs(math.remainder(yaw - yaw_of_zones, 2 * math.pi)) > SAME_YAW:
-        turned = f"the zones are turned by {yaw_of_zones:.6g} radians, the map by {yaw:.6g}"
+        turned = (
+            f"the zones are turned by {yaw_of_zones:.6g} radians, the map by {yaw:.6g}"
+        )
         raise ValueError(f"{turned}; give both one yaw")
     dx, dy = grid.origin[0] - zones.origin[0], grid.origin[1] - zones.origin[1]
     cos, sin = math.cos(yaw), math.sin(yaw)
@@ -69,7 +73,9 @@ def _along_axis(
     cell, is_inside = _cells_of_centres(zone_count, 1 / side, -corner / side, count)
     if is_inside.any():
         cells = cell[is_inside]
-        first = np.flatnonzero(np.diff(cells, prepend=-1))  # of the zones in each of these cells
+        first = np.flatnonzero(
+            np.diff(cells, prepend=-1)
+        )  # of the zones in each of these cells
         inside = zones_by_axis[is_inside]
         by_axis[cells[first]] = np.bitwise_or.reduceat(inside, first, axis=0)
     return forbidden
@@ -79,7 +85,9 @@ def _cells_of_centres(
     number: int, side: float, corner: float, count: int
 ) -> tuple[Indices, NDArray[np.bool_]]:
     """Return the cells in which a number of centres lie, and which of them lie in 0..count - 1."""
-    with np.errstate(all="ignore"):  # a corner may be too far away for a number of cells
+    with np.errstate(
+        all="ignore"
+    ):  # a corner may be too far away for a number of cells
         place = corner + (np.arange(number) + 0.5) * side + ON_EDGE
     is_inside = (place >= 0) & (place < count)
     return np.where(is_inside, place, 0).astype(np.int64), is_inside

@@ -11,5 +11,10 @@ from ddqn_planner.model.model_file import (
     package_version,
     save_model,
 )
-from ddqn_planner.model.networks import AnyMapQNetwork, PaperQNetwork, PropagationQNetwork, QNetwork
+from ddqn_planner.model.networks import (
+    AnyMapQNetwork,
+    PaperQNetwork,
+    PropagationQNetwork,
+    QNetwork,
+)
 from ddqn_planner.model.robot import RobotNetwork

@@ -26,9 +26,13 @@ Float64: TypeAlias = NDArray[np.float64]
 MOVE_RULES: Final = (MoveRule.ROBOT_SAFE, MoveRule.CORNER_CUTTING)
 CENTRE = 4  # the robot's cell in a patch
 COSTS = slice(9, 27)  # the inputs for costs and unknown cells
-NO_CERTIFICATE = "nothing can be proved: the moves depend on the whole map, not on 3x3 patches"
+NO_CERTIFICATE = (
+    "nothing can be proved: the moves depend on the whole map, not on 3x3 patches"
+)
 MAX_FILTERS = 256  # for more, the proof would take seconds, and it is not tried
-ROUNDING = 2.0**-23  # a float32 operation's relative error, and as much for errors in float64
+ROUNDING = (
+    2.0**-23
+)  # a float32 operation's relative error, and as much for errors in float64
 
 
 @dataclass(frozen=True)
@@ -39,13 +43,19 @@ class Certificate:
     undecided: int  # those that are neither proved nor known to be wrong
     wrong: int  # those that some known costs make wrong
     margin: float  # least proved distance of a right decision's logit from 0; 0 if none is right
-    multiplier_error: float  # bound on the relative error of legal moves' learned cost multipliers
-    tries: float = 1.0  # the most that a legal move is expected to take: 1/p, or 1 if certain
+    multiplier_error: (
+        float  # bound on the relative error of legal moves' learned cost multipliers
+    )
+    tries: float = (
+        1.0  # the most that a legal move is expected to take: 1/p, or 1 if certain
+    )
 
     @property
     def proved(self) -> bool:
         """Whether all decisions are right."""
-        return self.undecided == self.wrong == 0 and math.isfinite(self.multiplier_error)
+        return self.undecided == self.wrong == 0 and math.isfinite(
+            self.multiplier_error
+        )
 
     @property
     def cost_error(self) -> float:
@@ -97,7 +107,9 @@ def certify(
         # The costs that make their bounded function least: for each free cell 0, 99 or unknown.
         gain_K9B = weight_CPA.reshape(-1, 9, *legal_PA.shape)[:, :, pattern, action]
         gain_K9B = np.pad(gain_K9B, ((1, 0), (0, 0), (0, 0)))
-        worst_B9 = np.array([0, OCCUPIED - 1, UNKNOWN], np.int8)[gain_K9B.argmin(axis=0)].T
+        worst_B9 = np.array([0, OCCUPIED - 1, UNKNOWN], np.int8)[
+            gain_K9B.argmin(axis=0)
+        ].T
         example_B9 = np.where(feature_PI[pattern, :9] > 0, OCCUPIED, worst_B9)
         example_BI = network.features(example_B9, move_rules[0])
         example_BI[:, 27:] = feature_PI[pattern, 27:]  # the rule
@@ -109,21 +121,30 @@ def certify(
 
 
 def _margins(
-    network: PropagationQNetwork, feature_PI: NDArray[np.float32], legal_PA: NDArray[np.bool_]
+    network: PropagationQNetwork,
+    feature_PI: NDArray[np.float32],
+    legal_PA: NDArray[np.bool_],
 ) -> tuple[Float64, Float64]:
     """Bound how far on its right side of 0 each logit is, (P, A), and its gains by C: (C, P, A)."""
     # Two lines enclose a ReLU, so two linear functions a logit (CROWN, Zhang et al. 2018). With one
     # slope for both, one product gives the bounds of a hidden layer (Fast-Lin, Weng et al. 2018).
-    tensors = {name: tensor.astype(np.float64) for name, tensor in network.tensors.items()}
+    tensors = {
+        name: tensor.astype(np.float64) for name, tensor in network.tensors.items()
+    }
     # Copies, as arrays in another order than the rest are slow.
-    weight_IF, hidden_FF = tensors["convolution.weight"].T.copy(), tensors["hidden.weight"].T.copy()
+    weight_IF, hidden_FF = (
+        tensors["convolution.weight"].T.copy(),
+        tensors["hidden.weight"].T.copy(),
+    )
     base_PF = feature_PI @ weight_IF + tensors["convolution.bias"]
     low_PF, high_PF = _extremes(weight_IF[COSTS, None], feature_PI)
     first = _Lines(base_PF + low_PF, base_PF + high_PF)
 
     # With the upper line's slope for both lines, only their distance differs.
     base_PF = (first.slope * base_PF) @ hidden_FF + tensors["hidden.bias"]
-    low_PF, high_PF = _extremes((first.slope * weight_IF[COSTS, None]) @ hidden_FF, feature_PI)
+    low_PF, high_PF = _extremes(
+        (first.slope * weight_IF[COSTS, None]) @ hidden_FF, feature_PI
+    )
     low_PF += first.distance @ np.minimum(hidden_FF, 0)
     high_PF += first.distance @ np.maximum(hidden_FF, 0)
     second = _Lines(base_PF + low_PF, base_PF + high_PF)
@@ -141,7 +162,11 @@ def _margins(
     weight_CPA = weight_APF[..., COSTS].transpose(2, 1, 0)
     low_PA, _ = _extremes(weight_CPA, feature_PI)
     ones_I = np.ones_like(feature_PI[0])
-    layers = [("convolution", ones_I), ("hidden", first.greatest), ("moves", second.greatest)]
+    layers = [
+        ("convolution", ones_I),
+        ("hidden", first.greatest),
+        ("moves", second.greatest),
+    ]
     return bound_AP.T + low_PA - _rounding_error(network, layers), weight_CPA
 
 
@@ -157,18 +182,25 @@ class _Lines:
         self.greatest = above.max(axis=0).astype(np.float32)
 
 
-def _extremes(weight_CPU: Float64, feature_PI: NDArray[np.float32]) -> tuple[Float64, Float64]:
+def _extremes(
+    weight_CPU: Float64, feature_PI: NDArray[np.float32]
+) -> tuple[Float64, Float64]:
     """Return the least and greatest sums, (P, U), of costs and unknown cells with weights."""
     # A free cell has a cost of 0 to 1, or it is unknown.
     cells = len(weight_CPU) // 2
     choice_29PU = weight_CPU.reshape(2, cells, *weight_CPU.shape[1:])
     choice_29PU = choice_29PU * (1 - feature_PI.T[:cells, :, None])
-    low_9PU, high_9PU = choice_29PU.min(axis=0, initial=0), choice_29PU.max(axis=0, initial=0)
+    low_9PU, high_9PU = (
+        choice_29PU.min(axis=0, initial=0),
+        choice_29PU.max(axis=0, initial=0),
+    )
     return low_9PU.sum(axis=0), high_9PU.sum(axis=0)
 
 
 def _multiplier_error(
-    network: PropagationQNetwork, feature_PI: NDArray[np.float32], legal_PA: NDArray[np.bool_]
+    network: PropagationQNetwork,
+    feature_PI: NDArray[np.float32],
+    legal_PA: NDArray[np.bool_],
 ) -> float:
     """Return the greatest relative error of legal moves' cost multipliers, over all costs."""
     if not network.uses_costs:  # 1 instead of at most the greatest one
@@ -214,7 +246,9 @@ def _error_of_pairs(cost_2: Float64, unknown_2: Float64, others: _Others) -> flo
 
     The arguments are the weights of the two cells' costs, 0 to 0.99, and of unknown cells.
     """
-    share_V = np.append(np.arange(OCCUPIED) / OCCUPIED, 1.0)  # the last one is of an unknown cell
+    share_V = np.append(
+        np.arange(OCCUPIED) / OCCUPIED, 1.0
+    )  # the last one is of an unknown cell
     before_V, after_V = np.column_stack([cost_2[:, None] * share_V[:-1], unknown_2])
     sum_VV = before_V[:, None] + after_V
     true_VV = 1 + (MAX_COST_MULTIPLIER - 1) * (share_V[:, None] + share_V) / 2
@@ -235,7 +269,11 @@ def _rounding_error(
     for layer, greatest_I in layers:
         weight_UI = np.abs(network.tensors[f"{layer}.weight"])
         inherited_U = weight_UI @ error_U
-        sum_U = weight_UI @ greatest_I + inherited_U + np.abs(network.tensors[f"{layer}.bias"])
+        sum_U = (
+            weight_UI @ greatest_I
+            + inherited_U
+            + np.abs(network.tensors[f"{layer}.bias"])
+        )
         # The greatest multiplier stands for what is done with the last layer's output.
         sum_U += MAX_COST_MULTIPLIER
         error_U = inherited_U + (weight_UI.shape[1] + 2) * ROUNDING * sum_U

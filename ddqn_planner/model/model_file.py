@@ -70,7 +70,9 @@ def find_model(name: str | Path) -> Path:
         raise ModelFileError(str(error)) from None
     if path.suffix == MODEL_SUFFIX or path.name != str(name):
         if kind := kind_of(path):
-            raise ModelFileError(f"the model {str(path)!r} is {kind}; give a model file")
+            raise ModelFileError(
+                f"the model {str(path)!r} is {kind}; give a model file"
+            )
         if os.path.exists(path):
             return path
         raise ModelFileError(f"there is no model file {str(path)!r}; check the path")
@@ -113,18 +115,25 @@ def model_of(data: bytes) -> tuple[QNetwork, ModelMetadata]:
     """Return the model of which `model_bytes` made the bytes; a ValueError if they are none."""
     try:
         tensors = safetensors.numpy.load(data)
-    except (SafetensorError, KeyError) as error:  # or of numbers that NumPy does not have
+    except (
+        SafetensorError,
+        KeyError,
+    ) as error:  # or of numbers that NumPy does not have
         problem = f"cannot be read as safetensors ({error}); it is truncated or of another kind"
         raise ValueError(f"{problem}: save or copy it again") from None
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
     text = (header.get("__metadata__") or {}).get(METADATA_KEY)
     if text is None:
         found = f"is safetensors, but no model of {PACKAGE} (it has no metadata {METADATA_KEY!r})"
-        raise ValueError(f"{found}; give a file that ddqn-planner or trainer_node saved")
+        raise ValueError(
+            f"{found}; give a file that ddqn-planner or trainer_node saved"
+        )
     try:
         description = _parse(json.loads(text))
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"its metadata is wrong ({error}); train the model again") from None
+        raise ValueError(
+            f"its metadata is wrong ({error}); train the model again"
+        ) from None
     network_class, sizes = NETWORKS[description.network], description.sizes
     held = {name: (tensor.dtype.name, tensor.shape) for name, tensor in tensors.items()}
     expected = {
@@ -132,7 +141,9 @@ def model_of(data: bytes) -> tuple[QNetwork, ModelMetadata]:
         for name, shape in network_class.shapes(sizes).items()
     }
     if held != expected:
-        raise ValueError(f"holds tensors {reprlib.repr(held)}, not {expected}; train it again")
+        raise ValueError(
+            f"holds tensors {reprlib.repr(held)}, not {expected}; train it again"
+        )
     if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
         raise ValueError("its weights are not all finite; train it again")
     return network_class(sizes, tensors), description
@@ -147,20 +158,32 @@ def _parse(values: object) -> ModelMetadata:
     for key, types in TYPES.items():
         if type(values[key]) not in types:
             names = " or ".join(known.__name__ for known in types)
-            raise ValueError(f"{key} is {reprlib.repr(values[key])}; it must be {names}")
+            raise ValueError(
+                f"{key} is {reprlib.repr(values[key])}; it must be {names}"
+            )
     network, sizes = values["network"], values["sizes"]
     if network not in NETWORKS:
-        raise ValueError(f"network is {reprlib.repr(network)}; this version knows {[*NETWORKS]}")
-    if network == "paper":  # missing in files of version 0.1.0, whose networks have none
+        raise ValueError(
+            f"network is {reprlib.repr(network)}; this version knows {[*NETWORKS]}"
+        )
+    if (
+        network == "paper"
+    ):  # missing in files of version 0.1.0, whose networks have none
         sizes = {"hidden_units": 0, **sizes}
     size_names = NETWORKS[network].size_names
     if sizes.keys() != set(size_names):
-        raise ValueError(f"sizes is {reprlib.repr(sizes)}; it must have {[*size_names]}")
+        raise ValueError(
+            f"sizes is {reprlib.repr(sizes)}; it must have {[*size_names]}"
+        )
     for name, size in sizes.items():
         least, most = 0 if name == "hidden_units" else 1, NETWORKS[network].max_size
         if type(size) is not int or not least <= size <= most:
             limits = f"{least} to {most}"
-            raise ValueError(f"size {name} is {reprlib.repr(size)}; it must lie in {limits}")
+            raise ValueError(
+                f"size {name} is {reprlib.repr(size)}; it must lie in {limits}"
+            )
     if not 0 <= values["gamma"] <= 1:
         raise ValueError(f"gamma is {values['gamma']}; it must lie in 0 to 1")
-    return ModelMetadata(**{**values, "sizes": sizes, "move_rule": MoveRule(values["move_rule"])})
+    return ModelMetadata(
+        **{**values, "sizes": sizes, "move_rule": MoveRule(values["move_rule"])}
+    )

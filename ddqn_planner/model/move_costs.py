@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place
-from ddqn_planner.grid import MAX_COST_MULTIPLIER, OCCUPIED, UNKNOWN, GridMap, MoveRule, legal_moves
+from ddqn_planner.grid import (
+    MAX_COST_MULTIPLIER,
+    OCCUPIED,
+    UNKNOWN,
+    GridMap,
+    MoveRule,
+    legal_moves,
+)
 from ddqn_planner.grid.copies import ORIGIN, Box, replaced, wider, within
 from ddqn_planner.grid.grid_map import LAYERS
 from ddqn_planner.grid.moves import UPHILL
@@ -54,7 +61,9 @@ class MoveCosts(NamedTuple):
     value: NDArray[np.uint8]  # (C,), for the terms, or empty
     terms: Array  # (2 * 8 * L,) float32: of the cell before a move and of that after it, or empty
     multiplier: Array  # (C,) float32: 1 or more, or empty
-    uphill: NDArray[np.uint8]  # (C,), for factors of the multipliers by the action, or empty
+    uphill: NDArray[
+        np.uint8
+    ]  # (C,), for factors of the multipliers by the action, or empty
     width: int  # columns of the padded map
     highest: float  # no possible move costs more
     straight: float  # no straight move costs less
@@ -88,15 +97,23 @@ class MoveCosts(NamedTuple):
             # The patches of the cells around see the box, too.
             around, seen = (wider(box, by, shape) for by in (1, 2))
             layers = [(name, getattr(grid, name)) for name in LAYERS]
-            parts = {name: layer[seen].copy() for name, layer in layers if layer is not None}
+            parts = {
+                name: layer[seen].copy() for name, layer in layers if layer is not None
+            }
             part = grid.with_layers(**parts)
             of_part = self.on(part, is_part=True)
-            highest, least = max(after.highest, of_part.highest), min(after.least, of_part.least)
+            highest, least = (
+                max(after.highest, of_part.highest),
+                min(after.least, of_part.least),
+            )
             after = after._replace(highest=highest, least=least)
             for name in ("patch", "value", "multiplier", "uphill"):
                 layer, new = getattr(after, name), getattr(of_part, name)
                 if new.size:
-                    layer, new = layer.reshape(-1, shape[1] + 2), new.reshape(-1, part.width + 2)
+                    layer, new = (
+                        layer.reshape(-1, shape[1] + 2),
+                        new.reshape(-1, part.width + 2),
+                    )
                     new = new[within(around, seen, 1)]
                     layer = replaced(layer, within(around, ORIGIN, 1), new)
                     after = after._replace(**{name: layer.ravel()})
@@ -128,7 +145,10 @@ class MoveCosts(NamedTuple):
         if grid.slowness is not None:
             multiplier = _with_border(grid.cost_multiplier, 1).ravel()
             greatest = self.table.max(where=np.isfinite(self.table), initial=1)
-            highest, least = float(greatest * multiplier.max()), float(grid.cost_multiplier.min())
+            highest, least = (
+                float(greatest * multiplier.max()),
+                float(grid.cost_multiplier.min()),
+            )
             costs = costs._replace(multiplier=multiplier, highest=highest, least=least)
         if grid.uphill is not None:
             uphill = _with_border(grid.uphill, 0).ravel()
@@ -165,7 +185,9 @@ class MoveCosts(NamedTuple):
         grid, has_costs = self.rows.grid, self.value.size > 0
         around = slice(max(first - 1, 0), min(end + 1, grid.height))
         occupied = np.ones((end - first + 2, self.width), np.bool_)
-        occupied[around.start - first + 1 : around.stop - first + 1, 1:-1] = grid.occupancy[around]
+        occupied[around.start - first + 1 : around.stop - first + 1, 1:-1] = (
+            grid.occupancy[around]
+        )
         cost = grid.cost[first:end] if has_costs and grid.cost is not None else None
         patch, value, _ = _read_padded(occupied, cost)
         # The border below the first row, and that above the last one, belong to the rows read.
@@ -184,10 +206,14 @@ def _with_directions(
     occurs = np.zeros(256, np.bool_)
     _occurring(forbidden_C, occurs)
     sets = np.flatnonzero(occurs)
-    is_forbidden_SA = (sets[:, None] >> np.arange(table_PA.shape[1]) & 1).astype(np.bool_)
+    is_forbidden_SA = (sets[:, None] >> np.arange(table_PA.shape[1]) & 1).astype(
+        np.bool_
+    )
     tables_SPA = np.where(is_forbidden_SA[:, None], np.float32(np.inf), table_PA)
     small = len(sets) * len(table_PA) <= 2**16
-    first_row = ((np.cumsum(occurs) - 1) * len(table_PA)).astype(np.uint16 if small else np.int32)
+    first_row = ((np.cumsum(occurs) - 1) * len(table_PA)).astype(
+        np.uint16 if small else np.int32
+    )
     rows_C = first_row.take(forbidden_C)
     rows_C += patch_C.astype(rows_C.dtype, copy=False)
     return rows_C, tables_SPA.ravel()
@@ -249,7 +275,9 @@ def _lowest(occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None) -> int:
 
 
 @in_place
-def _read_cells(occupied: Any, cost: Any, patch: Any, value: Any, has_costs: bool) -> Any:
+def _read_cells(
+    occupied: Any, cost: Any, patch: Any, value: Any, has_costs: bool
+) -> Any:
     """Write patches and values of the cells inside the border; return the least cost."""
     lowest, one, closed = np.uint8(OCCUPIED), np.uint8(1), np.uint8(OCCUPIED)
     for y in range(1, patch.shape[0] - 1):
@@ -268,9 +296,13 @@ def _read_cells(occupied: Any, cost: Any, patch: Any, value: Any, has_costs: boo
     return lowest
 
 
-def patches(occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None) -> NDArray[np.int8]:
+def patches(
+    occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None
+) -> NDArray[np.int8]:
     """Return each cell's 3x3 patch: costs, or 0, of free cells, 100 for all others: (C, 9) int8."""
-    values = np.where(occupancy, OCCUPIED, np.int8(0) if cost is None else cost).astype(np.int8)
+    values = np.where(occupancy, OCCUPIED, np.int8(0) if cost is None else cost).astype(
+        np.int8
+    )
     padded = np.pad(values, 1, constant_values=OCCUPIED)
     windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
     patch_C9: NDArray[np.int8] = windows.reshape(-1, 9)
@@ -293,7 +325,9 @@ def every_patch() -> NDArray[np.int8]:
     return ((np.arange(2**9)[:, None] >> np.arange(9) & 1) * OCCUPIED).astype(np.int8)
 
 
-def legal_in_patches(patch_P9: NDArray[np.int8], move_rule: MoveRule) -> NDArray[np.bool_]:
+def legal_in_patches(
+    patch_P9: NDArray[np.int8], move_rule: MoveRule
+) -> NDArray[np.bool_]:
     """Return which actions are legal in the centre of each patch: (P, 8) bool."""
     # The patches lie one above the other: a move out of a centre stays in its patch.
     legal = legal_moves((patch_P9 == OCCUPIED).reshape(-1, 3), move_rule)

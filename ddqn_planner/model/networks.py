@@ -87,13 +87,17 @@ class QNetwork:
 
     def _layer(self, name: str, input_BI: Array) -> Array:
         """Return the output of a fully connected layer: (B, O)."""
-        with np.errstate(over="ignore", invalid="ignore"):  # a broken model may overflow
+        with np.errstate(
+            over="ignore", invalid="ignore"
+        ):  # a broken model may overflow
             output_BO: Array = input_BI @ self.tensors[f"{name}.weight"].T
             output_BO += self.tensors[f"{name}.bias"]
         return output_BO
 
 
-def observation_background(occupancy: NDArray[np.bool_], goal: Cell) -> NDArray[np.float32]:
+def observation_background(
+    occupancy: NDArray[np.bool_], goal: Cell
+) -> NDArray[np.float32]:
     """Return the part of the observation that stays the same while the robot moves: (C,)."""
     background = np.where(occupancy, OBSTACLE, FREE).astype(np.float32)
     background[goal[1], goal[0]] = GOAL
@@ -123,15 +127,21 @@ class PaperQNetwork(QNetwork):
     def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Array:
         """Evaluate a robot in each cell: Q(s, a) toward one goal, (8, H, W), whatever the rule."""
         # In double precision: differences of large sums stay exact enough, and do not overflow.
-        tensors = [self.tensors[name].astype(np.float64) for name in self.shapes(self.sizes)]
+        tensors = [
+            self.tensors[name].astype(np.float64) for name in self.shapes(self.sizes)
+        ]
         kernel_F9, bias_F, layer_UK, layer_bias_U, *last = tensors
         kernel_9F, filters = kernel_F9.reshape(-1, 9).T, len(bias_F)
         cut_L9, cells = window_cells(grid.occupancy.shape), grid.occupancy.size
         layer_LFU = layer_UK.reshape(-1, filters, len(cut_L9)).T.copy()
-        shown = np.append(observation_background(grid.occupancy, goal), 0.0)  # 0 outside the map
+        shown = np.append(
+            observation_background(grid.occupancy, goal), 0.0
+        )  # 0 outside the map
         before_LF = shown[cut_L9] @ kernel_9F + bias_F
         after_LF = np.maximum(before_LF, 0)
-        output_CU = np.tile(layer_bias_U + np.tensordot(after_LF, layer_LFU, 2), (cells + 1, 1))
+        output_CU = np.tile(
+            layer_bias_U + np.tensordot(after_LF, layer_LFU, 2), (cells + 1, 1)
+        )
         # Each window is seen with a robot in each of its cells. What that changes adds up.
         robot_L9F = (ROBOT - shown[cut_L9])[..., None] * kernel_9F
         change_L9F = np.maximum(before_LF[:, None] + robot_L9F, 0) - after_LF[:, None]
@@ -162,7 +172,9 @@ class PropagationQNetwork(QNetwork):
     name = "propagation"
     size_names = ("filters",)
     inputs: ClassVar[int] = 9  # features
-    uses_costs: ClassVar[bool] = False  # whether the features tell costs and the move rule
+    uses_costs: ClassVar[bool] = (
+        False  # whether the features tell costs and the move rule
+    )
 
     def __init__(self, sizes: Mapping[str, int], tensors: Mapping[str, Array]) -> None:
         prices = {name: t for name, t in tensors.items() if name.startswith("prices")}
@@ -204,7 +216,9 @@ class PropagationQNetwork(QNetwork):
         """Return 1/p, or 1 from `CERTAIN` on; infinite if p is at most 1/2, or NaN: (B, 8)."""
         p_BA = self.success(feature_BI)
         p_BA = np.where(p_BA >= CERTAIN, np.float32(1), p_BA)
-        tries_BA: Array = np.where(p_BA > 0.5, 1 / np.maximum(p_BA, 0.5), np.float32(np.inf))
+        tries_BA: Array = np.where(
+            p_BA > 0.5, 1 / np.maximum(p_BA, 0.5), np.float32(np.inf)
+        )
         return tries_BA
 
     def multiplier(self, feature_BI: Array) -> Array:
@@ -231,7 +245,9 @@ class PropagationQNetwork(QNetwork):
         costs = self._proved[kind]
         return costs and costs.on(grid)
 
-    def _proved_costs(self, move_rule: MoveRule, with_costs: bool, timed: bool) -> MoveCosts | None:
+    def _proved_costs(
+        self, move_rule: MoveRule, with_costs: bool, timed: bool
+    ) -> MoveCosts | None:
         """Return the costs of moves without what depends on the map."""
         patch_P9 = every_patch()
         legal_PA = legal_in_patches(patch_P9, move_rule)
@@ -242,7 +258,9 @@ class PropagationQNetwork(QNetwork):
         is_right = np.array_equal(np.isfinite(table_PA), legal_PA)
         return MoveCosts.of_table(table_PA) if is_right else None
 
-    def _sums_of_prices(self, move_rule: MoveRule, legal_PA: NDArray[np.bool_]) -> MoveCosts | None:
+    def _sums_of_prices(
+        self, move_rule: MoveRule, legal_PA: NDArray[np.bool_]
+    ) -> MoveCosts | None:
         """Return costs that are sums over the two cells of a move, if they are proved to be."""
         if not self.certificate(move_rule).proved:
             return None
@@ -275,9 +293,13 @@ class PropagationQNetwork(QNetwork):
         patch_C, patch_P9 = None, every_patch()
         if self.uses_costs and grid.cost is not None and not timed:
             patch_C, patch_P9 = unique_patches(grid.occupancy, grid.cost)
-        return MoveCosts.of_table(self._costs_of(patch_P9, move_rule, timed)).on(grid, patch_C)
+        return MoveCosts.of_table(self._costs_of(patch_P9, move_rule, timed)).on(
+            grid, patch_C
+        )
 
-    def _costs_of(self, patch_P9: NDArray[np.int8], move_rule: MoveRule, timed: bool) -> Array:
+    def _costs_of(
+        self, patch_P9: NDArray[np.int8], move_rule: MoveRule, timed: bool
+    ) -> Array:
         """Return each move's cost, infinite if not possible, or the tries if `timed`: (P, 8)."""
         costs = []
         for batch_B9 in np.split(patch_P9, range(BATCH, len(patch_P9), BATCH)):

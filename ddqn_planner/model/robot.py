@@ -21,7 +21,9 @@ Float64: TypeAlias = NDArray[np.float64]
 # Shapes: P = primitives, U = units of the network, S x S cells with the robot in the middle.
 
 QUARTER = HEADINGS // 4  # headings in a quarter turn
-SAME = 1e-6  # cells or radians: primitives differ by more, and are not written so exactly
+SAME = (
+    1e-6  # cells or radians: primitives differ by more, and are not written so exactly
+)
 
 
 @dataclass(frozen=True)
@@ -43,8 +45,12 @@ class BodyCertificate:
         if self.proved:
             what = f"all {self.cells:,} cells that {self.primitives:,} primitives sweep forbid them"
             return f"proved: {what}, and no others do, margin {self.margin:.2f}"
-        weak = f"{self.weak:,} of {self.cells:,} swept cells do not forbid their primitive"
-        others = f"{self.forbidden:,} of {self.primitives:,} are forbidden by other cells"
+        weak = (
+            f"{self.weak:,} of {self.cells:,} swept cells do not forbid their primitive"
+        )
+        others = (
+            f"{self.forbidden:,} of {self.primitives:,} are forbidden by other cells"
+        )
         return f"not proved: {weak}, {others}"
 
 
@@ -61,9 +67,15 @@ class RobotNetwork(QNetwork):
     @classmethod
     def shapes(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
         """Return the shape of each tensor."""
-        units, side, primitives, poses, corners = (sizes[name] for name in cls.size_names)
+        units, side, primitives, poses, corners = (
+            sizes[name] for name in cls.size_names
+        )
         learned = {"weight": (units, side, side), "threshold": (units,)}
-        given = {"primitive": (primitives, 6), "pose": (poses, 3), "footprint": (corners, 2)}
+        given = {
+            "primitive": (primitives, 6),
+            "pose": (poses, 3),
+            "footprint": (corners, 2),
+        }
         return {**learned, **given, "angle": (HEADINGS,), "resolution": (1,)}
 
     @classmethod
@@ -119,7 +131,9 @@ class RobotNetwork(QNetwork):
         weak_U = (swept_USS & (lack_USS <= 0)).sum(axis=(1, 2))
         others_U = weight_USS.sum(axis=(1, 2), where=~swept_USS)
         rest_U = threshold_U - others_U * (1 + weight_USS[0].size * ROUNDING)
-        least_U = np.minimum(rest_U, lack_USS.min(axis=(1, 2), where=swept_USS, initial=np.inf))
+        least_U = np.minimum(
+            rest_U, lack_USS.min(axis=(1, 2), where=swept_USS, initial=np.inf)
+        )
         return BodyCertificate(
             primitives=len(self.unit),
             cells=int(count_U @ swept_USS.sum(axis=(1, 2))),
@@ -168,16 +182,31 @@ def _motions_of(tensors: Mapping[str, Any]) -> Motions:
     start, end, dx, dy, count = (column.astype(np.int64) for column in (*whole, count))
     angle, pose = tensors["angle"], tensors["pose"]
     inside = ((start >= 0) & (start < HEADINGS) & (end >= 0) & (end < HEADINGS)).all()
-    is_whole = np.array_equal(np.column_stack([*whole, count]), np.c_[start, end, dx, dy, count])
+    is_whole = np.array_equal(
+        np.column_stack([*whole, count]), np.c_[start, end, dx, dy, count]
+    )
     poses_fit = (count >= 1).all() and count.sum() == len(pose)
-    if not (inside and is_whole and poses_fit and (cost > 0).all() and tensors["resolution"] > 0):
+    if not (
+        inside
+        and is_whole
+        and poses_fit
+        and (cost > 0).all()
+        and tensors["resolution"] > 0
+    ):
         raise ValueError("its primitives are damaged; train the robot again")
     offset, last = np.column_stack([dx, dy]), np.cumsum(count)
-    for places, cells, heading in ((last - count, 0 * offset, start), (last - 1, offset, end)):
+    for places, cells, heading in (
+        (last - count, 0 * offset, start),
+        (last - 1, offset, end),
+    ):
         off = np.abs(pose[places, :2] - cells).max()
         turned = np.abs(turn_between(pose[places, 2], angle[heading])).max()
         if off > 0.01 or turned > 0.01 or len(np.unique(heading)) < HEADINGS:
-            raise ValueError("its primitives do not begin and end where they say; train it again")
+            raise ValueError(
+                "its primitives do not begin and end where they say; train it again"
+            )
     poses = tuple(np.split(pose, last[:-1]))
     cost = cost.astype(np.float32)
-    return Motions(float(tensors["resolution"][0]), angle, start, end, offset, cost, poses)
+    return Motions(
+        float(tensors["resolution"][0]), angle, start, end, offset, cost, poses
+    )

@@ -35,7 +35,9 @@ def run(name: str) -> NoReturn:
     # The node has saved what it has to save, DDS has left the graph, and these are written:
     logging.shutdown()
     for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError, ValueError, AttributeError):  # it is closed, or there is none
+        with suppress(
+            OSError, ValueError, AttributeError
+        ):  # it is closed, or there is none
             stream.flush()
     os._exit(code)
 

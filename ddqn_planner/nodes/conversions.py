@@ -25,9 +25,13 @@ Origin = tuple[float, float, float]
 Float64 = NDArray[np.float64]
 
 MAP_PARAMETERS = ("occupied_threshold", "allow_unknown", "use_map_costs", "map_type")
-MAX_TILT = math.sin(math.radians(1) / 2)  # of one degree: two decimals of a quaternion tilt less
+MAX_TILT = math.sin(
+    math.radians(1) / 2
+)  # of one degree: two decimals of a quaternion tilt less
 AS_SENT = 1e-6  # a norm so near to 1 is left as it is
-LABEL = "ddqn_planner {} 1 sha256:{}"  # of bytes: their kind, its version and their digest
+LABEL = (
+    "ddqn_planner {} 1 sha256:{}"  # of bytes: their kind, its version and their digest
+)
 BLANK_POSES = pickle.dumps(
     [
         PoseStamped(header=header, pose=Pose(orientation=rotation))
@@ -45,9 +49,15 @@ def grid_from_message(message: OccupancyGrid, *rules: Any) -> GridMap:
     (finest, coarsest), metres = RESOLUTIONS, f"give {METRES_PER_CELL}"
     for is_right, wrong in (
         (message.header.frame_id, "frame is ''; name one in header.frame_id"),
-        (finest <= info.resolution <= coarsest, f"resolution is {info.resolution}; {metres}"),
+        (
+            finest <= info.resolution <= coarsest,
+            f"resolution is {info.resolution}; {metres}",
+        ),
         (needs, f"size is {size}; give at least one row and column"),
-        (needs <= MAX_CELLS, f"size is {size}; give at most {MAX_CELLS}, or a coarser resolution"),
+        (
+            needs <= MAX_CELLS,
+            f"size is {size}; give at most {MAX_CELLS}, or a coarser resolution",
+        ),
         (has == needs, f"data has {has} values; its {size} need {needs}"),
     ):
         if not is_right:
@@ -56,7 +66,9 @@ def grid_from_message(message: OccupancyGrid, *rules: Any) -> GridMap:
     turned = rotation(info.origin.orientation)
     if turned.tilt > MAX_TILT:
         numbers = _numbers(info.origin.orientation)
-        raise ValueError(f"the map's origin is rolled or pitched ({numbers}); give a yaw")
+        raise ValueError(
+            f"the map's origin is rolled or pitched ({numbers}); give a yaw"
+        )
     values = np.frombuffer(message.data, np.int8).reshape(info.height, info.width)
     origin = (info.origin.position.x, info.origin.position.y, turned.yaw)
     try:
@@ -82,7 +94,9 @@ def occupancy_message(
         return OccupancyGrid(header=header)
     (height, width), (x, y, yaw) = values.shape, map(float, origin)
     corner = Pose(position=Point(x=x, y=y), orientation=quaternion(yaw))
-    info = MapMetaData(map_load_time=header.stamp, resolution=float(resolution), origin=corner)
+    info = MapMetaData(
+        map_load_time=header.stamp, resolution=float(resolution), origin=corner
+    )
     info.width, info.height = width, height
     data = array.array("b", values.astype(np.int8, copy=False).tobytes())
     return OccupancyGrid(header=header, info=info, data=data)
@@ -129,7 +143,9 @@ def centres(cells: Cells, grid: GridMap) -> Float64:
 
 def frame_of(path: Path) -> str:
     """Return the frame of a path, or of its first pose where the path names none."""
-    frame = path.header.frame_id or (path.poses[0].header.frame_id if path.poses else "")
+    frame = path.header.frame_id or (
+        path.poses[0].header.frame_id if path.poses else ""
+    )
     return str(frame)
 
 
@@ -145,7 +161,9 @@ def poses_of(path: Path, with_yaw: bool = True) -> Float64:
     is_finite = np.isfinite(array).all(axis=1)
     if not is_finite.all():
         number = int(is_finite.argmin())
-        raise ValueError(f"pose {number} of the path is {array[number]}; give finite numbers")
+        raise ValueError(
+            f"pose {number} of the path is {array[number]}; give finite numbers"
+        )
     return array
 
 
@@ -167,8 +185,12 @@ def path_bytes(
     start = serialize_message(Path(header=header))[:-4] + count.to_bytes(4, "little")
     if not count:
         return start
-    first, others = (stamp + bytes(-(at + len(stamp)) % 8) for at in (len(start) - 4, 0))
-    poses = np.zeros(count, dtype=[("header", f"V{len(others)}"), ("numbers", "<f8", 7)])
+    first, others = (
+        stamp + bytes(-(at + len(stamp)) % 8) for at in (len(start) - 4, 0)
+    )
+    poses = np.zeros(
+        count, dtype=[("header", f"V{len(others)}"), ("numbers", "<f8", 7)]
+    )
     poses["header"], numbers = np.void(others), poses["numbers"]
     numbers[:, :2] = positions
     numbers[: len(yaw), 5], numbers[: len(yaw), 6] = np.sin(yaw / 2), np.cos(yaw / 2)
@@ -181,7 +203,9 @@ def bytes_message(kind: str, data: bytes) -> UInt8MultiArray:
     """Make the message that carries bytes of a kind, a model or an experience."""
     label = LABEL.format(kind, hashlib.sha256(data).hexdigest())
     dimension = MultiArrayDimension(label=label, size=len(data), stride=len(data))
-    return UInt8MultiArray(layout=MultiArrayLayout(dim=[dimension]), data=array.array("B", data))
+    return UInt8MultiArray(
+        layout=MultiArrayLayout(dim=[dimension]), data=array.array("B", data)
+    )
 
 
 def bytes_of(kind: str, message: UInt8MultiArray) -> bytes:
@@ -191,12 +215,16 @@ def bytes_of(kind: str, message: UInt8MultiArray) -> bytes:
     if label != (right := LABEL.format(kind, hashlib.sha256(data).hexdigest())):
         wrong = f"{len(data)} bytes with the label {label!r}, not {right!r}"
         is_cut = label.partition(":")[0] == right.partition(":")[0]
-        remedy = "save there again" if is_cut else "let trainer and planner have one version"
+        remedy = (
+            "save there again" if is_cut else "let trainer and planner have one version"
+        )
         raise ValueError(f"the trainer sent {wrong}; {remedy}")
     return data
 
 
-def check_pose(name: str, stamped: PoseStamped, frame: str = "", other_remedy: str = "") -> None:
+def check_pose(
+    name: str, stamped: PoseStamped, frame: str = "", other_remedy: str = ""
+) -> None:
     """Check a pose, which the ValueError calls by its name, and that it is in the map's frame."""
     its = stamped.header.frame_id
     if its and frame in ("", its):
@@ -216,7 +244,9 @@ def cell_from_pose(name: str, stamped: PoseStamped, grid: GridMap, frame: str) -
         return grid.world_to_cell(position.x, position.y)
     except (OverflowError, ValueError):  # the floor of infinity, and of NaN
         where = f"({_numbers(position)}) is too far from the map to have a cell"
-        raise ValueError(f"{name}'s position {where}; give one on the map, in metres") from None
+        raise ValueError(
+            f"{name}'s position {where}; give one on the map, in metres"
+        ) from None
 
 
 def pose_of(stamped: PoseStamped) -> Origin:
@@ -262,12 +292,16 @@ def quaternion(yaw: float) -> Quaternion:
 def _check_pose(name: str, pose: Pose) -> None:
     position = pose.position
     if not all(map(math.isfinite, (position.x, position.y, position.z))):
-        raise ValueError(f"{name}'s position is ({_numbers(position)}); give finite numbers")
+        raise ValueError(
+            f"{name}'s position is ({_numbers(position)}); give finite numbers"
+        )
     turned = rotation(pose.orientation)
     if not turned.is_rounded:
         numbers = _numbers(pose.orientation)
         wrong = f"{name}'s orientation is ({numbers}), a quaternion of norm {turned.norm:.6g}"
-        raise ValueError(f"{wrong}; give one of norm 1 (w = 1 and the rest 0 means no rotation)")
+        raise ValueError(
+            f"{wrong}; give one of norm 1 (w = 1 and the rest 0 means no rotation)"
+        )
 
 
 def _numbers(message: Point | Quaternion) -> str:

@@ -37,11 +37,15 @@ class Declared(NamedTuple):
         if isinstance(self.allowed, tuple):
             form = "{} to {}" if isinstance(self.default, int) else "{:g} to {:g}"
             return form.format(*self.allowed)
-        return self.allowed if isinstance(self.allowed, str) else f"one of {self.allowed}"
+        return (
+            self.allowed if isinstance(self.allowed, str) else f"one of {self.allowed}"
+        )
 
     def descriptor(self) -> msg.ParameterDescriptor:
         """Return what ROS stores of it, and checks: a number's type and range."""
-        descriptor = msg.ParameterDescriptor(description=self.description, read_only=self.read_only)
+        descriptor = msg.ParameterDescriptor(
+            description=self.description, read_only=self.read_only
+        )
         if not isinstance(self.allowed, tuple):
             descriptor.additional_constraints = self.limits
             return descriptor
@@ -94,9 +98,13 @@ class Declared(NamedTuple):
         """Return the names of a list, without empty ones; ROS has no type for an empty list."""
         if isinstance(values, str):
             values = [values]
-        if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
+        if not isinstance(values, list) or not all(
+            isinstance(value, str) for value in values
+        ):
             if values:
-                raise ValueError(f"{name} is {self._shown(values)}; give {self._wanted}")
+                raise ValueError(
+                    f"{name} is {self._shown(values)}; give {self._wanted}"
+                )
             values = []
         names = [value.strip().strip("/") for value in values]
         names = [*dict.fromkeys(filter(None, names))]
@@ -105,7 +113,9 @@ class Declared(NamedTuple):
                 validate_namespace(f"/{space}")
             except InvalidNamespaceException:
                 wrong = f"{name} holds {space!r}, which is no namespace"
-                raise ValueError(f"{wrong}; give letters, digits and _, such as r1") from None
+                raise ValueError(
+                    f"{wrong}; give letters, digits and _, such as r1"
+                ) from None
         return names or [""]
 
     @property

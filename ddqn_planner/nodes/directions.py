@@ -28,7 +28,9 @@ class Directions:
     They stay in effect when their publisher ends, until others come.
     """
 
-    def __init__(self, node: BaseNode, report: Report, on_change: Callable[[], None]) -> None:
+    def __init__(
+        self, node: BaseNode, report: Report, on_change: Callable[[], None]
+    ) -> None:
         self._node, self._report, self._on_change = node, report, on_change
         self._frame = ""
         self._zones: GridMap | None = None  # None if nothing is forbidden
@@ -38,7 +40,9 @@ class Directions:
         # The publishers whose first message came, or was awaited long enough.
         self._known_publishers: set[bytes] = set()
         self._awaited_since: float | None = None
-        subscription = node.create_subscription(OccupancyGrid, DIRECTIONS, self.take, LATCHED)
+        subscription = node.create_subscription(
+            OccupancyGrid, DIRECTIONS, self.take, LATCHED
+        )
         self.topic = subscription.topic_name
 
     @property
@@ -113,4 +117,6 @@ class Directions:
 
 
 def _values(message: OccupancyGrid) -> NDArray[np.int8]:
-    return np.frombuffer(message.data, np.int8).reshape(message.info.height, message.info.width)
+    return np.frombuffer(message.data, np.int8).reshape(
+        message.info.height, message.info.width
+    )

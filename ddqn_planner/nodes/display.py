@@ -24,7 +24,11 @@ from ddqn_planner.planning.plan import PosePlan
 
 MAX_ARROWS = 10_000  # more take longer to make than a plan, and are too small to see
 LINE_WIDTH = 0.06  # in cells; larger arrows have wider lines
-APART, TURN, BODY_LINE = 0.25, 0.5, 0.01  # metres: between two bodies, a radian's, a line's width
+APART, TURN, BODY_LINE = (
+    0.25,
+    0.5,
+    0.01,
+)  # metres: between two bodies, a radian's, a line's width
 HEIGHT = 0.01  # metres above the map, so that the map does not hide the arrows
 COLOUR = ColorRGBA(r=0.13, g=0.13, b=0.23, a=0.9)
 
@@ -46,7 +50,9 @@ class FieldDisplay:
         self._published: dict[str, Header | None] = dict.fromkeys(LAYERS)
         matched = PublisherEventCallbacks(matched=self._look)
         self._publishers = {
-            name: node.create_publisher(kind, f"~/{name}", LATCHED, event_callbacks=matched)
+            name: node.create_publisher(
+                kind, f"~/{name}", LATCHED, event_callbacks=matched
+            )
             for name, (kind, _) in LAYERS.items()
         }
 
@@ -77,8 +83,12 @@ class FieldDisplay:
                     publisher.publish(LAYERS[name][1](shown))
             except InvalidHandle:  # cleaned up meanwhile
                 return
-            except Exception as error:  # as when no memory is left: the node must survive
-                self._logger.error(f"no {name} is shown ({error!r}); give a smaller map")
+            except (
+                Exception
+            ) as error:  # as when no memory is left: the node must survive
+                self._logger.error(
+                    f"no {name} is shown ({error!r}); give a smaller map"
+                )
 
 
 def _key(outcome: Outcome) -> tuple[object, ...]:
@@ -91,16 +101,25 @@ def _key(outcome: Outcome) -> tuple[object, ...]:
 def _field_of(outcome: Any) -> tuple[QField | None, GridMap, Header]:
     """Return the field of an outcome, which is computed, its map, and the header."""
     request, planner, goal = outcome.request, outcome.planner, outcome.plan.goal
-    field = planner.q_field(request.grid, goal, request.move_rule) if planner is not None else None
+    field = (
+        planner.q_field(request.grid, goal, request.move_rule)
+        if planner is not None
+        else None
+    )
     return field, request.grid, outcome.header
 
 
 def value_message(field: QField | None, grid: GridMap, header: Header) -> OccupancyGrid:
     """Make a map message of a value field: 0 the lowest value, 100 the goal's, -1 for no value."""
     percent = np.full(grid.occupancy.shape, -1, dtype=np.int8)
-    if field is not None and (known := np.isfinite(field.value) & ~grid.occupancy).any():
+    if (
+        field is not None
+        and (known := np.isfinite(field.value) & ~grid.occupancy).any()
+    ):
         values = field.value[known]
-        percent[known] = np.rint(np.interp(values, (values.min(), values.max()), (0, 100)))
+        percent[known] = np.rint(
+            np.interp(values, (values.min(), values.max()), (0, 100))
+        )
     return occupancy_message(percent, grid.resolution, grid.origin, header)
 
 
@@ -116,7 +135,9 @@ def policy_message(field: QField | None, grid: GridMap, header: Header) -> Marke
     rows, columns = step * np.array(np.nonzero(policy[::step, ::step] >= 0))
     x, y = grid.centres(columns, rows)
     size, turn = step * grid.resolution, np.exp(1j * grid.origin[2])
-    arrows = (x + 1j * y)[:, None] + size * turn * ARROW * DIRECTIONS[policy[rows, columns], None]
+    arrows = (x + 1j * y)[:, None] + size * turn * ARROW * DIRECTIONS[
+        policy[rows, columns], None
+    ]
     # From tail to tip, and from there along both barbs.
     return _lines("policy", arrows, (0, 1, 1, 2, 1, 3), LINE_WIDTH * size, header)
 
@@ -131,7 +152,9 @@ def footprint_message(outcome: Any) -> MarkerArray:
     at = np.append(True, np.diff(passed, prepend=0) > 0)
     corners = outcome.planner.pose_planner.footprint @ [1, 1j]
     outlines = (x + 1j * y)[at, None] + np.exp(1j * yaw)[at, None] * corners
-    sides = [corner % len(corners) for n in range(len(corners)) for corner in (n, n + 1)]
+    sides = [
+        corner % len(corners) for n in range(len(corners)) for corner in (n, n + 1)
+    ]
     return _lines("footprints", outlines, sides, BODY_LINE, outcome.header)
 
 
@@ -141,7 +164,11 @@ def _lines(
     """Return a marker with lines between the corners of each shape; none deletes the last one."""
     marker = Marker(header=header, ns=name, type=Marker.LINE_LIST, color=COLOUR)
     marker.action = Marker.ADD if len(shapes) else Marker.DELETE
-    marker.pose.position.z, marker.pose.orientation.w, marker.scale.x = HEIGHT, 1.0, width
+    marker.pose.position.z, marker.pose.orientation.w, marker.scale.x = (
+        HEIGHT,
+        1.0,
+        width,
+    )
     for shape in shapes:
         # The lines share their points, because most of the time goes into making messages.
         corners = [*map(_point, shape.real.tolist(), shape.imag.tolist())]

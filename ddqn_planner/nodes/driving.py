@@ -17,7 +17,12 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
 
-from ddqn_planner.experience.drives import Drive, DriveFolder, DriveRecorder, read_drives
+from ddqn_planner.experience.drives import (
+    Drive,
+    DriveFolder,
+    DriveRecorder,
+    read_drives,
+)
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import occupancy_message
 from ddqn_planner.nodes.poses import Frames, listen
@@ -112,7 +117,9 @@ class DrivingRobot:
         """Return what the diagnostics say of it."""
         places = {"robot": self.recorder.position, "goal": self.recorder.goal}
         return {
-            f"{what} {self._name}".rstrip(): f"({at[0]:.6g}, {at[1]:.6g})" if at else "unknown"
+            f"{what} {self._name}".rstrip(): f"({at[0]:.6g}, {at[1]:.6g})"
+            if at
+            else "unknown"
             for what, at in places.items()
         }
 
@@ -128,7 +135,9 @@ class Driving:
         self._shown: GridMap | None = None
         self._slowness = node.create_publisher(OccupancyGrid, "~/slowness", LATCHED)
         frames, names = Frames(node), node.value("robots")
-        self._robots = [DrivingRobot(node, frames, name, self._on_drive) for name in names]
+        self._robots = [
+            DrivingRobot(node, frames, name, self._on_drive) for name in names
+        ]
         self._places_of_prior, self._is_speed_wrong = 0, False
         group = MutuallyExclusiveCallbackGroup()  # it awaits the worker
         self._learning = node.create_timer(1.0, self._learn_prior, group, clock=STEADY)
@@ -180,17 +189,28 @@ class Driving:
         if not known or before <= known < MORE_PLACES * before:
             return
         self._places_of_prior = known
-        given = place.grid, evidence.table.copy(), evidence.prior, self._node.value("seed")
+        given = (
+            place.grid,
+            evidence.table.copy(),
+            evidence.prior,
+            self._node.value("seed"),
+        )
         training = "ddqn_planner.training.prior"  # it imports torch
         try:
-            prior = await self._node.worker.call(lambda: import_module(training).prior_of(*given))
+            prior = await self._node.worker.call(
+                lambda: import_module(training).prior_of(*given)
+            )
         except Exception as error:  # the node must survive
             if isinstance(error, ImportError):
                 self._node.destroy_timer(self._learning)
-            self._node.get_logger().warning(f"the map foretells nothing: {explained(error)}")
+            self._node.get_logger().warning(
+                f"the map foretells nothing: {explained(error)}"
+            )
             return
         evidence = folder.experience.evidence
-        if folder is self._folder and len(evidence.table) >= known:  # else it was forgotten
+        if (
+            folder is self._folder and len(evidence.table) >= known
+        ):  # else it was forgotten
             folder.experience.prior = prior
             folder.try_to_save()
 
@@ -205,7 +225,9 @@ class Driving:
         percent = np.clip(100 * np.log(slowness) / np.log(SLOWEST), 0, 100).round()
         percent[grid.occupancy] = -1
         header = self._node.header(place.frame)
-        self._slowness.publish(occupancy_message(percent, grid.resolution, grid.origin, header))
+        self._slowness.publish(
+            occupancy_message(percent, grid.resolution, grid.origin, header)
+        )
 
     # Services, and what the node asks of whatever it learns from
 

@@ -5,7 +5,12 @@ from typing import Any, NamedTuple
 from uuid import uuid4
 
 from lifecycle_msgs.msg import State, Transition, TransitionDescription, TransitionEvent
-from lifecycle_msgs.srv import ChangeState, GetAvailableStates, GetAvailableTransitions, GetState
+from lifecycle_msgs.srv import (
+    ChangeState,
+    GetAvailableStates,
+    GetAvailableTransitions,
+    GetState,
+)
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from rclpy.timer import Timer
@@ -13,7 +18,10 @@ from rclpy.timer import Timer
 from ddqn_planner.nodes.declared import Parameters
 from ddqn_planner.nodes.runtime import STEADY, BaseNode, apt_install
 
-BEAT_PERIOD, BEAT_TIMEOUT = 0.5, 4.0  # seconds; the timeout as Nav2's lifecycle manager has it
+BEAT_PERIOD, BEAT_TIMEOUT = (
+    0.5,
+    4.0,
+)  # seconds; the timeout as Nav2's lifecycle manager has it
 
 ENTITIES = {
     "publisher": "publishers",
@@ -67,7 +75,9 @@ def _state(label: str) -> State:
     return State(id=STATES[label], label=label)
 
 
-def _description(number: int, label: str, start: str, goal: str) -> TransitionDescription:
+def _description(
+    number: int, label: str, start: str, goal: str
+) -> TransitionDescription:
     transition = Transition(id=number, label=label)
     ends = {"start_state": _state(start), "goal_state": _state(goal)}
     return TransitionDescription(transition=transition, **ends)
@@ -99,12 +109,18 @@ class ManagedNode(BaseNode):
         self._beats: Timer | None = None
         super().__init__(name, parameters)
         self._events = self.create_publisher(TransitionEvent, "~/transition_event", 10)
-        group = ReentrantCallbackGroup()  # the state can be asked for while a transition waits
+        group = (
+            ReentrantCallbackGroup()
+        )  # the state can be asked for while a transition waits
         for kind, service, callback in (
             (ChangeState, "change_state", self._on_change_state),
             (GetState, "get_state", self._on_get_state),
             (GetAvailableStates, "get_available_states", self._on_get_states),
-            (GetAvailableTransitions, "get_available_transitions", self._on_get_transitions),
+            (
+                GetAvailableTransitions,
+                "get_available_transitions",
+                self._on_get_transitions,
+            ),
             (GetAvailableTransitions, "get_transition_graph", self._on_get_graph),
         ):
             self.create_service(kind, f"~/{service}", callback, callback_group=group)
@@ -119,7 +135,10 @@ class ManagedNode(BaseNode):
                 self.cleanup()
             raise
         self.state = change.goal
-        for start, goal in ((change.start, change.during), (change.during, change.goal)):
+        for start, goal in (
+            (change.start, change.during),
+            (change.during, change.goal),
+        ):
             event = TransitionEvent(start_state=_state(start), goal_state=_state(goal))
             self._events.publish(event)
         if label == "configure":
@@ -131,7 +150,9 @@ class ManagedNode(BaseNode):
 
     def destroy_node(self) -> None:
         """Free all that the node has, and destroy it, so that it leaves the graph at once."""
-        if self._is_destroyed:  # newer releases destroy a context's nodes when it is shut down
+        if (
+            self._is_destroyed
+        ):  # newer releases destroy a context's nodes when it is shut down
             return
         self._is_destroyed = True
         # First, as a lifecycle manager calls them when the bond breaks, and waits without end.
@@ -210,7 +231,11 @@ class ManagedNode(BaseNode):
         if self._is_changing or self.is_stopping or label not in known.values():
             what = repr(asked.label) if asked.label else f"transition {asked.id}"
             choices = ", ".join(known.values()) or "none"
-            when = "while it changes its state" if self._is_changing else f"when {self.state}"
+            when = (
+                "while it changes its state"
+                if self._is_changing
+                else f"when {self.state}"
+            )
             when = "as it is being stopped" if self.is_stopping else when
             self.get_logger().error(f"{what} refused: the node has {choices} {when}")
             return response
@@ -237,7 +262,10 @@ class ManagedNode(BaseNode):
             return
         # As bondpy does, but deaf: the topic has the bonds of all nodes, each ten times a second.
         self._bond = Status(id=self.get_name(), instance_id=str(uuid4()), active=True)
-        self._bond.heartbeat_period, self._bond.heartbeat_timeout = BEAT_PERIOD, BEAT_TIMEOUT
+        self._bond.heartbeat_period, self._bond.heartbeat_timeout = (
+            BEAT_PERIOD,
+            BEAT_TIMEOUT,
+        )
         self._heart = self.create_publisher(Status, "bond", 1)
         self._beat()
         self._beats = self.create_timer(BEAT_PERIOD, self._beat, clock=STEADY)

@@ -52,7 +52,9 @@ class MapServerNode(BaseNode):
         self._random = np.random.default_rng(self.value("seed"))
         topic = self.value("topic_name")
         # First, so that whoever receives a map knows that its directions come too.
-        self._directions = self.create_publisher(OccupancyGrid, f"{topic}_directions", LATCHED)
+        self._directions = self.create_publisher(
+            OccupancyGrid, f"{topic}_directions", LATCHED
+        )
         self._publisher = self.create_publisher(OccupancyGrid, topic, LATCHED)
         name = self.value("yaml_filename")
         if name.strip():
@@ -76,8 +78,12 @@ class MapServerNode(BaseNode):
         try:
             self.resolve_topic_name(topic)
         except (NameValidationException, RuntimeError, ValueError) as error:
-            wrong = f"topic_name is {topic!r} ({str(error).splitlines()[0].rstrip(':')})"
-            raise ValueError(f"{wrong}; give letters, digits, _ and /, such as map") from None
+            wrong = (
+                f"topic_name is {topic!r} ({str(error).splitlines()[0].rstrip(':')})"
+            )
+            raise ValueError(
+                f"{wrong}; give letters, digits, _ and /, such as map"
+            ) from None
 
     def _load(self, url: str, only_below: bool = False) -> int:
         """Load a map and serve it, or log why not; return the result code of LoadMap."""
@@ -87,7 +93,9 @@ class MapServerNode(BaseNode):
         except Exception as error:  # anything, of a library that reads a broken file
             kept = "the map before it stays" if self._loaded else "no map is served"
             self.get_logger().error(f"cannot load {url!r}, {kept}: {error}")
-            return int(RESULTS.get(type(error), LoadMap.Response.RESULT_UNDEFINED_FAILURE))
+            return int(
+                RESULTS.get(type(error), LoadMap.Response.RESULT_UNDEFINED_FAILURE)
+            )
         self._loaded = loaded
         self._serve(loaded.values)
         height, width = loaded.values.shape
@@ -96,7 +104,11 @@ class MapServerNode(BaseNode):
 
     def _serve(self, values: NDArray[np.int8]) -> None:
         assert self._loaded is not None
-        place = self._loaded.resolution, self._loaded.origin, self.header(self.value("frame_id"))
+        place = (
+            self._loaded.resolution,
+            self._loaded.origin,
+            self.header(self.value("frame_id")),
+        )
         self._served = occupancy_message(values, *place)
         self._directions.publish(occupancy_message(self._loaded.forbidden, *place))
         # No planner has the new map while it has the directions of the map before.
@@ -104,9 +116,13 @@ class MapServerNode(BaseNode):
             self._directions.wait_for_all_acked(DIRECTIONS_TIMEOUT)
         self._publisher.publish(self._served)
 
-    def _on_get_map(self, request: GetMap.Request, response: GetMap.Response) -> GetMap.Response:
+    def _on_get_map(
+        self, request: GetMap.Request, response: GetMap.Response
+    ) -> GetMap.Response:
         if self._loaded is None:
-            self.get_logger().warning("asked for a map, but none is loaded: the answer is empty")
+            self.get_logger().warning(
+                "asked for a map, but none is loaded: the answer is empty"
+            )
         response.map = self._served
         return response
 
@@ -132,7 +148,9 @@ class MapServerNode(BaseNode):
         rows, columns = np.nonzero(new)
         places = zip(*grid.centres(columns, rows), strict=True)
         cells = ", ".join(f"({x:.3f}, {y:.3f})" for x, y in places)
-        message = f"{len(rows)} new obstacles at {cells} m; {rejected} draws thrown away"
+        message = (
+            f"{len(rows)} new obstacles at {cells} m; {rejected} draws thrown away"
+        )
         self.get_logger().info(message)
         return True, message
 
@@ -147,12 +165,16 @@ def known_path(grid: GridMap, map_file: MapFile) -> tuple[MoveRule, list[Cell]]:
     """Return the shortest path, and the safest rule under which there is one, or a ValueError."""
     start, goal = map_file.start, map_file.goal
     if start is None or goal is None:
-        remedy = f"add '{PACKAGE}: {{start: [x, y], goal: [x, y]}}' in cells to its YAML"
+        remedy = (
+            f"add '{PACKAGE}: {{start: [x, y], goal: [x, y]}}' in cells to its YAML"
+        )
         raise ValueError(f"the map file names no start and goal; {remedy}")
     for move_rule in (MoveRule.ROBOT_SAFE, MoveRule.CORNER_CUTTING):
         if path := shortest_path(grid, start, goal, move_rule):
             return move_rule, path
-    raise ValueError(f"no path leads from the start {start} to the goal {goal} of the map file")
+    raise ValueError(
+        f"no path leads from the start {start} to the goal {goal} of the map file"
+    )
 
 
 main = partial(spin_until_shutdown, MapServerNode, PARAMETERS)

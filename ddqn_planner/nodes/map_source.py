@@ -37,11 +37,17 @@ BODY_PARAMETERS = ("robot_radius", "clearance_weight")
 UPDATES = QoSProfile(depth=100)
 REMEDY = "let the map's publisher send the full map"
 
-CHANGED_SHARE = 0.02  # of cells: with more, experience is spread anew over the map, slowly
+CHANGED_SHARE = (
+    0.02  # of cells: with more, experience is spread anew over the map, slowly
+)
 
-ONE_WAY_ZONES = "one-way zones"  # what is refused of directions that do not hold on a map
+ONE_WAY_ZONES = (
+    "one-way zones"  # what is refused of directions that do not hold on a map
+)
 
-UPDATE_WAIT = 1.0  # seconds to wait for a costmap without a known period, as Nav2's planners do
+UPDATE_WAIT = (
+    1.0  # seconds to wait for a costmap without a known period, as Nav2's planners do
+)
 # Each map may be turned by another number: only another kind of reason is news.
 NUMBER = re.compile(r"-?\d[\d.]*(e[+-]?\d+)?")
 
@@ -64,7 +70,9 @@ class Arrivals:
 
     def __init__(self) -> None:
         self.number = 0
-        self.awaited_in_vain = -1  # the number of the last one after which none came in time
+        self.awaited_in_vain = (
+            -1
+        )  # the number of the last one after which none came in time
         self._times: deque[float] = deque(maxlen=INTERVALS + 1)
 
     def note(self) -> float:
@@ -90,11 +98,18 @@ class MapSource:
     def __init__(
         self, node: BaseNode, report: Report, worker: Worker, on_map: Callable[[], None]
     ) -> None:
-        self._node, self._report, self._worker, self._on_map = node, report, worker, on_map
+        self._node, self._report, self._worker, self._on_map = (
+            node,
+            report,
+            worker,
+            on_map,
+        )
         self.times = ExpectedTimes(node, report, worker, self.change)
         self.arrivals = Arrivals()
         self._used: Received | None = None
-        self._waiting: Received | None = None  # a newer one, whose directions may be under way
+        self._waiting: Received | None = (
+            None  # a newer one, whose directions may be under way
+        )
         self._waiting_since = math.inf
         self._logged_reason = ""  # why a map waits, without the numbers
         self._size = ""  # of the one in use, in words
@@ -104,10 +119,14 @@ class MapSource:
         self._ready: Future | None = None
         # Before the subscription of the map: directions that come with a map are taken first.
         self._directions = Directions(node, report, self._on_directions)
-        self._topic = node.create_subscription(OccupancyGrid, "map", self._take, LATCHED).topic_name
+        self._topic = node.create_subscription(
+            OccupancyGrid, "map", self._take, LATCHED
+        ).topic_name
         updates = f"{self._topic}_updates"
         if OccupancyGridUpdate is not None:
-            node.create_subscription(OccupancyGridUpdate, updates, self._take_update, UPDATES)
+            node.create_subscription(
+                OccupancyGridUpdate, updates, self._take_update, UPDATES
+            )
         else:
             install = apt_install("map-msgs")
             missing = f"is not read: map_msgs is not installed; {install}, or"
@@ -140,9 +159,14 @@ class MapSource:
         refused = self._report.refused.get("map")
         because = f" ({refused})" if refused else ""
         if self._used is None:
-            missing, since = f"no map was received on {self._topic} yet{because}", self._began
+            missing, since = (
+                f"no map was received on {self._topic} yet{because}",
+                self._began,
+            )
             if refused and self._waiting is not None:
-                raise RequestError("NO_MAP", refused, max(since, self._directions.awaited_since))
+                raise RequestError(
+                    "NO_MAP", refused, max(since, self._directions.awaited_since)
+                )
             raise RequestError("NO_MAP", f"{missing}; start a map server", since)
         timeout = self._node.value("map_timeout")
         is_costmap = self._node.value("map_type") == "costmap"
@@ -174,24 +198,37 @@ class MapSource:
             description = {"map": self._size, "map stamp (s)": stamp}
         if self._updates:
             description["map updates applied"] = str(self._applied_updates)
-            description["map updates refused"] = str(self._updates - self._applied_updates)
+            description["map updates refused"] = str(
+                self._updates - self._applied_updates
+            )
         return description | self.times.told(self._report.outcome)
 
     def ready(self) -> Future:
         """Return the `GridMap` to plan on, with body and times: computed for the first request."""
         ready, used = self._ready, self._used
-        if ready is None or (ready.done() and ready.exception()):  # as when no memory was left
+        if ready is None or (
+            ready.done() and ready.exception()
+        ):  # as when no memory was left
             assert used is not None
             radius, weight = map(self._node.value, BODY_PARAMETERS)
             # ROS accepts a value that is above the range by a millionth.
-            of_body = used.grid.with_layers(forbidden=used.forbidden), radius, min(weight, 1.0)
+            of_body = (
+                used.grid.with_layers(forbidden=used.forbidden),
+                radius,
+                min(weight, 1.0),
+            )
             ready = self._worker.call(lambda: self.times.apply(self._inflate(*of_body)))
             self._ready = ready
         return ready
 
     def apply_parameters(self, changed: set[str]) -> None:
         """Read and prepare the map anew if one of the parameters that changed says so."""
-        if changed & {*MAP_PARAMETERS, *BODY_PARAMETERS, "require_directions", "exploration"}:
+        if changed & {
+            *MAP_PARAMETERS,
+            *BODY_PARAMETERS,
+            "require_directions",
+            "exploration",
+        }:
             for received in filter(None, (self._waiting, self._used)):
                 received.grid = self._read(received.message)
             self._on_directions()
@@ -221,10 +258,14 @@ class MapSource:
             grid = self._patched(grid, new[box], box[1].start, box[0].start)
         return grid
 
-    def _patched(self, grid: GridMap, values: NDArray[np.int8], x: int, y: int) -> GridMap:
+    def _patched(
+        self, grid: GridMap, values: NDArray[np.int8], x: int, y: int
+    ) -> GridMap:
         rules = map(self._node.value, MAP_PARAMETERS)
         patch = conversions.grid_from_values(values, 1.0, (0.0, 0.0, 0.0), *rules)
-        return grid.with_patch(patch.occupancy, x, y, patch.cost, patch.obstacles, patch.unknown)
+        return grid.with_patch(
+            patch.occupancy, x, y, patch.cost, patch.obstacles, patch.unknown
+        )
 
     def _take_update(self, update: Any) -> None:
         """Plan on the map with other values in a box from now on, or refuse the update."""
@@ -285,7 +326,9 @@ class MapSource:
     def _direct(self, received: Received) -> str:
         """Let the directions hold on a map; return why the map cannot be used, if it cannot."""
         try:
-            received.forbidden = self._directions.on(received.grid, received.header.frame_id)
+            received.forbidden = self._directions.on(
+                received.grid, received.header.frame_id
+            )
         except ValueError as error:
             received.forbidden = None
             if self._node.value("require_directions"):
@@ -298,18 +341,29 @@ class MapSource:
 
 def _place(message: OccupancyGrid) -> tuple[Any, ...]:
     info, size = message.info, len(message.data)
-    return message.header.frame_id, info.width, info.height, info.resolution, info.origin, size
+    return (
+        message.header.frame_id,
+        info.width,
+        info.height,
+        info.resolution,
+        info.origin,
+        size,
+    )
 
 
 def _values(message: OccupancyGrid) -> NDArray[np.int8]:
-    return np.frombuffer(message.data, np.int8).reshape(message.info.height, message.info.width)
+    return np.frombuffer(message.data, np.int8).reshape(
+        message.info.height, message.info.width
+    )
 
 
 def updated_values(message: OccupancyGrid, update: Any) -> NDArray[np.int8]:
     """Return the values that an update puts into the last map, (h, w); ValueError if none fit."""
     frame, map_frame = update.header.frame_id, message.header.frame_id
     if frame != map_frame:
-        raise ValueError(f"the update's frame is {frame!r}, the map's is {map_frame!r}; use one")
+        raise ValueError(
+            f"the update's frame is {frame!r}, the map's is {map_frame!r}; use one"
+        )
     stamp, map_stamp = update.header.stamp, message.header.stamp
     if (0, 0) < (stamp.sec, stamp.nanosec) < (map_stamp.sec, map_stamp.nanosec):
         stamps = f"{seconds(map_stamp)}, is later than the update's, {seconds(stamp)}"
@@ -320,7 +374,9 @@ def updated_values(message: OccupancyGrid, update: Any) -> NDArray[np.int8]:
         place = f"is not inside the map of {info.width} x {info.height}"
         raise ValueError(f"an update of {box} from {(x, y)} {place}; {REMEDY}")
     if len(update.data) != width * height:
-        raise ValueError(f"the update has {len(update.data)} values; {box} need {width * height}")
+        raise ValueError(
+            f"the update has {len(update.data)} values; {box} need {width * height}"
+        )
     return np.frombuffer(update.data, np.int8).reshape(height, width)
 
 
@@ -328,9 +384,18 @@ class ExpectedTimes:
     """Puts on maps what the trainer has learned of the robot's drives."""
 
     def __init__(
-        self, node: BaseNode, report: Report, worker: Worker, on_change: Callable[[], None]
+        self,
+        node: BaseNode,
+        report: Report,
+        worker: Worker,
+        on_change: Callable[[], None],
     ) -> None:
-        self._node, self._report, self._worker, self._on_change = node, report, worker, on_change
+        self._node, self._report, self._worker, self._on_change = (
+            node,
+            report,
+            worker,
+            on_change,
+        )
         self._experience: Experience | None = None
         self._layout: Any = None  # of the message that it came in
         self._loaded: Experience | None = None  # from the file that was set last
@@ -361,7 +426,10 @@ class ExpectedTimes:
         if self._experience is None:
             return {}
         if outcome is not self._outcome:
-            self._outcome, self._forecast = outcome, self._worker.call(self.describe, outcome)
+            self._outcome, self._forecast = (
+                outcome,
+                self._worker.call(self.describe, outcome),
+            )
         if not self._forecast.done():
             self._report.change()  # to look again soon
         is_refused = self._forecast.exception()  # as when no memory is left
@@ -394,7 +462,9 @@ class ExpectedTimes:
     def describe(self, outcome: Outcome) -> dict[str, str]:
         """Return how long a plan takes, unless its map is old or untimed."""
         now, request, path = self._spread_on, outcome.request, outcome.plan.path
-        if not (self._experience and now and request and request.grid.slowness is not None):
+        if not (
+            self._experience and now and request and request.grid.slowness is not None
+        ):
             return {}
         if not len(path) or not is_like(request.grid, now):
             return {}
@@ -405,6 +475,10 @@ class ExpectedTimes:
 
 def is_like(grid: GridMap, other: GridMap) -> bool:
     """Return whether two maps have the same place, and nearly the same obstacles."""
-    mine, its = ((each.occupancy.shape, each.resolution, each.origin) for each in (grid, other))
+    mine, its = (
+        (each.occupancy.shape, each.resolution, each.origin) for each in (grid, other)
+    )
     most = CHANGED_SHARE * grid.occupancy.size
-    return mine == its and bool(np.count_nonzero(grid.occupancy != other.occupancy) <= most)
+    return mine == its and bool(
+        np.count_nonzero(grid.occupancy != other.occupancy) <= most
+    )

@@ -25,12 +25,16 @@ from ddqn_planner.planning import PlanStatus
 
 # Returns the answer of another planner to a goal's handle, or the outcome if there is none.
 AskOther = Callable[[Any, GivenUp, Callable[[], bool]], Awaitable[Any]]
-RESULT_TIMEOUT = 10  # seconds to keep a result, as action_server_result_timeout of Nav2's servers
+RESULT_TIMEOUT = (
+    10  # seconds to keep a result, as action_server_result_timeout of Nav2's servers
+)
 CANCELED = Outcome("CANCELED", "the goal was canceled")
 PREEMPTED = Outcome("PREEMPTED", "a newer goal of the same action came")
 
 CODES = {
-    **dict.fromkeys((PlanStatus.NO_PATH.name, PlanStatus.ROLLOUT_TRAPPED.name), "NO_VALID_PATH"),
+    **dict.fromkeys(
+        (PlanStatus.NO_PATH.name, PlanStatus.ROLLOUT_TRAPPED.name), "NO_VALID_PATH"
+    ),
     # Unknown, malformed, or in a frame without TF: clearing costmaps, as after UNKNOWN, is no help.
     **dict.fromkeys(("NO_START", "INVALID_START", "INVALID_GOAL"), "TF_ERROR"),
     "NO_GOALS": "NO_VIAPOINTS_GIVEN",
@@ -132,7 +136,9 @@ class PathAction:
 
     def _is_others(self, handle: Any) -> bool:
         """Return whether a goal names another planner, and there may be one."""
-        return self._ask_other is not None and not self._is_ours(handle.request.planner_id)
+        return self._ask_other is not None and not self._is_ours(
+            handle.request.planner_id
+        )
 
     async def _answer_of_other(self, handle: Any, given_up: GivenUp) -> Any:
         """Return another planner's result, and set the handle's state, or why there is none."""
@@ -158,7 +164,9 @@ def poses_of(goals: Any) -> list[PoseStamped]:
     if not hasattr(goals, "goals"):
         return [*goals]
     return [
-        stamped if stamped.header.frame_id else PoseStamped(header=goals.header, pose=stamped.pose)
+        stamped
+        if stamped.header.frame_id
+        else PoseStamped(header=goals.header, pose=stamped.pose)
         for stamped in goals.goals
     ]
 
@@ -168,7 +176,9 @@ class Planning(NamedTuple):
 
     refusal: GivenUp
     plan: Plan
-    ask_other: Callable[[OtherPlanners, Any, GivenUp, Callable[[], bool]], Awaitable[Any]]
+    ask_other: Callable[
+        [OtherPlanners, Any, GivenUp, Callable[[], bool]], Awaitable[Any]
+    ]
     is_ours: Callable[[str], bool]  # a planner's name
     on_is_path_valid: Callable[..., Any]
 
@@ -182,19 +192,30 @@ def serve_nav2(node: BaseNode, planning: Planning, other_planners: str = "") -> 
         from nav2_msgs.action import ComputePathThroughPoses, ComputePathToPose
         from nav2_msgs.srv import IsPathValid
     except ImportError as error:
-        node.get_logger().info(f"no actions for Nav2 ({error}); {apt_install('nav2-msgs')}")
+        node.get_logger().info(
+            f"no actions for Nav2 ({error}); {apt_install('nav2-msgs')}"
+        )
         return
     # Reentrant: the newest goal must be able to preempt another one.
     group = ReentrantCallbackGroup()
     options = {"callback_group": group, "result_timeout": RESULT_TIMEOUT, **QUEUES}
     options["cancel_callback"] = lambda _: CancelResponse.ACCEPT
-    for name, kind in zip(ACTIONS, (ComputePathToPose, ComputePathThroughPoses), strict=True):
+    for name, kind in zip(
+        ACTIONS, (ComputePathToPose, ComputePathThroughPoses), strict=True
+    ):
         ask_other = None
         if other_planners:
             others = OtherPlanners(node, kind, action_name(other_planners, name))
             ask_other = partial(planning.ask_other, others)
-        action = PathAction(kind, planning.refusal, planning.plan, ask_other, planning.is_ours)
-        begin = {"goal_callback": action.accept, "handle_accepted_callback": action.begin}
+        action = PathAction(
+            kind, planning.refusal, planning.plan, ask_other, planning.is_ours
+        )
+        begin = {
+            "goal_callback": action.accept,
+            "handle_accepted_callback": action.begin,
+        }
         ActionServer(node, kind, name, action.execute, **begin, **options)
     on_is_path_valid = planning.on_is_path_valid
-    node.create_service(IsPathValid, "is_path_valid", on_is_path_valid, callback_group=group)
+    node.create_service(
+        IsPathValid, "is_path_valid", on_is_path_valid, callback_group=group
+    )

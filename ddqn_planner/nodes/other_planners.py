@@ -18,12 +18,17 @@ GivenUp = Callable[[], Outcome | None]  # returns why a request is given up now,
 ACTIONS = "compute_path_to_pose", "compute_path_through_poses"
 SERVER_WAIT = 1.0  # seconds until a server that was just started is discovered
 ACCEPT_WAIT = 5.0  # seconds in which a server says whether it takes a goal
-ASK_PERIOD = 2.0  # seconds until it is asked for the result again: a new server lacks the goal
-TICK = 0.05  # seconds between two looks whether a goal is given up, or its server is gone
+ASK_PERIOD = (
+    2.0  # seconds until it is asked for the result again: a new server lacks the goal
+)
+TICK = (
+    0.05  # seconds between two looks whether a goal is given up, or its server is gone
+)
 
 # Of an action's services: without these queues, goals are lost like requests.
 QUEUES: dict[str, Any] = {
-    f"{service}_service_qos_profile": SERVICE_QUALITY for service in ("goal", "cancel", "result")
+    f"{service}_service_qos_profile": SERVICE_QUALITY
+    for service in ("goal", "cancel", "result")
 }
 INVALID, LOST = "INVALID_PLANNER", "PLANNER_LOST"
 
@@ -44,9 +49,13 @@ def check_prefix(node: BaseNode, prefix: str) -> None:
             )
         except RuntimeError as error:
             reason, *_ = str(error).split(", at ")
-            raise ValueError(f"other_planners is {prefix!r} ({reason}); {remedy}") from None
+            raise ValueError(
+                f"other_planners is {prefix!r} ({reason}); {remedy}"
+            ) from None
         if moved == ours:
-            raise ValueError(f"other_planners is {prefix!r}, which is this node itself; {remedy}")
+            raise ValueError(
+                f"other_planners is {prefix!r}, which is this node itself; {remedy}"
+            )
 
 
 class OtherPlanners:
@@ -79,19 +88,25 @@ class OtherPlanners:
         A goal that is given up is canceled, unless `is_kept` says that a newer one preempts it.
         """
         planner = f"the planner {planner_id!r}"
-        await self._wait(lambda: self._client.server_is_ready() or given_up(), SERVER_WAIT)
+        await self._wait(
+            lambda: self._client.server_is_ready() or given_up(), SERVER_WAIT
+        )
         if (outcome := given_up()) is not None:
             return outcome
         if not self._client.server_is_ready():
             remedy = "start Nav2's planner_server with its actions remapped to there"
-            return Outcome(INVALID, f"{planner} has no server at {self._name}; {remedy}")
+            return Outcome(
+                INVALID, f"{planner} has no server at {self._name}; {remedy}"
+            )
         sending = self._client.send_goal_async(goal, goal_uuid=goal_id)
         sending.add_done_callback(self._look)
         await self._wait(lambda: sending.done() or given_up(), ACCEPT_WAIT)
         if not sending.done():
             sending.add_done_callback(_cancel)
             silence = f"{planner}: no answer from {self._name} within {ACCEPT_WAIT:g} s"
-            return given_up() or Outcome(INVALID, f"{silence}; look into its server's log")
+            return given_up() or Outcome(
+                INVALID, f"{silence}; look into its server's log"
+            )
         accepted = sending.result()
         if not accepted.accepted:
             remedy = "is it active, and another node than this?"
@@ -120,7 +135,9 @@ class OtherPlanners:
             if await self._wait(is_over, ASK_PERIOD):
                 return asking.result() if asking.done() else None
 
-    async def _wait(self, is_over: Callable[[], Any], seconds: float = math.inf) -> bool:
+    async def _wait(
+        self, is_over: Callable[[], Any], seconds: float = math.inf
+    ) -> bool:
         """Wait until something is over, or for some seconds; return whether it is."""
         deadline = time.monotonic() + seconds
         self._waiting += 1

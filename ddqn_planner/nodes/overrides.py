@@ -35,7 +35,9 @@ class Section(NamedTuple):
         """Return whether it is for a node, by its full name."""
         wildcards = {"**": "(/[^/]+)*", "*": "/[^/]+"}
         tokens = filter(None, self.name.split("/"))
-        pattern = "".join(wildcards.get(token, "/" + re.escape(token)) for token in tokens)
+        pattern = "".join(
+            wildcards.get(token, "/" + re.escape(token)) for token in tokens
+        )
         return re.fullmatch(pattern, node) is not None
 
 
@@ -56,10 +58,14 @@ def unread_names(names: Iterable[str], known: Collection[str], node: str) -> str
         f"{name} (the nearest is {other})" if other else name
         for name, other in zip(unknown, similar, strict=True)
     )
-    return f"{node} does not know, and does not read: {told}; --help lists what it knows"
+    return (
+        f"{node} does not know, and does not read: {told}; --help lists what it knows"
+    )
 
 
-def unread_qualities(names: Iterable[str], known: Collection[str], node: str) -> list[str]:
+def unread_qualities(
+    names: Iterable[str], known: Collection[str], node: str
+) -> list[str]:
     """Return which qualities of service are for topics that a node does not read."""
     told = []
     for name in names:
@@ -72,7 +78,9 @@ def unread_qualities(names: Iterable[str], known: Collection[str], node: str) ->
     return told
 
 
-def unread_sections(arguments: Sequence[str], known: Collection[str], node: str) -> list[str]:
+def unread_sections(
+    arguments: Sequence[str], known: Collection[str], node: str
+) -> list[str]:
     """Return which parameter files, and settings of -p, are for other nodes alone."""
     told = []
     for source, sections in _sources(arguments):
@@ -94,7 +102,11 @@ def _is_meant(section: Section, known: Collection[str], node: str) -> bool:
     """Return whether a section for no other node than this one may have been meant for it."""
     has_namespace = section.name.count("/") > 1
     is_similar = nearest(section.last, [node.rpartition("/")[2]]) != ""
-    return not has_namespace and is_similar and any(name in known for name in section.parameters)
+    return (
+        not has_namespace
+        and is_similar
+        and any(name in known for name in section.parameters)
+    )
 
 
 def _remedy(sections: Sequence[Section], node: str) -> str:
@@ -104,7 +116,9 @@ def _remedy(sections: Sequence[Section], node: str) -> str:
     other = nearest(name, [section.last for section in sections])
     remedy = f"add a section {node}: or /**:"
     if other:
-        remedy = _rename(next(section for section in sections if section.last == other), node)
+        remedy = _rename(
+            next(section for section in sections if section.last == other), node
+        )
     return f"it is for {shown}; {remedy}"
 
 
@@ -112,7 +126,9 @@ def _rename(section: Section, node: str) -> str:
     name = node.rpartition("/")[2]
     if section.last == name:  # in another namespace
         return f"write {node}: or /**/{name}: instead of {section.name}:"
-    return f"write {node.removeprefix('/')}: instead of {section.name.removeprefix('/')}:"
+    return (
+        f"write {node.removeprefix('/')}: instead of {section.name.removeprefix('/')}:"
+    )
 
 
 def _sources(arguments: Sequence[str]) -> Iterator[tuple[str, list[Section]]]:
@@ -125,7 +141,9 @@ def _sources(arguments: Sequence[str]) -> Iterator[tuple[str, list[Section]]]:
             file = next(rest, "")
             # ROS has read it before, or has said what is wrong with it.
             with suppress(OSError, ValueError, yaml.YAMLError, RecursionError):
-                document = yaml.load(read_file(Path(file), MAX_FILE_BYTES), Loader=yaml.BaseLoader)
+                document = yaml.load(
+                    read_file(Path(file), MAX_FILE_BYTES), Loader=yaml.BaseLoader
+                )
                 yield file, [*_sections(document)]
         elif is_for_ros and argument in ("-p", "--param"):
             rule = next(rest, "")
@@ -173,7 +191,9 @@ def _wrong_rule(rule: str) -> str:
     """Return why a setting of -p cannot be read; empty if it can."""
     target, assignment, value = rule.partition(":=")
     if not assignment:
-        return f"-p {rule} has no ':='; write -p NAME:=VALUE, as in -p robot_radius:=0.3"
+        return (
+            f"-p {rule} has no ':='; write -p NAME:=VALUE, as in -p robot_radius:=0.3"
+        )
     node, colon, name = target.rpartition(":")
     if colon and "/" in node:
         return f"-p {rule} names a node with '/'; write -p {node.split('/')[-1]}:{name}:={value}"
@@ -182,7 +202,9 @@ def _wrong_rule(rule: str) -> str:
     try:
         yaml.load(value, Loader=yaml.BaseLoader)
     except yaml.YAMLError as error:
-        return f"-p {rule}: the value is no YAML ({_reason(error)}); put a text in quotes"
+        return (
+            f"-p {rule}: the value is no YAML ({_reason(error)}); put a text in quotes"
+        )
     return ""
 
 

@@ -12,7 +12,9 @@ METHODS: Final = [method.value for method in PlanMethod]
 LOADABLE: Final = "a model that can be loaded; else the one before it stays"
 
 OF_MAPS: Final = {
-    "occupied_threshold": Declared(65, "Percent from which on a cell is occupied", (1, 100)),
+    "occupied_threshold": Declared(
+        65, "Percent from which on a cell is occupied", (1, 100)
+    ),
     "allow_unknown": Declared(False, "Unknown cells are free"),
 }
 """How both nodes read a map."""
@@ -20,26 +22,50 @@ OF_MAPS: Final = {
 PLANNER_PARAMETERS: Final = {
     "autostart": Declared(True, "Start without a lifecycle manager", read_only=True),
     "model": Declared("any_map", "A shipped model's name, or a model file", LOADABLE),
-    "move_rule": Declared("", "Legal diagonal moves; '' for the model's rule", ["", *MOVE_RULES]),
-    "map_type": Declared("map", "Values of a map, or of a Nav2 costmap", ["map", "costmap"]),
-    "map_timeout": Declared(5.0, "Seconds to plan on the last costmap; 0: always", (0, 3600)),
-    "require_directions": Declared(False, "Wait for map_directions, even from a later node"),
+    "move_rule": Declared(
+        "", "Legal diagonal moves; '' for the model's rule", ["", *MOVE_RULES]
+    ),
+    "map_type": Declared(
+        "map", "Values of a map, or of a Nav2 costmap", ["map", "costmap"]
+    ),
+    "map_timeout": Declared(
+        5.0, "Seconds to plan on the last costmap; 0: always", (0, 3600)
+    ),
+    "require_directions": Declared(
+        False, "Wait for map_directions, even from a later node"
+    ),
     **OF_MAPS,
-    "use_map_costs": Declared(False, "For any_map: a free cell costs by its value, unknown most"),
-    "robot_radius": Declared(0.0, "Metres: cells nearer to an obstacle are occupied", (0, 100)),
+    "use_map_costs": Declared(
+        False, "For any_map: a free cell costs by its value, unknown most"
+    ),
+    "robot_radius": Declared(
+        0.0, "Metres: cells nearer to an obstacle are occupied", (0, 100)
+    ),
     "start_clearing_radius": Declared(
         -1.0,
         "Metres: obstacles so near to an occupied start do not count; -1: robot_radius, at least "
         "one cell; 0: such a start is refused",
         (-1, 100),
     ),
-    "clearance_weight": Declared(0.0, "For any_map: how strongly to avoid obstacles", (0, 1)),
-    "tolerance": Declared(0.0, "Metres: how far an occupied or cut off goal may move", (0, 1000)),
+    "clearance_weight": Declared(
+        0.0, "For any_map: how strongly to avoid obstacles", (0, 1)
+    ),
+    "tolerance": Declared(
+        0.0, "Metres: how far an occupied or cut off goal may move", (0, 1000)
+    ),
     "yaw_tolerance": Declared(0.0, "Radians: the same for a robot's heading", (0, 4)),
-    "path_bound": Declared(1.2, "A robot's first path: how many times the least cost", (1, 10)),
-    "replan_period": Declared(1.0, "Seconds between plans on a free path; 0: each map", (0, 3600)),
-    "switch_threshold": Declared(0.05, "Share by which a kept path may cost more", (0, 10)),
-    "mode": Declared("greedy", "astar_fallback: search where greedy steps get stuck", METHODS),
+    "path_bound": Declared(
+        1.2, "A robot's first path: how many times the least cost", (1, 10)
+    ),
+    "replan_period": Declared(
+        1.0, "Seconds between plans on a free path; 0: each map", (0, 3600)
+    ),
+    "switch_threshold": Declared(
+        0.05, "Share by which a kept path may cost more", (0, 10)
+    ),
+    "mode": Declared(
+        "greedy", "astar_fallback: search where greedy steps get stuck", METHODS
+    ),
     "path_simplification": Declared(
         "straight",
         "straight: lines, a pose at least each cell; line_of_sight: only at turns; none: cells",
@@ -48,21 +74,32 @@ PLANNER_PARAMETERS: Final = {
     "start_source": Declared(
         "initialpose", "What says where the robot is", ["initialpose", "odometry", "tf"]
     ),
-    "robot_frame": Declared("base_link", "The robot's frame, for the start_source tf", "not empty"),
+    "robot_frame": Declared(
+        "base_link", "The robot's frame, for the start_source tf", "not empty"
+    ),
     "transform_tolerance": Declared(
-        0.3, "Seconds: greatest age of a transform, wait for one, silence of odometry", (0, 1000)
+        0.3,
+        "Seconds: greatest age of a transform, wait for one, silence of odometry",
+        (0, 1000),
     ),
     "field_cache_bytes": Declared(
         CACHE_BYTES, "Bytes for kept Q fields; the last three always stay", (0, 2**40)
     ),
-    "planner_id": Declared("GridBased", "What Nav2's requests may name, or leave empty"),
+    "planner_id": Declared(
+        "GridBased", "What Nav2's requests may name, or leave empty"
+    ),
     "other_planners": Declared(
-        "", "Prefix of planner_server's actions, for another planner_id; '': none", read_only=True
+        "",
+        "Prefix of planner_server's actions, for another planner_id; '': none",
+        read_only=True,
     ),
     "allow_partial_planning": Declared(
-        False, "Through several poses: as far as there is a path, if there is one to the first"
+        False,
+        "Through several poses: as far as there is a path, if there is one to the first",
     ),
     "experience": Declared("", "What drives taught: a file or folder; '': none"),
-    "exploration": Declared(0.1, "Share by which a path may take longer, to learn", (0, 10)),
+    "exploration": Declared(
+        0.1, "Share by which a path may take longer, to learn", (0, 10)
+    ),
     "follow_trainer": Declared(False, "Load what the trainer saves", read_only=True),
 }

@@ -32,15 +32,30 @@ from ddqn_planner.nodes.report import (
     Report,
     RequestError,
 )
-from ddqn_planner.nodes.requests import UNCHANGED, ActiveGoal, ModelSource, Requests, read_model
-from ddqn_planner.nodes.runtime import LATCHED, STEADY, Worker, spin_until_shutdown, unless
+from ddqn_planner.nodes.requests import (
+    UNCHANGED,
+    ActiveGoal,
+    ModelSource,
+    Requests,
+    read_model,
+)
+from ddqn_planner.nodes.runtime import (
+    LATCHED,
+    STEADY,
+    Worker,
+    spin_until_shutdown,
+    unless,
+)
 from ddqn_planner.planning import Planner
 from ddqn_planner.planning.plan import PosePlan
 from ddqn_planner.planning.segments import SAME_COST
 
 CONFIGURED = "inactive", "active"  # states with a map, a start and requests
 Planning = Coroutine[None, None, Outcome]
-LOOK_PERIOD, IDLE_PERIOD = 0.1, 1.0  # seconds until the next look: after a change, and else
+LOOK_PERIOD, IDLE_PERIOD = (
+    0.1,
+    1.0,
+)  # seconds until the next look: after a change, and else
 
 
 # The executor's one thread holds all state. What takes long runs in workers: to load the model,
@@ -53,7 +68,9 @@ class PlannerNode(ManagedNode):
         self._settings = self.settings()
         self._looks = self.create_timer(LOOK_PERIOD, self._on_look, clock=STEADY)
         self._report = Report(self, self._look_soon)
-        self._worker, self._map_worker, self._display_worker = (Worker(self) for _ in range(3))
+        self._worker, self._map_worker, self._display_worker = (
+            Worker(self) for _ in range(3)
+        )
         self._model = ModelSource(self, self._report, self._worker)
         self.deactivate()
         self.add_post_set_parameters_callback(self._apply_parameters)
@@ -78,16 +95,24 @@ class PlannerNode(ManagedNode):
         group = MutuallyExclusiveCallbackGroup()
         self._replan = self.create_guard_condition(self._plan_for_active_goal, group)
         self._map = MapSource(self, self._report, self._map_worker, self._on_map)
-        self._places = Places(self, self._report, lambda: self._map.frame, self._on_start)
+        self._places = Places(
+            self, self._report, lambda: self._map.frame, self._on_start
+        )
         inputs = self._map, self._places, self._model
-        self._requests = Requests(self._settings, *inputs, self._worker, self._look_soon)
+        self._requests = Requests(
+            self._settings, *inputs, self._worker, self._look_soon
+        )
         self.create_subscription(PoseStamped, "goal_pose", self._on_goals, 10)
         self.create_subscription(PoseArray, "goal_poses", self._on_goals, 10)
         if self._settings.follow_trainer:
-            self.create_subscription(UInt8MultiArray, "trainer/model", self._on_model, LATCHED)
+            self.create_subscription(
+                UInt8MultiArray, "trainer/model", self._on_model, LATCHED
+            )
         # Reentrant: a request that waits for its field does not keep out the others.
         reentrant = ReentrantCallbackGroup()
-        self.create_service(GetPlan, "~/get_plan", self._on_get_plan, callback_group=reentrant)
+        self.create_service(
+            GetPlan, "~/get_plan", self._on_get_plan, callback_group=reentrant
+        )
         self.create_trigger("~/reload_model", self._model.on_reload)
         planning = Nav2Planning(
             refusal=lambda: self._refusal,
@@ -156,18 +181,26 @@ class PlannerNode(ManagedNode):
     def check_parameters(self, new: dict[str, Any]) -> None:
         """Check new values as `BaseNode` does, whether TF can be used, and load new files."""
         super().check_parameters(new)
-        check_source("start_source", new.get("start_source", ""), "'initialpose' or 'odometry'")
+        check_source(
+            "start_source", new.get("start_source", ""), "'initialpose' or 'odometry'"
+        )
         check_prefix(self, new.get("other_planners", ""))
-        if "model" in new and hasattr(self, "_settings"):  # a worker loads the first one
+        if "model" in new and hasattr(
+            self, "_settings"
+        ):  # a worker loads the first one
             self._candidate = read_model(new["model"])
-        if "experience" in new and hasattr(self, "_settings"):  # so does one with the first file
+        if "experience" in new and hasattr(
+            self, "_settings"
+        ):  # so does one with the first file
             file = new["experience"]
             self._new_experience = Experience.load(file) if file else None
 
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
         self._settings = self.settings()
         changed = {parameter.name for parameter in parameters} & self._declared.keys()
-        if not changed or self.state not in CONFIGURED:  # subscriptions declare parameters, too
+        if (
+            not changed or self.state not in CONFIGURED
+        ):  # subscriptions declare parameters, too
             return
         if "model" in changed:
             self._model.use(*self._candidate)
@@ -181,8 +214,12 @@ class PlannerNode(ManagedNode):
     def _on_model(self, message: UInt8MultiArray) -> None:
         with self._report.taking("trainer/model"):
             data = bytes_of("model", message)
-            if message.layout != self._model.layout:  # its digest says whether it is in use
-                self._model.use(Planner(*model_of(data)), "trainer/model", message.layout)
+            if (
+                message.layout != self._model.layout
+            ):  # its digest says whether it is in use
+                self._model.use(
+                    Planner(*model_of(data)), "trainer/model", message.layout
+                )
                 self._plan_for(self._active.poses)
 
     # Map, start and goal
@@ -194,7 +231,9 @@ class PlannerNode(ManagedNode):
     def _on_start(self) -> None:
         self._plan_for(self._active.poses, self._active.followed)
 
-    def _plan_for(self, goals: list[PoseStamped], followed: Outcome | None = None) -> None:
+    def _plan_for(
+        self, goals: list[PoseStamped], followed: Outcome | None = None
+    ) -> None:
         """Plan at once, whatever was planned: the goal before may have a plan under way."""
         self._active = ActiveGoal(goals, self._settings.replan_period, followed)
         self._replan.trigger()
@@ -208,14 +247,18 @@ class PlannerNode(ManagedNode):
             self._report.log(self._refusal)
         else:
             self._report.accept("goal_poses")
-            self._plan_for([PoseStamped(header=message.header, pose=pose) for pose in poses])
+            self._plan_for(
+                [PoseStamped(header=message.header, pose=pose) for pose in poses]
+            )
 
     # Planning
 
     async def _on_get_plan(self, request: Any, response: Any) -> Any:
         start = request.start if request.start.header.frame_id else None
         goals = [request.goal]
-        outcome = await self._answer(goals, self._requests.plan(start, goals, request.tolerance))
+        outcome = await self._answer(
+            goals, self._requests.plan(start, goals, request.tolerance)
+        )
         (response.plan,) = _paths(outcome, path_message)
         self._report.log(outcome)
         return response
@@ -243,7 +286,9 @@ class PlannerNode(ManagedNode):
             self._plan_publisher.publish(*_paths(outcome, path_bytes))
         self._display.show(outcome)
 
-    async def _plan_for_action(self, task: Task, given_up: GivenUp) -> tuple[Path, Outcome]:
+    async def _plan_for_action(
+        self, task: Task, given_up: GivenUp
+    ) -> tuple[Path, Outcome]:
         start, goals, planner_id, has_via_points = task
         planning = self._requests.plan(
             start,
@@ -263,7 +308,11 @@ class PlannerNode(ManagedNode):
         return path, outcome
 
     async def _ask_other_planner(
-        self, others: OtherPlanners, handle: Any, given_up: GivenUp, is_kept: Callable[[], bool]
+        self,
+        others: OtherPlanners,
+        handle: Any,
+        given_up: GivenUp,
+        is_kept: Callable[[], bool],
     ) -> Any:
         """Return another planner's answer to a goal, or the outcome if there is none."""
         goal = handle.request
@@ -277,7 +326,9 @@ class PlannerNode(ManagedNode):
                     is_kept=is_kept,
                 )
         except Exception as error:  # the node must survive
-            answer = Outcome("FAILED", f"the other planner could not be asked ({error!r})")
+            answer = Outcome(
+                "FAILED", f"the other planner could not be asked ({error!r})"
+            )
         if isinstance(answer, Outcome):
             self._report.note(answer)
             self._report.log(answer)
@@ -302,7 +353,9 @@ class PlannerNode(ManagedNode):
     async def _on_is_path_valid(self, request: Any, response: Any) -> Any:
         """Answer Nav2's IsPathValid: whether the robot can drive the rest of a path."""
         response.is_valid = False
-        has_success = hasattr(response, "success")  # with it, Nav2 needs the robot's pose
+        has_success = hasattr(
+            response, "success"
+        )  # with it, Nav2 needs the robot's pose
         try:
             checking = self._requests.invalid_poses(request, needs_robot=has_success)
             with self.answering():
@@ -319,12 +372,17 @@ class PlannerNode(ManagedNode):
         return response
 
     async def _answer(
-        self, goals: list[PoseStamped], planning: Planning, given_up: GivenUp = lambda: None
+        self,
+        goals: list[PoseStamped],
+        planning: Planning,
+        given_up: GivenUp = lambda: None,
     ) -> Outcome:
         """Plan, unless the node stops or the request is given up."""
         try:
             with self.answering():
-                outcome: Outcome = await unless(planning, lambda: self._refusal or given_up())
+                outcome: Outcome = await unless(
+                    planning, lambda: self._refusal or given_up()
+                )
         except RequestError as error:
             outcome = Outcome(error.status, str(error))
         except Exception as error:  # as when no memory is left: the node must survive
@@ -342,7 +400,9 @@ class PlannerNode(ManagedNode):
     def _look_soon(self, is_near: bool = True) -> None:
         """Look at what changed, or may have come, in `LOOK_PERIOD`, or else in `IDLE_PERIOD`."""
         nanoseconds = int(1e9 * (LOOK_PERIOD if is_near else IDLE_PERIOD))
-        if self._looks.timer_period_ns != nanoseconds:  # a timer that is reset wakes the node
+        if (
+            self._looks.timer_period_ns != nanoseconds
+        ):  # a timer that is reset wakes the node
             self._looks.timer_period_ns = nanoseconds
             self._looks.reset()
 
@@ -365,7 +425,10 @@ class PlannerNode(ManagedNode):
         if self._report.is_due():
             missing += ["the model is being loaded"] if self._model.loading else []
             fatal = self._model.planner is None and "model" in self._report.refused
-            values = {"state": self.state, **self._model.describe(self._settings.move_rule)}
+            values = {
+                "state": self.state,
+                **self._model.describe(self._settings.move_rule),
+            }
             values |= self._map.describe() if is_configured else {}
             self._report.publish(fatal, "; ".join(filter(None, missing)), values)
 

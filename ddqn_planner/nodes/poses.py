@@ -25,12 +25,21 @@ from ddqn_planner.nodes.conversions import (
 from ddqn_planner.nodes.report import Refusals, RequestError
 from ddqn_planner.nodes.runtime import STEADY, BaseNode, apt_install
 
-READ_PERIOD, TF_DEPTH = 0.5, 1000  # seconds between two reads, and messages that come meanwhile
-AGE_OF_FIRST_POSE = 1.0  # seconds that a pose may be older than the first transform heard
+READ_PERIOD, TF_DEPTH = (
+    0.5,
+    1000,
+)  # seconds between two reads, and messages that come meanwhile
+AGE_OF_FIRST_POSE = (
+    1.0  # seconds that a pose may be older than the first transform heard
+)
 SILENCE = 2.0  # seconds after which odometry that comes no more does not tell where the robot is
 REMEDY = f"; or install tf2_ros ({apt_install('tf2-ros-py')}), which transforms it"
 NEWEST = Time()
-TYPES = {"odom": Odometry, "initialpose": PoseWithCovarianceStamped, "goal_pose": PoseStamped}
+TYPES = {
+    "odom": Odometry,
+    "initialpose": PoseWithCovarianceStamped,
+    "goal_pose": PoseStamped,
+}
 
 
 def has_tf() -> bool:
@@ -41,8 +50,12 @@ def has_tf() -> bool:
 def check_source(parameter: str, value: str, others: str) -> None:
     """Raise a RuntimeError with the remedy if a parameter asks for TF without tf2_ros."""
     if value == "tf" and not has_tf():
-        missing = f"needs tf2_ros, and that is not installed: {apt_install('tf2-ros-py')}"
-        raise RuntimeError(f"{parameter} is 'tf', which {missing}, or set {parameter} to {others}")
+        missing = (
+            f"needs tf2_ros, and that is not installed: {apt_install('tf2-ros-py')}"
+        )
+        raise RuntimeError(
+            f"{parameter} is 'tf', which {missing}, or set {parameter} to {others}"
+        )
 
 
 class CheckedTransforms:
@@ -84,7 +97,9 @@ class Frames:
     """Transforms poses to the map's frame by TF, to which it listens from the first need on."""
 
     # `tolerance` returns how many seconds the newest transform may be old, or in the future.
-    def __init__(self, node: BaseNode, tolerance: Callable[[], float] = lambda: math.inf) -> None:
+    def __init__(
+        self, node: BaseNode, tolerance: Callable[[], float] = lambda: math.inf
+    ) -> None:
         self.available = has_tf()
         self._node, self._tolerance = node, tolerance
         self._listener: Any = None
@@ -111,14 +126,19 @@ class Frames:
         """Return where a frame's origin is now; ValueError if TF does not know it of now."""
         return transformed(PoseStamped(), self._lookup(map_frame, frame))
 
-    def _lookup(self, target: str, source: str, stamp: Time = NEWEST) -> TransformStamped:
+    def _lookup(
+        self, target: str, source: str, stamp: Time = NEWEST
+    ) -> TransformStamped:
         """Return the transform from a frame to another at a time, by default the newest."""
         self.listen()
         self._read()
         try:
             found = self._buffer.lookup_transform(target, source, stamp)
             of = Time.from_msg(found.header.stamp)
-            age, limit = (self._node.get_clock().now() - of).nanoseconds / 1e9, self._tolerance()
+            age, limit = (
+                (self._node.get_clock().now() - of).nanoseconds / 1e9,
+                self._tolerance(),
+            )
             # Static transforms have the stamp 0, and are never too old.
             if not of.nanoseconds or stamp.nanoseconds or abs(age) <= limit:
                 return found
@@ -128,19 +148,29 @@ class Frames:
             if stamp.nanoseconds:
                 newest = self._lookup(target, source)
                 later = (Time.from_msg(newest.header.stamp) - stamp).nanoseconds / 1e9
-                if 0 < later <= AGE_OF_FIRST_POSE:  # the pose is from before the node listened
+                if (
+                    0 < later <= AGE_OF_FIRST_POSE
+                ):  # the pose is from before the node listened
                     return newest
             why = "; ".join([str(error), *self._checked.refused.values()])
-        raise ValueError(f"no transform leads from {source!r} to {target!r} ({why}); publish one")
+        raise ValueError(
+            f"no transform leads from {source!r} to {target!r} ({why}); publish one"
+        )
 
     def listen(self) -> None:
         """Listen to TF from now on: most robots do not need it, and each message costs time."""
         if self._listener is None:
             import tf2_ros  # it takes a while
 
-            self._tf2_ros, self._buffer, self.began = tf2_ros, tf2_ros.Buffer(), time.monotonic()
+            self._tf2_ros, self._buffer, self.began = (
+                tf2_ros,
+                tf2_ros.Buffer(),
+                time.monotonic(),
+            )
             self._checked = CheckedTransforms(self._buffer, self._node)
-            self._listener = tf2_ros.TransformListener(self._checked, self._node, qos=TF_DEPTH)
+            self._listener = tf2_ros.TransformListener(
+                self._checked, self._node, qos=TF_DEPTH
+            )
             # No executor wakes for them, a hundred a second: they are read when they are needed.
             self._listener.group.can_execute = lambda _: False
             self._node.create_timer(READ_PERIOD, self._read, clock=STEADY)
@@ -149,7 +179,9 @@ class Frames:
     def _read(self) -> None:
         for subscription in (self._listener.tf_sub, self._listener.tf_static_sub):
             with subscription.handle:
-                take = partial(subscription.handle.take_message, subscription.msg_type, False)
+                take = partial(
+                    subscription.handle.take_message, subscription.msg_type, False
+                )
                 for message, _ in iter(take, None):
                     subscription.callback(message)
 
@@ -162,7 +194,9 @@ class Frames:
 
 def transform_problem(stamped: TransformStamped) -> str:
     """Return what is wrong with the numbers of a transform, and what to do; empty if nothing is."""
-    of_frames = f"the transform from {stamped.child_frame_id!r} to {stamped.header.frame_id!r}"
+    of_frames = (
+        f"the transform from {stamped.child_frame_id!r} to {stamped.header.frame_id!r}"
+    )
     turn = rotation(stamped.transform.rotation)
     if not turn.is_rounded:
         numbers = ", ".join(f"{number:.6g}" for number in turn)
@@ -200,12 +234,20 @@ def _turned(turn: Rotation, point: tuple[float, ...]) -> tuple[float, ...]:
     """Return p + 2 r × (r × p + w p), where r is the quaternion's vector and w its real part."""
     x, y, z, w = turn
     px, py, pz = point
-    a, b, c = y * pz - z * py + w * px, z * px - x * pz + w * py, x * py - y * px + w * pz
+    a, b, c = (
+        y * pz - z * py + w * px,
+        z * px - x * pz + w * py,
+        x * py - y * px + w * pz,
+    )
     return px + 2 * (y * c - z * b), py + 2 * (z * a - x * c), pz + 2 * (x * b - y * a)
 
 
 def listen(
-    node: BaseNode, topic: str, depth: int, refusals: Refusals, take: Callable[[PoseStamped], None]
+    node: BaseNode,
+    topic: str,
+    depth: int,
+    refusals: Refusals,
+    take: Callable[[PoseStamped], None],
 ) -> Subscription:
     """Hand each pose of a topic of `TYPES` to a function, whose ValueError refuses it."""
     message_type = TYPES[topic.rpartition("/")[2]]
@@ -227,7 +269,11 @@ class Places(Frames):
 
     # `frame` returns the map's; `plan` is called when there is a start to plan from at once.
     def __init__(
-        self, node: BaseNode, report: Refusals, frame: Callable[[], str], plan: Callable[[], None]
+        self,
+        node: BaseNode,
+        report: Refusals,
+        frame: Callable[[], str],
+        plan: Callable[[], None],
     ) -> None:
         super().__init__(node, lambda: float(node.value("transform_tolerance")))
         self._report, self._map_frame, self._plan = report, frame, plan
@@ -282,9 +328,13 @@ class Places(Frames):
         """Return the last pose in its own frame, by TF in the map's; or raise a RequestError."""
         if self.topic == "tf":
             try:
-                return self.origin_of(self._node.value("robot_frame"), self._map_frame())
+                return self.origin_of(
+                    self._node.value("robot_frame"), self._map_frame()
+                )
             except ValueError as error:
-                reason = f"the start is unknown: {error}, or set robot_frame or start_source"
+                reason = (
+                    f"the start is unknown: {error}, or set robot_frame or start_source"
+                )
                 raise RequestError("NO_START", reason, self.began) from None
         topic, is_set = self._subscription.topic_name, self.topic == "initialpose"
         problem, since = f"nothing came on {topic} in the map's frame", self._heard_from
@@ -292,9 +342,13 @@ class Places(Frames):
             problem, since = f"set it on {topic} (in RViz: 2D Pose Estimate)", -math.inf
         if self._pose is not None:  # its stamp may be that of another clock
             silent = (self._node.get_clock().now() - self._came).nanoseconds / 1e9
-            if is_set or silent <= max(self._node.value("transform_tolerance"), SILENCE):
+            if is_set or silent <= max(
+                self._node.value("transform_tolerance"), SILENCE
+            ):
                 return self._pose
             often = "publish it more often, set transform_tolerance"
             problem = f"nothing came on {topic} for {silent:.3g} s; {often}"
         remedy = "or set start_source, or give the request's start its frame"
-        raise RequestError("NO_START", f"the start is unknown; {problem}; {remedy}", since)
+        raise RequestError(
+            "NO_START", f"the start is unknown; {problem}; {remedy}", since
+        )

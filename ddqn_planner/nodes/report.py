@@ -14,7 +14,14 @@ from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell
 from ddqn_planner.nodes.runtime import BaseNode
-from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus, unknown_space
+from ddqn_planner.planning import (
+    Plan,
+    PlanMethod,
+    Planner,
+    PlanRequest,
+    PlanStatus,
+    unknown_space,
+)
 from ddqn_planner.planning.exact_paths import NO_PATH, ExactPath
 from ddqn_planner.planning.plan import PosePlan
 from ddqn_planner.planning.pose_planner import PoseRequest
@@ -24,7 +31,9 @@ Request = PlanRequest | PoseRequest
 PATIENCE = 5.0  # seconds in which a new listener hears a first map, odometry or TF, at a load of 20
 PERIOD = 0.9  # seconds until diagnostics are due when nothing changes: at the next look
 
-TOLERANCE = ", or a greater tolerance"  # does not help with several goals: none of them moves
+TOLERANCE = (
+    ", or a greater tolerance"  # does not help with several goals: none of them moves
+)
 ALL_GOALS = -1  # as in ComputePathThroughPoses
 REMEDIES = {
     PlanStatus.START_OUTSIDE_MAP: "set the start on the map",
@@ -56,10 +65,14 @@ class Outcome:
     plan: Plan = field(default_factory=lambda: Plan(PlanStatus.NO_PATH))
     goal: PoseStamped | None = None  # in the map's frame
     map_header: Header | None = None  # of the map that it was planned on
-    path: ExactPath = field(default=NO_PATH, compare=False)  # of a disc, between exact poses
+    path: ExactPath = field(
+        default=NO_PATH, compare=False
+    )  # of a disc, between exact poses
     is_dense: bool = False  # whether its path has a pose at least every cell
     header: Header = field(default_factory=Header)  # of its path
-    last_reached: int = ALL_GOALS  # of several goals, the index of the one where the path ends
+    last_reached: int = (
+        ALL_GOALS  # of several goals, the index of the one where the path ends
+    )
 
     @property
     def length(self) -> float:
@@ -69,8 +82,12 @@ class Outcome:
 
 NO_REQUEST = Outcome("NO_REQUEST", "no plan was asked for yet")
 WAYS = "with a lifecycle manager or `ros2 lifecycle set`"
-STOPPING = Outcome("NOT_ACTIVE", "the node is being stopped; start it again, and ask again")
-NOT_ACTIVE = Outcome("NOT_ACTIVE", f"the node is not active; configure and activate it, {WAYS}")
+STOPPING = Outcome(
+    "NOT_ACTIVE", "the node is being stopped; start it again, and ask again"
+)
+NOT_ACTIVE = Outcome(
+    "NOT_ACTIVE", f"the node is not active; configure and activate it, {WAYS}"
+)
 
 
 def reason_of(
@@ -105,7 +122,11 @@ def reason_of(
         on_map = filter(grid.contains, goals)
         is_goal = plan.status is PlanStatus.GOAL_OCCUPIED and not is_unknown
         if is_goal and not all(map(grid.is_obstacle, on_map)):
-            near = f"robot_radius, {robot_radius:g} m" if robot_radius else "the costmap allows"
+            near = (
+                f"robot_radius, {robot_radius:g} m"
+                if robot_radius
+                else "the costmap allows"
+            )
             near = "the robot's body allows" if has_body else near
             reason += f", nearer to an obstacle than {near}"
         if plan.status is PlanStatus.START_OCCUPIED and clearing:
@@ -118,18 +139,24 @@ def reason_of(
         length = plan.length
         how = f"by greedy steps, of at most {plan.bound:.3g} times the least cost"
         if math.isinf(plan.bound):
-            how = "kept, as there is none from the cell and heading nearest to the start"
+            how = (
+                "kept, as there is none from the cell and heading nearest to the start"
+            )
     elif plan.method is not PlanMethod.GREEDY:
         how = "searched for in the order of the Q field: the greedy steps were trapped"
     reason = f"a path of {length:.2f} cells{number}, {how}"
     if plan.extra_cost:
         reason += f", kept: its cost is {plan.extra_cost:+.1%} beside that of a new one"
     if plan.goal is not None and plan.goal not in goals and not several:
-        metres = math.dist(plan.goal, goals[0]) * grid.resolution  # as the tolerance counts
+        metres = (
+            math.dist(plan.goal, goals[0]) * grid.resolution
+        )  # as the tolerance counts
         why = unknown_space.goal_in_words(grid, goals[0]) or "is cut off"
         reason += f"; the goal {why} and moved {metres:.3g} m"
     if grid.is_obstacle(plan.path[0]):
-        reason += f"; the start is occupied: obstacles within {cleared} of it were ignored"
+        reason += (
+            f"; the start is occupied: obstacles within {cleared} of it were ignored"
+        )
     return reason
 
 
@@ -142,13 +169,17 @@ def reached(request: Request, plan: Plan) -> int:
 
 def _place(stamped: PoseStamped, cell: Cell) -> str:
     position = stamped.pose.position
-    return f"({position.x:.6g}, {position.y:.6g}) m in cell ({cell[0]:.6g}, {cell[1]:.6g})"
+    return (
+        f"({position.x:.6g}, {position.y:.6g}) m in cell ({cell[0]:.6g}, {cell[1]:.6g})"
+    )
 
 
 class Refusals:
     """What a node refused and has not accepted since, and why; it is logged when that changes."""
 
-    def __init__(self, node: BaseNode, on_change: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self, node: BaseNode, on_change: Callable[[], None] = lambda: None
+    ) -> None:
         self.node, self._on_change, self._due = node, on_change, 0.0
         self.refused: dict[str, str] = {}
         self.publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -185,14 +216,25 @@ class Refusals:
         """Return what a user reads of all that is refused."""
         return [f"{what} refused: {reason}" for what, reason in self.refused.items()]
 
-    def tell(self, what: str, level: bytes, message: str, values: Mapping[str, str]) -> None:
+    def tell(
+        self, what: str, level: bytes, message: str, values: Mapping[str, str]
+    ) -> None:
         """Publish diagnostics; topics' problems are in them, and logged once."""
         if problems := self.node.topic_problems():
-            level, message = max(level, DiagnosticStatus.WARN), "; ".join([message, *problems])
-        status = DiagnosticStatus(name=f"{self.node.get_fully_qualified_name()}: {what}")
+            level, message = (
+                max(level, DiagnosticStatus.WARN),
+                "; ".join([message, *problems]),
+            )
+        status = DiagnosticStatus(
+            name=f"{self.node.get_fully_qualified_name()}: {what}"
+        )
         status.level, status.message = level, message
-        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
-        self.publisher.publish(DiagnosticArray(header=self.node.header(), status=[status]))
+        status.values = [
+            KeyValue(key=key, value=value) for key, value in values.items()
+        ]
+        self.publisher.publish(
+            DiagnosticArray(header=self.node.header(), status=[status])
+        )
 
 
 class Report(Refusals):

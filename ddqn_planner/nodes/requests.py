@@ -20,7 +20,13 @@ from ddqn_planner.grid.footprint import read_footprint
 from ddqn_planner.grid.motions import HEADINGS
 from ddqn_planner.model import find_model
 from ddqn_planner.model.certificate import NO_CERTIFICATE
-from ddqn_planner.nodes.conversions import cell_from_pose, frame_of, moved, pose_of, poses_of
+from ddqn_planner.nodes.conversions import (
+    cell_from_pose,
+    frame_of,
+    moved,
+    pose_of,
+    poses_of,
+)
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.poses import Places
 from ddqn_planner.nodes.report import (
@@ -44,8 +50,12 @@ from ddqn_planner.planning.pose_paths import points_of
 from ddqn_planner.planning.pose_planner import PoseRequest
 from ddqn_planner.warm_up import warm_up
 
-HEADING = 2 * math.pi / HEADINGS  # radians that a robot turns until that is a reason to plan
-REST_AFTER = 1.0  # seconds until the rest is compiled: what waits for the model is planned first
+HEADING = (
+    2 * math.pi / HEADINGS
+)  # radians that a robot turns until that is a reason to plan
+REST_AFTER = (
+    1.0  # seconds until the rest is compiled: what waits for the model is planned first
+)
 THE_GOAL = "the goal"  # what errors call one
 UNCHANGED = Outcome("UNCHANGED", "the active goal needs no new plan")
 
@@ -56,9 +66,13 @@ T = TypeVar("T")
 class ActiveGoal:
     """Decides when to plan again, and what to publish; the table in docs/nodes.md has the rules."""
 
-    poses: list[PoseStamped]  # the last ``goal_pose``, or ``goal_poses``: the nearest one counts
+    poses: list[
+        PoseStamped
+    ]  # the last ``goal_pose``, or ``goal_poses``: the nearest one counts
     period: float  # seconds between looks if something changed
-    followed: Outcome | None = None  # the last one whose path was published for this goal
+    followed: Outcome | None = (
+        None  # the last one whose path was published for this goal
+    )
     last: Outcome = UNCHANGED
     next_look: float = 0.0
 
@@ -69,7 +83,9 @@ class ActiveGoal:
 
     def is_look_due(self, lacks_map: bool) -> bool:
         """Return whether it is time to look if something changed; the next plan does then."""
-        stopped = lacks_map and self.last.request is not None  # a costmap: its path is taken back
+        stopped = (
+            lacks_map and self.last.request is not None
+        )  # a costmap: its path is taken back
         return bool(self.poses) and (stopped or time.monotonic() >= self.next_look)
 
     def is_due(self, planner: Planner, request: Request, header: Header) -> bool:
@@ -99,7 +115,12 @@ class ActiveGoal:
 def _inputs_of(request: Request, header: Header | None) -> tuple[Any, ...]:
     """Return what a plan for the active goal depends on: map, place, and heading of the robot."""
     yaws = request.start[2:]  # of a body
-    return request.grid, header, request.cells[0], *(round(yaw / HEADING) for yaw in yaws)
+    return (
+        request.grid,
+        header,
+        request.cells[0],
+        *(round(yaw / HEADING) for yaw in yaws),
+    )
 
 
 def path_under_way(last: Outcome, request: Request, frame: str) -> Any:
@@ -150,10 +171,15 @@ class ModelSource:
             try:
                 planner, file = read_model(self._node.value("model"))
                 compiling = warm_up(planner, self._node.value("follow_trainer"))
-                gc.set_threshold(20_000)  # to compile and to plan makes hardly any garbage
+                gc.set_threshold(
+                    20_000
+                )  # to compile and to plan makes hardly any garbage
                 next(compiling)
             except Exception as error:
-                return None, f"{str(error) or repr(error)}; or set the parameter 'model'"
+                return (
+                    None,
+                    f"{str(error) or repr(error)}; or set the parameter 'model'",
+                )
             gc.freeze()  # a collection of all that would stop the node for 45 ms
             rest = threading.Timer(REST_AFTER, next, [compiling])
             rest.daemon = True  # no end of the process waits for it
@@ -199,9 +225,13 @@ class ModelSource:
             "model file": self.file,
             "move rule": rule or metadata.move_rule.value,
             "model move rule": metadata.move_rule.value,
-            "model sizes": ", ".join(f"{key} {size}" for key, size in metadata.sizes.items()),
+            "model sizes": ", ".join(
+                f"{key} {size}" for key, size in metadata.sizes.items()
+            ),
             "model training steps": str(metadata.steps),
-            "model certificate": str(network.certificate(metadata.move_rule) or NO_CERTIFICATE),
+            "model certificate": str(
+                network.certificate(metadata.move_rule) or NO_CERTIFICATE
+            ),
         }
 
     def forget(self) -> None:
@@ -348,7 +378,11 @@ class Requests:
             plans.append(await self._plan(planner, request))
         plan, number = joined(plans) if more else plans[0], len(plans)
         before, goal = poses[number - 1], poses[number + reached(request, plan)]
-        path = _exact_path(plans, request, [*poses[:number], goal]) if len(plan.path) else NO_PATH
+        path = (
+            _exact_path(plans, request, [*poses[:number], goal])
+            if len(plan.path)
+            else NO_PATH
+        )
         reason = reason_of(request, plan, before, goal, settings.robot_radius, path)
         last_reached = ALL_GOALS
         if more and not len(plan.path):
@@ -386,12 +420,16 @@ class Requests:
 
     async def _plan(self, planner: Planner, request: Any) -> Plan:
         is_of_poses = isinstance(request, PoseRequest)
-        steps: Any = planner.pose_steps(request) if is_of_poses else planner.steps(request)
+        steps: Any = (
+            planner.pose_steps(request) if is_of_poses else planner.steps(request)
+        )
         try:
             plan: Plan | None = next(steps)
         except ValueError as error:
             raise RequestError("MAP_RESOLUTION_UNSUPPORTED", str(error)) from None
-        while plan is None:  # a slow step follows; between two of them others have a turn
+        while (
+            plan is None
+        ):  # a slow step follows; between two of them others have a turn
             plan = await self.worker.run(next, steps)
         return plan
 
@@ -406,7 +444,9 @@ class Requests:
         if footprint := getattr(request, "footprint", ""):
             body = points_of(read_footprint(footprint), grid.resolution)
         if layer := getattr(request, "layer_name", ""):
-            missing = f"layer_name is {layer!r}, and the planner has one map without layers"
+            missing = (
+                f"layer_name is {layer!r}, and the planner has one map without layers"
+            )
             raise ValueError(f"{missing}; leave it empty")
         poses = poses_of(request.path, with_yaw=body is not None)
         frame = frame_of(request.path) or header.frame_id
@@ -436,7 +476,11 @@ class Requests:
             distance=getattr(request, "max_lookahead_distance", 0.0),
             clearing_radius=_clearing_radius(self.settings, grid),
         ).tolist()
-        return invalid[:1] if getattr(request, "stop_at_first_collision", True) else invalid
+        return (
+            invalid[:1]
+            if getattr(request, "stop_at_first_collision", True)
+            else invalid
+        )
 
     async def _inputs(self) -> tuple[Header, GridMap, Planner]:
         """Return the header of the map of now, this map ready to plan on, and the planner."""
@@ -488,10 +532,14 @@ def check_request(goals: list[PoseStamped], planner_id: str, known_id: str) -> N
         raise RequestError("NO_GOALS", "the request has no goal; give one or more")
     if planner_id not in ("", known_id):
         remedy = f"give {known_id!r} or '' as the planner_id, or set the parameter 'planner_id'"
-        raise RequestError("INVALID_PLANNER", f"there is no planner {planner_id!r}; {remedy}")
+        raise RequestError(
+            "INVALID_PLANNER", f"there is no planner {planner_id!r}; {remedy}"
+        )
 
 
-def _exact_path(plans: list[Plan], request: Any, poses: Sequence[PoseStamped]) -> ExactPath:
+def _exact_path(
+    plans: list[Plan], request: Any, poses: Sequence[PoseStamped]
+) -> ExactPath:
     """Return a disc's path along the plans that have one, through poses; none for a body."""
     legs = [plan.path for plan in plans if plan.path.size]
     if isinstance(request, PoseRequest):

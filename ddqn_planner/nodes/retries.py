@@ -38,7 +38,9 @@ class Retries:
     def __init__(self) -> None:
         self._failures: deque[Failure] = deque(maxlen=MOST_FAILURES)
 
-    def is_retry(self, goals: list[PoseStamped], costmap: int, resolution: float) -> bool:
+    def is_retry(
+        self, goals: list[PoseStamped], costmap: int, resolution: float
+    ) -> bool:
         """Return whether a request for the same last goal failed just now, or on this costmap."""
         for failure in self._failures:
             is_recent = time.monotonic() - failure.seconds < RETRY_WITHIN
@@ -53,7 +55,11 @@ class Retries:
         if outcome.request is None:
             return
         resolution = outcome.request.grid.resolution
-        others = [it for it in self._failures if _distance(it.last_goal, goals[-1]) > resolution]
+        others = [
+            it
+            for it in self._failures
+            if _distance(it.last_goal, goals[-1]) > resolution
+        ]
         self._failures = deque(others, MOST_FAILURES)
         if outcome.status in FAILURES:
             self._failures.append(Failure(goals[-1], costmap, time.monotonic()))

@@ -62,9 +62,14 @@ FAREWELL = 0.1  # seconds after an answer until its service may end, which would
 
 GREATEST_DEPTH = 2**31 - 1  # of a queue in DDS
 # What parameters may change of each subscription.
-OVERRIDABLE = [QoSPolicyKind[name] for name in ("HISTORY", "DEPTH", "DURABILITY", "RELIABILITY")]
+OVERRIDABLE = [
+    QoSPolicyKind[name] for name in ("HISTORY", "DEPTH", "DURABILITY", "RELIABILITY")
+]
 # What of a publisher's quality is less than what a subscription may ask for.
-MISFITS = ("durability", "volatile", "transient_local"), ("reliability", "best_effort", "reliable")
+MISFITS = (
+    ("durability", "volatile", "transient_local"),
+    ("reliability", "best_effort", "reliable"),
+)
 
 STOPPED = False, "the node is being stopped"  # of triggers that wait at a signal
 
@@ -93,7 +98,9 @@ class BaseNode(Node):
         super().__init__(name)
         # As tf2 has it. Another clock, by use_sim_time, counts as a jump, too.
         back = JumpThreshold(min_forward=None, min_backward=Duration(seconds=-1))
-        self._jumps = self.get_clock().create_jump_callback(back, post_callback=self._on_jump)
+        self._jumps = self.get_clock().create_jump_callback(
+            back, post_callback=self._on_jump
+        )
         self._declared = parameters
         self._declare(parameters)
         self.check_parameters({name: self.value(name) for name in parameters})
@@ -103,10 +110,15 @@ class BaseNode(Node):
 
     def _declare(self, parameters: Parameters) -> None:
         """Declare parameters with what the command line and its files say; warn of the rest."""
-        overrides = {p.name: p.value for p in self.handle.get_parameters(Parameter).values()}
+        overrides = {
+            p.name: p.value for p in self.handle.get_parameters(Parameter).values()
+        }
         known = {*parameters, *self.list_parameters([], 0).names}
         node = self.get_fully_qualified_name()
-        unread = [unread_names(overrides, known, node), *unread_sections(sys.argv, known, node)]
+        unread = [
+            unread_names(overrides, known, node),
+            *unread_sections(sys.argv, known, node),
+        ]
         for warning in filter(None, unread):
             self.get_logger().warning(warning)
         self._qualities = [name for name in overrides if name.startswith(QOS)]
@@ -115,7 +127,9 @@ class BaseNode(Node):
         for name, declared in parameters.items():
             value = values.get(name, declared.default)
             # With the override itself, rclpy ends with its own error for a whole number.
-            self.declare_parameter(name, value, declared.descriptor(), ignore_override=True)
+            self.declare_parameter(
+                name, value, declared.descriptor(), ignore_override=True
+            )
 
     def tell_unread_qualities(self) -> None:
         """Log once which qualities of service are for no subscription, when all are there."""
@@ -127,20 +141,29 @@ class BaseNode(Node):
     def _on_jump(self, jump: TimeJump) -> None:
         seconds = jump.delta.nanoseconds / 1e9
         what = f"jumped by {seconds:.6g} s" if seconds else "changed"
-        self.get_logger().warning(f"the clock {what}: transforms and odometry are forgotten")
+        self.get_logger().warning(
+            f"the clock {what}: transforms and odometry are forgotten"
+        )
         for forget in self.after_jump_back:
             forget()
 
     def _check(self, parameters: list[Parameter]) -> msg.SetParametersResult:
         try:
-            self.check_parameters({parameter.name: parameter.value for parameter in parameters})
+            self.check_parameters(
+                {parameter.name: parameter.value for parameter in parameters}
+            )
         except (ValueError, OSError, RuntimeError, MemoryError) as error:
-            return msg.SetParametersResult(successful=False, reason=str(error) or repr(error))
+            return msg.SetParametersResult(
+                successful=False, reason=str(error) or repr(error)
+            )
         return msg.SetParametersResult(successful=True)
 
     def check_parameters(self, new: dict[str, Any]) -> None:
         """Check new values beyond their types and ranges; an error refuses them all."""
-        read_all(self._declared, {n: value for n, value in new.items() if n in self._declared})
+        read_all(
+            self._declared,
+            {n: value for n, value in new.items() if n in self._declared},
+        )
 
     def value(self, name: str) -> Any:
         """Return the value of a parameter."""
@@ -185,11 +208,17 @@ class BaseNode(Node):
         try:
             parameters = [Parameter.from_parameter_msg(each) for each in messages]
         except ValueError as error:
-            raise ValueError(f"{error}; give one of rcl_interfaces/msg/ParameterType") from None
-        given = {each.name: each.value for each in parameters if each.name in self._declared}
+            raise ValueError(
+                f"{error}; give one of rcl_interfaces/msg/ParameterType"
+            ) from None
+        given = {
+            each.name: each.value for each in parameters if each.name in self._declared
+        }
         values = read_all(self._declared, given)
         return [
-            Parameter(each.name, value=values[each.name]) if each.name in values else each
+            Parameter(each.name, value=values[each.name])
+            if each.name in values
+            else each
             for each in parameters
         ]
 
@@ -219,14 +248,22 @@ class BaseNode(Node):
 
     def create_service(self, *arguments: Any, **options: Any) -> Service:
         """Create a service with the queue of `SERVICE_QUALITY`."""
-        return super().create_service(*arguments, **{"qos_profile": SERVICE_QUALITY, **options})
+        return super().create_service(
+            *arguments, **{"qos_profile": SERVICE_QUALITY, **options}
+        )
 
-    def create_trigger(self, name: str, handler: Callable[[], Any], **options: Any) -> None:
+    def create_trigger(
+        self, name: str, handler: Callable[[], Any], **options: Any
+    ) -> None:
         """Create a service; its handler returns whether it succeeds and a message, or awaits."""
 
-        async def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        async def answer(
+            _: Trigger.Request, response: Trigger.Response
+        ) -> Trigger.Response:
             with self.answering():
-                handling = unless(await_or_execute(handler), lambda: self.is_stopping and STOPPED)
+                handling = unless(
+                    await_or_execute(handler), lambda: self.is_stopping and STOPPED
+                )
                 response.success, response.message = await handling
             return response
 
@@ -247,18 +284,28 @@ class BaseNode(Node):
         def check_depth(quality: QoSProfile) -> msg.SetParametersResult:
             if not 0 <= quality.depth <= GREATEST_DEPTH:
                 parameter = f"qos_overrides.{name}.subscription.depth"
-                raise ValueError(f"{parameter} is {quality.depth}; give 0 to {GREATEST_DEPTH}")
+                raise ValueError(
+                    f"{parameter} is {quality.depth}; give 0 to {GREATEST_DEPTH}"
+                )
             return msg.SetParametersResult(successful=True)
 
         overriding = QoSOverridingOptions(OVERRIDABLE, callback=check_depth)
         options["qos_overriding_options"] = overriding
-        options["event_callbacks"] = SubscriptionEventCallbacks(use_default_callbacks=False)
+        options["event_callbacks"] = SubscriptionEventCallbacks(
+            use_default_callbacks=False
+        )
         quality = copy(qos_profile)  # rclpy writes what the parameters say into it
         try:
-            return super().create_subscription(msg_type, topic, callback, quality, **options)
+            return super().create_subscription(
+                msg_type, topic, callback, quality, **options
+            )
         except RuntimeError as error:
-            remedy = f"give qos_overrides.{name}.subscription values that ROS knows, or none"
-            raise RuntimeError(f"cannot subscribe to {name} ({error}); {remedy}") from None
+            remedy = (
+                f"give qos_overrides.{name}.subscription values that ROS knows, or none"
+            )
+            raise RuntimeError(
+                f"cannot subscribe to {name} ({error}); {remedy}"
+            ) from None
 
     def header(self, frame: str = "") -> Header:
         """Return the header of a message about now."""
@@ -275,12 +322,19 @@ class BaseNode(Node):
         for subscription in self.subscriptions:
             topic = subscription.topic_name
             publishers = [
-                (f"{each.node_namespace.rstrip('/')}/{each.node_name}", each.qos_profile)
+                (
+                    f"{each.node_namespace.rstrip('/')}/{each.node_name}",
+                    each.qos_profile,
+                )
                 for each in self.get_publishers_info_by_topic(topic)
             ]
             effect = EFFECTS_OF_SEVERAL_PUBLISHERS.get(subscription.msg_type)
             wanted_quality = subscription.qos_profile
-            heard = [name for name, offered in publishers if not _misfits(offered, wanted_quality)]
+            heard = [
+                name
+                for name, offered in publishers
+                if not _misfits(offered, wanted_quality)
+            ]
             if effect and len(heard) > 1:
                 names = ", ".join(sorted(heard))
                 yield (
@@ -300,7 +354,9 @@ def _misfits(offered: QoSProfile, asked: QoSProfile) -> list[tuple[str, str, str
     """Return why a publisher is not heard: policies, what they are and what is asked for."""
     misfits = []
     for policy, *misfit in MISFITS:
-        has, wanted = (getattr(quality, policy).name.lower() for quality in (offered, asked))
+        has, wanted = (
+            getattr(quality, policy).name.lower() for quality in (offered, asked)
+        )
         if [has, wanted] == misfit:
             misfits.append((policy, has, wanted))
     return misfits
@@ -378,12 +434,16 @@ def print_help(make_node: Callable[[], Node], parameters: Parameters) -> int:
         kind = Parameter.Type.from_parameter_value(default).name.lower()
         value = repr(default) if isinstance(default, str) else json.dumps(default)
         limits = parameters[name].limits
-        words = filter(None, (f"{kind}, default {value}", limits, "read-only" * read_only))
+        words = filter(
+            None, (f"{kind}, default {value}", limits, "read-only" * read_only)
+        )
         print(f"  {name}: {'; '.join(words)}\n      {description}")
     return 0
 
 
-def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | None = None) -> int:
+def spin_until_shutdown(
+    make_node: Callable[[], Node], parameters: Parameters | None = None
+) -> int:
     """Run one node until SIGINT or SIGTERM, or print help; return 1 if it cannot start."""
     if parameters and {"-h", "--help"} & {*sys.argv[1:]}:
         return unless_cut_off(lambda: print_help(make_node, parameters))
@@ -395,15 +455,26 @@ def spin_until_shutdown(make_node: Callable[[], Node], parameters: Parameters | 
         stop.listen(executor)
         unread = remove_ros_args(sys.argv)[1:]
         if parameters and unread:
-            remedy = "give settings after --ros-args, as in --ros-args -p robot_radius:=0.3"
-            get_logger("ddqn_planner").warning(f"{' '.join(unread)} is not read; {remedy}")
+            remedy = (
+                "give settings after --ros-args, as in --ros-args -p robot_radius:=0.3"
+            )
+            get_logger("ddqn_planner").warning(
+                f"{' '.join(unread)} is not read; {remedy}"
+            )
         node = make_node()
         if isinstance(node, BaseNode):
             node.tell_unread_qualities()
-    except (NameValidationException, ParameterException, RuntimeError, ValueError) as error:
+    except (
+        NameValidationException,
+        ParameterException,
+        RuntimeError,
+        ValueError,
+    ) as error:
         # rcl names neither the argument nor the line in some cases.
         has_read = rclpy.ok()
-        reason = str(error) if has_read else wrong_argument(sys.argv) or f"{error}; {SYNTAX}"
+        reason = (
+            str(error) if has_read else wrong_argument(sys.argv) or f"{error}; {SYNTAX}"
+        )
         get_logger("ddqn_planner").fatal(f"cannot start: {reason}")
         rclpy.try_shutdown()
         return 1

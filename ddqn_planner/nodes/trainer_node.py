@@ -49,11 +49,20 @@ FIRST_STEP_PATIENCE = 0.5  # seconds
 
 PARAMETERS: Final = {
     "learn_from": Declared(
-        "simulation", "Episodes, or the robot's drives", ["simulation", "driving"], read_only=True
+        "simulation",
+        "Episodes, or the robot's drives",
+        ["simulation", "driving"],
+        read_only=True,
     ),
-    "output_folder": Declared("runs/trainer", "A folder for the training or drives", "not empty"),
-    "map_file": Declared("", "Map with start and goal, as a file; '': topics", read_only=True),
-    "move_rule": Declared("corner_cutting", "Which diagonal moves are legal", MOVE_RULES),
+    "output_folder": Declared(
+        "runs/trainer", "A folder for the training or drives", "not empty"
+    ),
+    "map_file": Declared(
+        "", "Map with start and goal, as a file; '': topics", read_only=True
+    ),
+    "move_rule": Declared(
+        "corner_cutting", "Which diagonal moves are legal", MOVE_RULES
+    ),
     "seed": Declared(0, "Seed of the training", (0, 2**31 - 1)),
     **OF_MAPS,
     "episode_interval": Declared(10, "Publish each n-th episode", (1, 10**6)),
@@ -61,13 +70,19 @@ PARAMETERS: Final = {
     "pose_source": Declared(
         "odometry", "Driving: odom, or a transform", ["odometry", "tf"], read_only=True
     ),
-    "robot_frame": Declared("base_link", "Driving: the robot's frame, for tf", "not empty"),
+    "robot_frame": Declared(
+        "base_link", "Driving: the robot's frame, for tf", "not empty"
+    ),
     "robots": Declared(
         [""], "Driving: namespaces of robots; []: its own", NAMESPACES, read_only=True
     ),
     "nominal_speed": Declared(0.5, "Driving: m/s where nothing slows it down", SPEEDS),
-    "robot_width": Declared(0.5, "Driving: metres; places are squares of half of it", WIDTHS),
-    "experience": Declared("", "Driving: older experience with which a new folder begins"),
+    "robot_width": Declared(
+        0.5, "Driving: metres; places are squares of half of it", WIDTHS
+    ),
+    "experience": Declared(
+        "", "Driving: older experience with which a new folder begins"
+    ),
     **HYPER_PARAMETERS,
 }
 """The next ``~/start`` uses those that changed."""
@@ -92,7 +107,9 @@ class TrainerNode(BaseNode):
         self._is_driving = self.value("learn_from") == "driving"
         self._learned = "experience" if self._is_driving else "model"
         self._saved = self.create_publisher(String, f"~/{self._learned}_saved", LATCHED)
-        self._publisher = self.create_publisher(UInt8MultiArray, f"~/{self._learned}", LATCHED)
+        self._publisher = self.create_publisher(
+            UInt8MultiArray, f"~/{self._learned}", LATCHED
+        )
         # What learns, and has most services: this node, or what it hears of robots.
         self._learner: Any = self
         services = {"stop": self._on_stop, "replay": self._on_replay}
@@ -192,7 +209,10 @@ class TrainerNode(BaseNode):
     def _on_look(self) -> None:
         """Publish the state, what was refused and failed, and what is still missing."""
         values = self._learner.look()
-        problems = [*self.refusals.problems(), *filter(None, [self.save_error, self.error])]
+        problems = [
+            *self.refusals.problems(),
+            *filter(None, [self.save_error, self.error]),
+        ]
         level = DiagnosticStatus.ERROR if problems else DiagnosticStatus.OK
         if self._is_driving and self.map is None:
             problems.append(NO_MAP)
@@ -204,7 +224,10 @@ class TrainerNode(BaseNode):
     def _on_stop(self) -> tuple[bool, str]:
         """Stop what the node does."""
         was_stopped, said = self._learner.stop()
-        return was_stopped, f"{said}; the replay was stopped" if self._stop_replay() else said
+        return (
+            was_stopped,
+            f"{said}; the replay was stopped" if self._stop_replay() else said,
+        )
 
     def _on_replay(self) -> tuple[bool, str]:
         """Draw the first place of each recorded episode, its first two, and so on."""
@@ -227,7 +250,9 @@ class TrainerNode(BaseNode):
         except OSError as error:
             return False, f"no recorded episodes ({error}); call ~/start first"
         self._stop_replay()
-        self._replaying = self.create_timer(self.value("replay_period"), step, clock=STEADY)
+        self._replaying = self.create_timer(
+            self.value("replay_period"), step, clock=STEADY
+        )
         return True, "replaying the recorded episodes on ~/episode"
 
     def _stop_replay(self) -> bool:
@@ -240,11 +265,15 @@ class TrainerNode(BaseNode):
         if is_replayed or self._replaying is None:
             yaw = np.arctan2(*np.diff(positions, axis=0).T[::-1])
             yaw = np.append(yaw, yaw[-1] if len(yaw) else 0.0)
-            self._episodes.publish(conversions.path_bytes(positions, yaw, self.header(frame)))
+            self._episodes.publish(
+                conversions.path_bytes(positions, yaw, self.header(frame))
+            )
 
     def destroy_node(self) -> None:
         """Save what was learned, and destroy the node."""
-        if self._has_begun:  # newer releases destroy a node that cannot start, and some twice
+        if (
+            self._has_begun
+        ):  # newer releases destroy a node that cannot start, and some twice
             self._has_begun = False
             self._learner.stop()
             self._wait_for_training()
@@ -282,10 +311,16 @@ class TrainerNode(BaseNode):
         if place is None:
             raise ValueError(NO_MAP)
         if self._poses.keys() < {"start", "goal"}:
-            remedy = "publish initialpose and goal_pose, or set map_file to a map with both"
+            remedy = (
+                "publish initialpose and goal_pose, or set map_file to a map with both"
+            )
             raise ValueError(f"the start or the goal is unknown; {remedy}")
-        start, goal = (self._cell(name, self._poses[name], place) for name in ("start", "goal"))
-        from ddqn_planner.training.environment import Scenario  # these import gymnasium, torch
+        start, goal = (
+            self._cell(name, self._poses[name], place) for name in ("start", "goal")
+        )
+        from ddqn_planner.training.environment import (
+            Scenario,
+        )  # these import gymnasium, torch
         from ddqn_planner.training.run import TrainingRun
 
         scenario = Scenario(place.grid, start, goal, MoveRule(self.value("move_rule")))
@@ -308,7 +343,9 @@ class TrainerNode(BaseNode):
 
     def _train(self, run: TrainingRun, place: MapInFrame) -> None:
         """Train, in the worker, until the training has finished or is stopped."""
-        executor: Any = self.executor  # where replays begin: no episode comes between their steps
+        executor: Any = (
+            self.executor
+        )  # where replays begin: no episode comes between their steps
         try:
             for episodes in run.steps():
                 for episode in episodes:
@@ -319,7 +356,9 @@ class TrainerNode(BaseNode):
             ends = "stopped" if "stop" in run.asked else "finished"
         except Exception as error:  # the node must survive any error
             ends = "failed"
-            self.fail("the training failed, and ~/start continues from its checkpoint", error)
+            self.fail(
+                "the training failed, and ~/start continues from its checkpoint", error
+            )
         finally:
             run.close()
         self.state = ends
@@ -328,14 +367,20 @@ class TrainerNode(BaseNode):
     def _tell_saved(self, run: TrainingRun) -> None:
         self.tell_saved(run.model, run.model_path, run.save_error)
         if not run.save_error:
-            self.get_logger().info(f"step {run.saved_at} is saved in {run.checkpoint_path}")
+            self.get_logger().info(
+                f"step {run.saved_at} is saved in {run.checkpoint_path}"
+            )
 
-    def recorded(self, file: FilePath, place: MapInFrame) -> tuple[str, Iterator[Float64]]:
+    def recorded(
+        self, file: FilePath, place: MapInFrame
+    ) -> tuple[str, Iterator[Float64]]:
         """Return the episodes of a file, and the frame of the map that they are on."""
         if self._run is not None and self._run.folder == file.parent:
             place = self._run_map
         episodes = read_cells(file, self.value("episode_interval"))
-        return place.frame, (conversions.centres(cells, place.grid) for cells in episodes)
+        return place.frame, (
+            conversions.centres(cells, place.grid) for cells in episodes
+        )
 
     def look(self) -> dict[str, str]:
         """Return what the diagnostics say of it, each second."""

@@ -57,7 +57,9 @@ def exact_path(
     parts = [begin]
     for path, point in zip(legs, points[1:], strict=True):
         end = _point_in(grid, path[-1], point)
-        corners = _corners_between(path, grid, _in_cells(begin, grid), _in_cells(end, grid))
+        corners = _corners_between(
+            path, grid, _in_cells(begin, grid), _in_cells(end, grid)
+        )
         parts += [np.column_stack(grid.centres(*corners.T)), end]
         begin = end
     path_points = np.vstack(parts)
@@ -74,14 +76,18 @@ def dense(points: Float64, spacing: float) -> tuple[Float64, NDArray[np.int64]]:
     parts = np.ceil(lengths / spacing * (1 - MARGIN)).astype(np.int64)
     position = positions(parts)
     number = np.arange(len(points))
-    dense_points = np.column_stack([np.interp(position, number, axis) for axis in points.T])
+    dense_points = np.column_stack(
+        [np.interp(position, number, axis) for axis in points.T]
+    )
     return dense_points, position[:-1].astype(np.int64)
 
 
 def _point_in(grid: GridMap, cell: NDArray[np.int32], point: Point) -> Float64:
     """Return a point (2,) if it lies in a cell, else the cell's centre."""
     x, y = cell.tolist()
-    return np.array(point if grid.world_to_cell(*point) == (x, y) else grid.centres(x, y))
+    return np.array(
+        point if grid.world_to_cell(*point) == (x, y) else grid.centres(x, y)
+    )
 
 
 def _in_cells(points: Float64, grid: GridMap) -> Float64:
@@ -117,7 +123,9 @@ def _is_clear(begin: Any, end: Any, grid: GridMap) -> bool:
     """
     occupancy, forbidden, *_ = grid.for_kernels(MoveRule.ROBOT_SAFE)
     (x, y), (to_x, to_y) = begin.tolist(), end.tolist()
-    return _touches_none(float(x), float(y), float(to_x), float(to_y), occupancy, forbidden)
+    return _touches_none(
+        float(x), float(y), float(to_x), float(to_y), occupancy, forbidden
+    )
 
 
 @in_place
@@ -136,20 +144,26 @@ def _touches_none(
     step_y = (dy > MARGIN) - (dy < -MARGIN)
     # It lies between a diagonal move and one along its longer axis.
     actions = BITS[step_y + 1, step_x + 1]
-    actions |= BITS[step_y * (abs(dy) >= abs(dx)) + 1, step_x * (abs(dx) >= abs(dy)) + 1]
+    actions |= BITS[
+        step_y * (abs(dy) >= abs(dx)) + 1, step_x * (abs(dx) >= abs(dy)) + 1
+    ]
     left = min(x, to_x)
     right = max(x, to_x)
     bottom = min(y, to_y)
     top = max(y, to_y)
     slope = dy / dx if step_x != 0 else 0.0
-    for at_x in range(math.floor(left + 0.5 - MARGIN), math.floor(right + 0.5 + MARGIN) + 1):
+    for at_x in range(
+        math.floor(left + 0.5 - MARGIN), math.floor(right + 0.5 + MARGIN) + 1
+    ):
         # The part of the piece within this column, from one edge to the other.
         low, high = bottom, top
         if step_x != 0:
             entered = y + (max(at_x - 0.5 - MARGIN, left) - x) * slope
             left_at = y + (min(at_x + 0.5 + MARGIN, right) - x) * slope
             low, high = min(entered, left_at), max(entered, left_at)
-        for at_y in range(math.floor(low + 0.5 - MARGIN), math.floor(high + 0.5 + MARGIN) + 1):
+        for at_y in range(
+            math.floor(low + 0.5 - MARGIN), math.floor(high + 0.5 + MARGIN) + 1
+        ):
             is_inside = 0 <= at_x < width and 0 <= at_y < height
             if not is_inside or (at_x == to_column and at_y == to_row):
                 continue

@@ -21,18 +21,28 @@ from ddqn_planner.planning import kernels
 from ddqn_planner.planning.kernels import Known
 from ddqn_planner.planning.plan import Plan, PlanStatus
 
-Goals: TypeAlias = tuple[Cell, ...]  # different free cells, sorted: a path may end in any of them
+Goals: TypeAlias = tuple[
+    Cell, ...
+]  # different free cells, sorted: a path may end in any of them
 REPAIRED = 100  # cells that a repair may take back before a new field is begun
 # Visits of a new field per cell that a repair may take back, while both take turns: to take a cell
 # back takes longer, and it is visited again. See docs/benchmarks.md.
 VISITS = 8
 REPAIRED_SHARE = 0.02  # of the map's cells that a repair may take back
-CHANGED_SHARE = 0.02  # of the map's cells may have changed: with more, a new field is cheaper
-CACHE_BYTES = 2**23  # for a planner's Q fields: 3 of 500 x 500 cells, at 9 bytes per cell
-ALWAYS_KEPT = 3  # fields, whatever their size: to and fro, or the three of `Exploration`
+CHANGED_SHARE = (
+    0.02  # of the map's cells may have changed: with more, a new field is cheaper
+)
+CACHE_BYTES = (
+    2**23
+)  # for a planner's Q fields: 3 of 500 x 500 cells, at 9 bytes per cell
+ALWAYS_KEPT = (
+    3  # fields, whatever their size: to and fro, or the three of `Exploration`
+)
 MOST_KEPT = 64  # fields, however small: a request's map is compared with that of each
 OBJECTS = 4_000  # bytes of a field, its costs and its map beside their arrays
-SAME_PLACE = 0.01  # cells that a shift may be off whole ones: messages' resolution is float32
+SAME_PLACE = (
+    0.01  # cells that a shift may be off whole ones: messages' resolution is float32
+)
 
 
 class QField:
@@ -81,7 +91,9 @@ class QField:
     @cached_property
     def policy(self) -> NDArray[np.int8]:
         """(H, W) int8: the legal action of the greatest Q; -1 where that is -inf."""
-        legal_q = np.where(self.legal & (self.q > -np.inf), self.q, np.float32(-np.inf))  # no NaN
+        legal_q = np.where(
+            self.legal & (self.q > -np.inf), self.q, np.float32(-np.inf)
+        )  # no NaN
         best = np.where(legal_q.max(axis=0) > -np.inf, legal_q.argmax(axis=0), -1)
         return best.astype(np.int8)
 
@@ -89,7 +101,9 @@ class QField:
     def nbytes(self) -> int:
         """Memory of its arrays, with those that were asked for, bytes."""
         state = vars(self)  # to which other threads add
-        arrays = [state[name] for name in ("q", "legal", "value", "policy") if name in state]
+        arrays = [
+            state[name] for name in ("q", "legal", "value", "policy") if name in state
+        ]
         return sum(_owner(array).nbytes for array in arrays)
 
     def unmasked(self) -> QField:
@@ -128,7 +142,9 @@ class DistanceField(QField):
 
     costs: MoveCosts
 
-    def __init__(self, goals: Goals, grid: GridMap, costs: MoveCosts, move_rule: MoveRule) -> None:
+    def __init__(
+        self, goals: Goals, grid: GridMap, costs: MoveCosts, move_rule: MoveRule
+    ) -> None:
         self.grid, self.costs, self.move_rule = grid, costs, move_rule
         self.goal, self.goals = goals[0], goals
         self._lock = threading.RLock()
@@ -136,7 +152,11 @@ class DistanceField(QField):
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy has: it grows anew, under a lock of its own."""
         state = vars(self).copy()  # other threads add to it
-        return {name: value for name, value in state.items() if name not in ("known", "_lock")}
+        return {
+            name: value
+            for name, value in state.items()
+            if name not in ("known", "_lock")
+        }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Begin as a copy."""
@@ -173,7 +193,9 @@ class DistanceField(QField):
 
     def is_known(self, start: Cell) -> bool:
         """Return whether no more of the field is needed for the rollout from a start."""
-        known: Known | None = vars(self).get("known")  # None while another thread computes it
+        known: Known | None = vars(self).get(
+            "known"
+        )  # None while another thread computes it
         return known is not None and _is_final(known, self._number(start))
 
     def rollout(self, start: Cell, straight: bool = False) -> Plan:
@@ -185,7 +207,9 @@ class DistanceField(QField):
             distance, state, *_ = self.known
             if state[number] != kernels.CLOSED:
                 return Plan(PlanStatus.NO_PATH, move_rule=self.move_rule)
-            most = 2 + int(1.01 * distance[number])  # no move costs less than 1; sums are rounded
+            most = 2 + int(
+                1.01 * distance[number]
+            )  # no move costs less than 1; sums are rounded
             path = np.empty((min(most, distance.size), 2), np.int32)
             length = kernels.roll_out(distance, number, path, toward, self.costs[:7])
         return Plan(PlanStatus.SUCCEEDED, path[:length], move_rule=self.move_rule)
@@ -200,7 +224,9 @@ class DistanceField(QField):
         around = (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel()
         changed = (around[:, None] + self._number(cells.T)).astype(np.int32)
         changed = np.sort(changed[(changed > width) & (changed < last)])
-        changed = changed[np.diff(changed, prepend=0) > 0]  # a fifth of the time of `np.unique`
+        changed = changed[
+            np.diff(changed, prepend=0) > 0
+        ]  # a fifth of the time of `np.unique`
         # For one start, repair and new field take turns, each time with four times the limit: the
         # quicker one wins. The older field then begins anew, or else stays as it is.
         most = max(REPAIRED, int(REPAIRED_SHARE * self.grid.occupancy.size))
@@ -209,7 +235,9 @@ class DistanceField(QField):
             # A repair may look at cells anywhere, also where the older field has read no rows.
             self.costs.read(0, self.grid.height)
             taken = old._take()
-            while (repaired := kernels.take_back(taken, self.costs, changed, limit)) is None:
+            while (
+                repaired := kernels.take_back(taken, self.costs, changed, limit)
+            ) is None:
                 limit *= 4
                 if start and limit <= most and not self.grow(start, VISITS * limit):
                     continue
@@ -228,7 +256,9 @@ class DistanceField(QField):
     @cached_property
     def q(self) -> NDArray[np.float32]:  # type: ignore[override]
         """(8, H, W) float32: Q(s, a); -inf where no path to the goal begins with the action."""
-        return self._layer(kernels.q_of, np.full((8, self.costs.patch.size), -np.inf, np.float32))
+        return self._layer(
+            kernels.q_of, np.full((8, self.costs.patch.size), -np.inf, np.float32)
+        )
 
     @cached_property
     def legal(self) -> NDArray[np.bool_]:  # type: ignore[override]
@@ -238,7 +268,9 @@ class DistanceField(QField):
     @cached_property
     def value(self) -> NDArray[np.float32]:
         """(H, W) float32: the greatest Q of a legal move, and at the goal the greatest of all."""
-        value = self._layer(kernels.value_of, np.full(self.costs.patch.size, -np.inf, np.float32))
+        value = self._layer(
+            kernels.value_of, np.full(self.costs.patch.size, -np.inf, np.float32)
+        )
         greatest = value.max()
         for x, y in self.goals:
             value[y, x] = greatest
@@ -247,12 +279,16 @@ class DistanceField(QField):
     @cached_property
     def policy(self) -> NDArray[np.int8]:
         """(H, W) int8: the action of a rollout in each cell; -1 without one."""
-        return self._layer(kernels.policy_of, np.full(self.costs.patch.size, -1, np.int8))
+        return self._layer(
+            kernels.policy_of, np.full(self.costs.patch.size, -1, np.int8)
+        )
 
     @property
     def nbytes(self) -> int:
         """Memory, bytes: 9 per cell for what is known, and that of its arrays."""
-        known: Known | None = vars(self).get("known")  # None while another thread computes it
+        known: Known | None = vars(self).get(
+            "known"
+        )  # None while another thread computes it
         opened = 0 if known is None else known.opened.nbytes
         return 9 * self.costs.patch.size + opened + super().nbytes
 
@@ -263,7 +299,9 @@ def _is_final(known: Known, number: int) -> bool:
     return bool(not known.opened.size or (known.closed_is_final and closed))
 
 
-def network_field(network: QNetwork, grid: GridMap, goal: Cell, move_rule: MoveRule) -> QField:
+def network_field(
+    network: QNetwork, grid: GridMap, goal: Cell, move_rule: MoveRule
+) -> QField:
     """Return the field of a network that may judge moves wrong, or see the whole map at once."""
     if isinstance(network, PropagationQNetwork):
         costs = network.believed_costs(grid, move_rule)
@@ -278,7 +316,10 @@ def network_field(network: QNetwork, grid: GridMap, goal: Cell, move_rule: MoveR
 
 def shift_between(old: GridMap, new: GridMap) -> Cell | None:
     """Return by how many cells a map has moved in a newer one with the same layers, or None."""
-    if any((getattr(old, layer) is None) != (getattr(new, layer) is None) for layer in LAYERS):
+    if any(
+        (getattr(old, layer) is None) != (getattr(new, layer) is None)
+        for layer in LAYERS
+    ):
         return None
     return offset_between(old, new)
 
@@ -302,7 +343,10 @@ def overlap(old: GridMap, new: GridMap, shift: Cell) -> tuple[Box, Box]:
     sizes = zip(shift[::-1], old.occupancy.shape, new.occupancy.shape, strict=True)
     # Where a box ends beyond an array, NumPy cuts it.
     sides = [
-        (slice(max(-by, 0), max(new_size - by, 0)), slice(max(by, 0), max(old_size + by, 0)))
+        (
+            slice(max(-by, 0), max(new_size - by, 0)),
+            slice(max(by, 0), max(old_size + by, 0)),
+        )
         for by, old_size, new_size in sizes
     ]
     before, after = zip(*sides, strict=True)
@@ -320,9 +364,13 @@ def changed_cells(
     most = CHANGED_SHARE * new.occupancy.size
     for box in [whole] if patches is None else patches:
         rows, columns = box
-        number = np.flatnonzero(new.differs(old, box) if differs is None else differs(box))
+        number = np.flatnonzero(
+            new.differs(old, box) if differs is None else differs(box)
+        )
         most -= len(number)
-        if most < 0:  # before their places are looked up: experience changes most of a map
+        if (
+            most < 0
+        ):  # before their places are looked up: experience changes most of a map
             return None
         # With few of many, sooner than `np.nonzero`.
         y, x = np.divmod(number, columns.stop - columns.start)
@@ -349,16 +397,25 @@ class FieldCache:
 
     def _of_rule(self, rule: MoveRule) -> list[DistanceField]:
         """Return the fields of distances that are kept for a move rule, used last first."""
-        fields = [field for field in self._kept[::-1] if isinstance(field, DistanceField)]
+        fields = [
+            field for field in self._kept[::-1] if isinstance(field, DistanceField)
+        ]
         return [field for field in fields if field.move_rule is rule]
 
     def find(self, grid: GridMap, goals: Goals, rule: MoveRule) -> QField | None:
         """Return the field of a map toward the nearest of some goals if it is kept, else None."""
         for field in self._kept:
-            if field.goals == goals and field.move_rule is rule and grid.same_cells(field.grid):
+            if (
+                field.goals == goals
+                and field.move_rule is rule
+                and grid.same_cells(field.grid)
+            ):
                 field.grid = grid  # it may lie elsewhere
                 field.shared = _shared_arrays(field)
-                self._kept = [*(other for other in self._kept if other is not field), field]
+                self._kept = [
+                    *(other for other in self._kept if other is not field),
+                    field,
+                ]
                 return field
         return None
 
@@ -368,7 +425,10 @@ class FieldCache:
             if grid.same_cells(field.grid):
                 return field.costs
             boxes = grid.patches_since(field.grid)
-            if boxes is not None and (costs := field.costs.after(grid, boxes)) is not None:
+            if (
+                boxes is not None
+                and (costs := field.costs.after(grid, boxes)) is not None
+            ):
                 return costs
         return self.network.move_costs(grid, rule)
 

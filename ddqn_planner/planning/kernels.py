@@ -21,13 +21,19 @@ UNREACHED, OPEN, CLOSED, MARKED = 0, 1, 2, 4
 
 AT_GOAL: Final = 5e-324  # the goal's distance: not 0, and as good as 0 in every sum
 CAPACITY = 4.0  # cells of a bucket, at first, per cell of a square map's side
-BUCKETS: Final = 2  # per unit of cost; more mean fewer visits of cells that a start does not need
-SAME: Final = 1 + 1e-12  # paths cost the same up to this factor: sums of floats are rounded
+BUCKETS: Final = (
+    2  # per unit of cost; more mean fewer visits of cells that a start does not need
+)
+SAME: Final = (
+    1 + 1e-12
+)  # paths cost the same up to this factor: sums of floats are rounded
 
 MOVE_X, MOVE_Y = MOVES.T.copy()
 
 # The lowest bit of a byte that is set.
-FIRST = np.array([0] + [(bits & -bits).bit_length() - 1 for bits in range(1, 256)], np.uint64)
+FIRST = np.array(
+    [0] + [(bits & -bits).bit_length() - 1 for bits in range(1, 256)], np.uint64
+)
 # Unsigned, as numba then looks for no index that counts from the end.
 ONE, ACTIONS, OF_ACTION, AFTER = np.array([1, 8, VALUES, 8 * VALUES], np.uint64)
 
@@ -49,7 +55,9 @@ class Known(NamedTuple):
 def _uphill(cell: Any, after: Any, action: Any, multiplier: Any, uphill: Any) -> Any:
     """Return the multipliers of an action's cells where it may lead uphill, added."""
     here = np.float64(multiplier[cell]) * UPHILL[np.uint64(uphill[cell]), action]
-    return here + np.float64(multiplier[after]) * UPHILL[np.uint64(uphill[after]), action]
+    return (
+        here + np.float64(multiplier[after]) * UPHILL[np.uint64(uphill[after]), action]
+    )
 
 
 # Kernels take the first fields of `MoveCosts` as a plain tuple, which numba knows sooner.
@@ -61,12 +69,16 @@ def cost_of(cell: int, action: int, costs: Any) -> Any:
     after = np.uint64(cell + MOVE_Y[action] * width + MOVE_X[action])
     if multiplier.size > 0:
         if uphill.size > 0:
-            both = _uphill(np.uint64(cell), after, np.uint64(action), multiplier, uphill)
+            both = _uphill(
+                np.uint64(cell), after, np.uint64(action), multiplier, uphill
+            )
             return np.float64(cost) * both / 2
         return cost * (np.float64(multiplier[np.uint64(cell)]) + multiplier[after]) / 2
     if terms.size > 0:
         place = np.uint64(action) * OF_ACTION
-        cost *= terms[place + value[np.uint64(cell)]] + terms[place + AFTER + value[after]]
+        cost *= (
+            terms[place + value[np.uint64(cell)]] + terms[place + AFTER + value[after]]
+        )
     return np.float64(cost)
 
 
@@ -80,7 +92,10 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
     # No path reaches cell 0, of the border, so all of the map is visited: without lower bounds
     # (Dijkstra), and with one bucket per unit, as no move costs less than 1.
     least = costs.least * (1 - 1e-7) if start else 0.0  # whatever the rounding
-    bounds, buckets = (costs.straight * least, costs.diagonal * least), BUCKETS if start else 1
+    bounds, buckets = (
+        (costs.straight * least, costs.diagonal * least),
+        BUCKETS if start else 1,
+    )
     distance, state, opened, is_final = known
     # A power of 2, so that a slot takes no division.
     ring = 1 << int((costs.highest + bounds[1]) * buckets + 2).bit_length()
@@ -91,7 +106,9 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
     is_stopped = True
     while is_stopped:
         order = np.empty(opened.size, np.int64)
-        count = _order(distance, state, opened, order, (start, bounds, buckets, costs.width))
+        count = _order(
+            distance, state, opened, order, (start, bounds, buckets, costs.width)
+        )
         opened, order = opened[:count], order[:count]
         if count > 1:
             first = np.argsort(order)
@@ -114,12 +131,17 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
     return Known(distance, state, opened, is_final), limit >= 0 or not opened.size
 
 
-def _rows_around(opened: NDArray[np.int32], start: int, costs: MoveCosts) -> tuple[int, int]:
+def _rows_around(
+    opened: NDArray[np.int32], start: int, costs: MoveCosts
+) -> tuple[int, int]:
     """Return the rows of the map to read before a field grows: the first one, and their end."""
     height = costs.patch.size // costs.width - 2
     if not start or costs.rows is None or not opened.size:
         return 0, height
-    rows = [cell // costs.width - 1 for cell in (start, int(opened.min()), int(opened.max()))]
+    rows = [
+        cell // costs.width - 1
+        for cell in (start, int(opened.min()), int(opened.max()))
+    ]
     return min(rows) - MARGIN, max(rows) + 1 + MARGIN
 
 
@@ -259,7 +281,10 @@ def take_back(
     """Take back what changed moves no longer support; None, and nothing, if it is too much."""
     # `changed` has all cells whose own moves changed (Ramalingam and Reps 1996; LPA*, Koenig and
     # Likhachev 2002, is the same for one start).
-    lost, waiting = np.empty(limit, np.int32), np.empty(changed.size + 8 * limit, np.int32)
+    lost, waiting = (
+        np.empty(limit, np.int32),
+        np.empty(changed.size + 8 * limit, np.int32),
+    )
     waiting[: changed.size] = changed
     number = _take_back(known.distance, known.state, changed, lost, waiting, costs[:7])
     opened = np.concatenate([known.opened, waiting[: max(number, 0)]])
@@ -267,7 +292,9 @@ def take_back(
 
 
 @in_place
-def _take_back(distance: Any, state: Any, changed: Any, lost: Any, waiting: Any, costs: Any) -> int:
+def _take_back(
+    distance: Any, state: Any, changed: Any, lost: Any, waiting: Any, costs: Any
+) -> int:
     """Do the work of `take_back`; return how many cells it opened, the first ones of `waiting`."""
     first, end, count, judged, opened = 0, changed.size, 0, 0, 0
     while first < end or judged < count + changed.size:
@@ -326,7 +353,10 @@ def roll_out(distance: Any, cell: int, path: Any, toward: Any, costs: Any) -> in
         for action in range(8):
             after = distance[np.uint64(cell + MOVE_Y[action] * width + MOVE_X[action])]
             if 0 < after < enough:
-                ahead_x, ahead_y = x + MOVE_X[action] - from_x, y + MOVE_Y[action] - from_y
+                ahead_x, ahead_y = (
+                    x + MOVE_X[action] - from_x,
+                    y + MOVE_Y[action] - from_y,
+                )
                 aside = abs(ahead_x * (to_y - from_y) - ahead_y * (to_x - from_x))
                 if aside < least and after + cost_of(cell, action, costs) <= enough:
                     least, best = aside, action

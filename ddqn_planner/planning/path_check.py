@@ -59,9 +59,13 @@ def invalid_poses(
         points = np.concatenate(body)
         bits = closed.view(np.uint8)
         numbers = range(first, end)
-        return np.array([n for n in numbers if touches(path[n : n + 1], points, bits)], np.int64)
+        return np.array(
+            [n for n in numbers if touches(path[n : n + 1], points, bits)], np.int64
+        )
     x, y, _ = poses[first:end].T
-    cells = np.floor(np.column_stack(grid.in_cells(x, y)))  # float64: they may be far away
+    cells = np.floor(
+        np.column_stack(grid.in_cells(x, y))
+    )  # float64: they may be far away
     is_invalid = _is_closed(cells, closed)
     cell = None if robot is None else grid.world_to_cell(*robot)
     if cell is not None and grid.contains(cell) and not grid.is_free(cell):
@@ -89,7 +93,11 @@ def _closed_cells(
     if unknown is not None:
         closed = closed | unknown
     if max_cost < LETHAL:
-        cost = np.zeros(closed.shape) if grid.cost is None else COST_STEP * np.maximum(grid.cost, 0)
+        cost = (
+            np.zeros(closed.shape)
+            if grid.cost is None
+            else COST_STEP * np.maximum(grid.cost, 0)
+        )
         closed = closed | (np.where(grid.occupancy, INSCRIBED, cost) >= max_cost)
     return closed
 

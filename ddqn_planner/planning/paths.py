@@ -96,7 +96,9 @@ def _search(
 # The way out, and the goals that are left
 
 
-def way_and_ends(request: PlanRequest, goals: Goals) -> tuple[tuple[Cell, ...], Goals] | PlanStatus:
+def way_and_ends(
+    request: PlanRequest, goals: Goals
+) -> tuple[tuple[Cell, ...], Goals] | PlanStatus:
     """Return the way to the first free cell and where a path can end, or why there is none."""
     grid, start, rule = request.grid, request.start, request.move_rule
     candidates = [(np.array(goals), len(goals))] if goals else []
@@ -115,7 +117,9 @@ def way_and_ends(request: PlanRequest, goals: Goals) -> tuple[tuple[Cell, ...], 
     return PlanStatus.NO_PATH if goals else PlanStatus.GOAL_OCCUPIED
 
 
-def obstacles_in_the_way(grid: GridMap, start: Cell, clearing_radius: float) -> Occupancy:
+def obstacles_in_the_way(
+    grid: GridMap, start: Cell, clearing_radius: float
+) -> Occupancy:
     """Return (H, W) bool: the obstacles that count for a start, which may be one itself."""
     # The robot stands there, so it and those within the radius are none.
     obstacles = grid.occupancy if grid.obstacles is None else grid.obstacles
@@ -158,7 +162,9 @@ def _near_map(cells: NDArray[np.int32], grid: GridMap) -> NDArray[np.int32]:
     return near
 
 
-def rest_of_path(path: Cells, robot: Cell, grid: GridMap, move_rule: MoveRule | str) -> Path:
+def rest_of_path(
+    path: Cells, robot: Cell, grid: GridMap, move_rule: MoveRule | str
+) -> Path:
     """Return what is left of a path from a robot's cell on, (N, 2): empty if it is too far."""
     cells = np.asarray(path, dtype=np.int32).reshape(-1, 2)
     if not len(cells) or not grid.is_free(robot):
@@ -189,14 +195,19 @@ def keep_or_switch(request: PlanRequest, new: Path) -> tuple[Path, float | None]
     # The rest may end at the new path's end or at other goals, and cost more by the threshold.
     grid, rule, (x, y) = request.grid, request.move_rule, new[0].tolist()
     rest = rest_of_path(request.under_way, (x, y), grid, rule)
-    if not len(rest) or rest[-1].tolist() not in [new[-1].tolist(), *map(list, request.goals)]:
+    if not len(rest) or rest[-1].tolist() not in [
+        new[-1].tolist(),
+        *map(list, request.goals),
+    ]:
         return new, None
     way = straightened(rest, grid, rule) if request.simplified else rest
     stands, cost, new_cost = (cost_along(path, grid, rule) for path in (rest, way, new))
     most = (1 + request.switch_threshold) * new_cost * SAME_COST
     if cost > most:
         return new, None
-    if stands > most:  # it was pulled straight through what has opened: that is a new path
+    if (
+        stands > most
+    ):  # it was pulled straight through what has opened: that is a new path
         return way, None
     return way, cost / new_cost - 1 if new_cost else 0.0
 

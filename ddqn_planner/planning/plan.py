@@ -49,7 +49,9 @@ class PlanRequest:
     tolerance: float = 0.0
     simplified: bool = False
     under_way: Cells = field(default=(), compare=False)  # what the robot follows
-    switch_threshold: float = 0.0  # the share by which the rest of it may cost more than a new path
+    switch_threshold: float = (
+        0.0  # the share by which the rest of it may cost more than a new path
+    )
     start_clearing_radius: float = 0.0
 
     @property
@@ -113,14 +115,22 @@ class Plan:
 
     def __post_init__(self) -> None:
         path = self.path
-        if not isinstance(path, np.ndarray) or path.dtype != np.int32:  # cells do as well
-            path = numbers("the path", path, between=(-(2**31), 2**31 - 1)).astype(np.int32)
+        if (
+            not isinstance(path, np.ndarray) or path.dtype != np.int32
+        ):  # cells do as well
+            path = numbers("the path", path, between=(-(2**31), 2**31 - 1)).astype(
+                np.int32
+            )
         if path.size and path.shape[1:] != (2,):
             raise ValueError(f"the path has shape {path.shape}; give (N, 2)")
         path = path.reshape(-1, 2)
         path.flags.writeable = False
         object.__setattr__(self, "path", path)
-        for name, kind in (("status", PlanStatus), ("method", PlanMethod), ("move_rule", MoveRule)):
+        for name, kind in (
+            ("status", PlanStatus),
+            ("method", PlanMethod),
+            ("move_rule", MoveRule),
+        ):
             if type(value := getattr(self, name)) is not kind:
                 object.__setattr__(self, name, kind(value))
         if not self.reason:
@@ -161,8 +171,12 @@ class PosePlan(Plan):
     # (N, 3): x, y in metres and yaw in radians, -pi to pi, in the map frame, from start to goal, at
     # most half a cell apart; empty unless the status is SUCCEEDED.
     poses: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)))
-    driven: float = 0.0  # the length of the origin's way, in cells, whatever the direction
-    bound: float = 1.0  # the proved ratio of the cost to the least one, 1.0 when it is the least
+    driven: float = (
+        0.0  # the length of the origin's way, in cells, whatever the direction
+    )
+    bound: float = (
+        1.0  # the proved ratio of the cost to the least one, 1.0 when it is the least
+    )
 
     @property
     def length(self) -> float:

@@ -12,7 +12,14 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
-from ddqn_planner.grid.arguments import Cells, as_cell, as_flag, as_number, as_pose, listed
+from ddqn_planner.grid.arguments import (
+    Cells,
+    as_cell,
+    as_flag,
+    as_number,
+    as_pose,
+    listed,
+)
 from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model, save_model
 from ddqn_planner.planning import unknown_space
@@ -55,7 +62,9 @@ class Planner:
         self.network = network
         self.metadata = metadata
         self.fields = FieldCache(network)
-        self.pose_planner = PosePlanner(network) if hasattr(network, "motions") else None
+        self.pose_planner = (
+            PosePlanner(network) if hasattr(network, "motions") else None
+        )
 
     @classmethod
     def load(cls, model: str | Path) -> Planner:
@@ -69,7 +78,9 @@ class Planner:
         """Save the model to a file for `load`; after an OSError, an old file is unchanged."""
         save_model(path, self.network, self.metadata)
 
-    def q_field(self, grid: GridMap, goal: Cell, move_rule: MoveRule | str | None = None) -> QField:
+    def q_field(
+        self, grid: GridMap, goal: Cell, move_rule: MoveRule | str | None = None
+    ) -> QField:
         """Return the Q field of a map toward a goal, a free cell, computed or from the cache.
 
         The move rule is by default the one that the model was trained for. A goal that is not free,
@@ -78,9 +89,13 @@ class Planner:
         check_grid(grid)
         goal, rule = as_cell(goal, "the goal"), self._rule(move_rule)
         if self.pose_planner is not None:
-            raise ValueError(f"{HAS_BODY}: there is no Q field of cells; use plan_poses")
+            raise ValueError(
+                f"{HAS_BODY}: there is no Q field of cells; use plan_poses"
+            )
         if not grid.is_free(goal):
-            raise ValueError(f"the goal {goal} is not a free cell of the map; give another")
+            raise ValueError(
+                f"the goal {goal} is not a free cell of the map; give another"
+            )
         if not self.network.supports((grid.height, grid.width)):
             problem = f"the model was not trained for maps of {grid.width} x {grid.height} cells"
             raise ValueError(f"{problem}; train one on such a map")
@@ -232,13 +247,17 @@ class Planner:
         metres, radians = _tolerance_of_poses(tolerance)
         least = as_number("the bound", bound, 1, math.inf, "1 or more")
         goals = _poses_of_goals(goal)
-        request = PoseRequest(grid, as_pose("the start", start), goals, (metres, radians), least)
+        request = PoseRequest(
+            grid, as_pose("the start", start), goals, (metres, radians), least
+        )
         return last_step(self.pose_steps(request))
 
     def pose_steps(self, request: PoseRequest) -> Iterator[PosePlan | None]:
         """Yield None before each slow step, and last the plan of `plan_poses`."""
         if self.pose_planner is None:
-            raise ValueError("the model knows no body; give one of ddqn-planner train-robot")
+            raise ValueError(
+                "the model knows no body; give one of ddqn-planner train-robot"
+            )
         hopes = request.grid.exploration
         used = request.grid if hopes is None else hopes.safe
         for plan in self.pose_planner.steps(replace(request, grid=used)):
@@ -251,7 +270,9 @@ class Planner:
                 plan = replace(plan, cost=(plan.cost or 0.0) * seconds / hoped)
             yield plan
 
-    def _answer(self, grid: GridMap, start: Cell, goals: list[Cell], how: tuple[Any, ...]) -> Plan:
+    def _answer(
+        self, grid: GridMap, start: Cell, goals: list[Cell], how: tuple[Any, ...]
+    ) -> Plan:
         """Check what a user asks for, and plan."""
         move_rule, method, tolerance, simplified, radius = how
         check_grid(grid)
@@ -276,7 +297,9 @@ class Planner:
         for plan in _with_plan_last(self._explain(request)):
             ms += 1e3 * (time.perf_counter() - began)
             if plan is not None:
-                vars(plan)["field_ms"] = ms - plan.rollout_ms  # frozen, but nobody else has it yet
+                vars(plan)["field_ms"] = (
+                    ms - plan.rollout_ms
+                )  # frozen, but nobody else has it yet
             yield plan
             began = time.perf_counter()
 
@@ -294,12 +317,16 @@ class Planner:
         grid, rule, hopes = request.grid, request.move_rule, request.grid.exploration
         assert hopes is not None
         plan = yield from self._find(replace(request, grid=hopes.bold))
-        if plan.path.size and plan.extra_cost is None:  # one under way was judged when it was new
+        if (
+            plan.path.size and plan.extra_cost is None
+        ):  # one under way was judged when it was new
             best = yield from self._find(replace(request, under_way=()))
             longest = (1 + hopes.share) * (best.cost or math.inf) * SAME_COST
             if _cost(plan.path, grid, rule) > longest:
                 plan = yield from self._find(replace(request, grid=hopes.safe))
-        return replace(plan, cost=_cost(plan.path, grid, rule)) if plan.path.size else plan
+        return (
+            replace(plan, cost=_cost(plan.path, grid, rule)) if plan.path.size else plan
+        )
 
     def _refusal(self, request: PlanRequest, free: Goals) -> PlanStatus | None:
         """Return why there is no path, where one look at start and free goals says so."""
@@ -333,7 +360,9 @@ class Planner:
                 goals = self._nearest_alone(request, goals)
             elif costs is not None and goals and grid.is_free(start):
                 field = self.fields.get(grid, goals, rule, start, costs)
-                while isinstance(field, DistanceField) and not field.grow(start, VISITS):
+                while isinstance(field, DistanceField) and not field.grow(
+                    start, VISITS
+                ):
                     yield
         way_out: tuple[Cell, ...] = (start,)
         began = time.perf_counter()
@@ -354,7 +383,9 @@ class Planner:
             if not plan.path.size and request.method is PlanMethod.ASTAR_FALLBACK:
                 yield
                 began = time.perf_counter()
-                cells = np.array(search(way_out[-1], field.goal, grid, rule, field.value))
+                cells = np.array(
+                    search(way_out[-1], field.goal, grid, rule, field.value)
+                )
                 plan = Plan(PlanStatus.SUCCEEDED, cells, PlanMethod.ASTAR_FALLBACK)
         if plan.path.size:
             return _dressed(request, plan, way_out, began)
@@ -368,7 +399,9 @@ class Planner:
         return nearest.cells[-1:] if nearest else goals[:1]
 
 
-def _dressed(request: PlanRequest, found: Plan, way_out: tuple[Cell, ...], began: float) -> Plan:
+def _dressed(
+    request: PlanRequest, found: Plan, way_out: tuple[Cell, ...], began: float
+) -> Plan:
     """Return the plan by a path that was found: straight, or by the one under way."""
     grid, rule = request.grid, request.move_rule
     path, cost, extra_cost = found.path, None, None
@@ -406,9 +439,14 @@ def last_step(steps: Iterator[AnyPlan | None]) -> AnyPlan:
 
 def _tolerance_of_poses(tolerance: Any) -> tuple[float, float]:
     remedy = "give two numbers (metres, radians), each 0 or more"
-    if isinstance(tolerance, str) or len(values := listed(tolerance, "the tolerance", remedy)) != 2:
+    if (
+        isinstance(tolerance, str)
+        or len(values := listed(tolerance, "the tolerance", remedy)) != 2
+    ):
         raise ValueError(f"the tolerance is {tolerance!r}; {remedy}")
-    metres, radians = (as_number("the tolerance", one, 0, math.inf, remedy[5:]) for one in values)
+    metres, radians = (
+        as_number("the tolerance", one, 0, math.inf, remedy[5:]) for one in values
+    )
     return metres, radians
 
 

@@ -13,15 +13,25 @@ from ddqn_planner.grid import GridMap
 from ddqn_planner.planning import pose_kernels as kernels
 from ddqn_planner.planning.pose_kernels import Aim, Search, heap_of
 from ddqn_planner.planning.pose_paths import SAME, Way
-from ddqn_planner.planning.pose_world import SHIFT, TILE, State, World, occupied_for_body
+from ddqn_planner.planning.pose_world import (
+    SHIFT,
+    TILE,
+    State,
+    World,
+    occupied_for_body,
+)
 
 NO_RESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)  # not in all versions of Python
 HEAP = 2**18  # entries that a heap has room for, at least
-LOST = 1 / 2  # of the cost of the last start; if a repair takes more back, a new field is quicker
+LOST = (
+    1 / 2
+)  # of the cost of the last start; if a repair takes more back, a new field is quicker
 UNGUIDED = 2**14  # states that are visited before a look at the map pays
 FINEST = 1  # the shift of the smallest tiles that it looks at
 NOWHERE = Aim(0, 0, -1, 1.0, np.empty((0, 0), np.float32), SHIFT + 1)
-ANY_PATH = 1e6  # a bound that each path keeps: a greater one would make the weight infinite
+ANY_PATH = (
+    1e6  # a bound that each path keeps: a greater one would make the weight infinite
+)
 GREEDY = 1.5  # the first round's weight is the bound to the power of this: mostly that will do
 
 
@@ -50,9 +60,16 @@ class PoseField:
         self.goals, self.grid, self.world = goals, grid, world  # (N, 3): x, y, heading
         self.way: Way | None = None  # the last path that followed it
         self.visits, tiles = 0, world.tile.size
-        self._aim, self._heap, self._least = aim._replace(number=-1), heap_of(0), math.inf
+        self._aim, self._heap, self._least = (
+            aim._replace(number=-1),
+            heap_of(0),
+            math.inf,
+        )
         states = tiles << kernels.TILE_BITS
-        self._distance, self._mark = _untouched(states, np.float32), _untouched(states, np.uint8)
+        self._distance, self._mark = (
+            _untouched(states, np.float32),
+            _untouched(states, np.uint8),
+        )
         self._touched = np.zeros(tiles, np.bool_)
         x, y, heading = goals.T
         numbers = kernels.number_of(x, y, heading, world)
@@ -83,10 +100,15 @@ class PoseField:
                 self._look_at_map(shift)
                 self._order(self._aim.weight)
                 continue
-            share, most = 1.0 if self._aim.weight > 1 else 1 / bound, min(limit, UNGUIDED)
+            share, most = (
+                1.0 if self._aim.weight > 1 else 1 / bound,
+                min(limit, UNGUIDED),
+            )
             visits, done = kernels.grow(self._search, bound * self._least, share, most)
             limit, self.visits = limit - visits, self.visits + visits
-            if self._proved() > bound * SAME and visits < most:  # or else the heap is full
+            if (
+                self._proved() > bound * SAME and visits < most
+            ):  # or else the heap is full
                 self._order(1.0 if done else self._aim.weight)
         return proved
 
@@ -117,7 +139,10 @@ class PoseField:
 
     def _can_leave(self) -> bool:
         """Return whether primitives lead from the start to more than a few states."""
-        mark, queue = _untouched(self._mark.size, np.uint8), np.empty(UNGUIDED, np.int64)
+        mark, queue = (
+            _untouched(self._mark.size, np.uint8),
+            np.empty(UNGUIDED, np.int64),
+        )
         return kernels.leads_to(self._aim.number, mark, queue, self.world) == len(queue)
 
     def _look_at_map(self, shift: int) -> None:
@@ -143,7 +168,9 @@ class PoseField:
         way = np.empty((4, 1 + most * int(np.diff(body.first_pose).max())))
         return way[:, : kernels.follow(self._search, number, most, way)]
 
-    def repaired(self, grid: GridMap, world: World, cells: NDArray[np.int64]) -> PoseField:
+    def repaired(
+        self, grid: GridMap, world: World, cells: NDArray[np.int64]
+    ) -> PoseField:
         """Return it for a map that differs in cells (N, 2), or a new one where that is quicker."""
         # A way may have got cheaper where a cell is free: what is left to the start, too. If none,
         # what is open is in order still, and nothing costs less than was known to be the least.
@@ -153,7 +180,10 @@ class PoseField:
         far = world.body.reach // TILE + 1
         for x, y in set(zip(*(cells // TILE).T.tolist(), strict=True)):
             is_near[max(y - far, 0) : y + far + 1, max(x - far, 0) : x + far + 1] = True
-        near, tiles = np.flatnonzero(is_near.ravel() & self._touched), np.flatnonzero(self._touched)
+        near, tiles = (
+            np.flatnonzero(is_near.ravel() & self._touched),
+            np.flatnonzero(self._touched),
+        )
         cost, room = self._cost(), len(tiles) << kernels.TILE_BITS
         self._least = min(self._least, cost)
         if opens or self._heap.size[0] + room > self._heap.keys.size:

@@ -8,7 +8,14 @@ from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place, inlined
 from ddqn_planner.grid.motions import HEADINGS
-from ddqn_planner.planning.pose_world import SHIFT, TILE, World, cost_of, is_inside, is_possible
+from ddqn_planner.planning.pose_world import (
+    SHIFT,
+    TILE,
+    World,
+    cost_of,
+    is_inside,
+    is_possible,
+)
 
 # A state is a cell and one of 16 headings. Its number counts headings, then the cells of a tile of
 # 4 x 4, then tiles: so what a request visits lies on few pages of memory, 4 bytes a distance.
@@ -27,7 +34,9 @@ class Aim(NamedTuple):
     y: int
     number: int
     weight: float  # times what is left, in the order in which states are visited
-    left: NDArray[np.float32]  # (rows, columns) of corners, in cells; empty before a look at them
+    left: NDArray[
+        np.float32
+    ]  # (rows, columns) of corners, in cells; empty before a look at them
     shift: int  # those of tiles with 2**shift cells of a side
 
 
@@ -61,7 +70,11 @@ def number_of(x: Any, y: Any, heading: Any, world: Any) -> Any:
 @inlined
 def place_of(number: int, world: Any) -> tuple[int, int, int]:
     """Return x, y and heading of a state."""
-    tile, cell, columns = number >> TILE_BITS, number >> HEADING_BITS, world.tile.shape[1]
+    tile, cell, columns = (
+        number >> TILE_BITS,
+        number >> HEADING_BITS,
+        world.tile.shape[1],
+    )
     row = tile // columns
     x = (tile - row * columns) << SHIFT | (cell & (TILE - 1))
     y = row << SHIFT | (cell >> SHIFT & (TILE - 1))
@@ -72,12 +85,20 @@ def place_of(number: int, world: Any) -> tuple[int, int, int]:
 def after(x: int, y: int, primitive: int, world: Any) -> int:
     """Return the number of the state to which a primitive leads; -1 outside the map."""
     x, y = x + world.body.offset[primitive, 0], y + world.body.offset[primitive, 1]
-    return number_of(x, y, world.body.end[primitive], world) if is_inside(x, y, world) else -1
+    return (
+        number_of(x, y, world.body.end[primitive], world)
+        if is_inside(x, y, world)
+        else -1
+    )
 
 
 def heap_of(entries: int) -> Heap:
     """Return a heap with room for so many entries."""
-    return Heap(np.empty(entries, np.float32), np.empty(entries, np.int64), np.zeros(1, np.int64))
+    return Heap(
+        np.empty(entries, np.float32),
+        np.empty(entries, np.int64),
+        np.zeros(1, np.int64),
+    )
 
 
 @inlined
@@ -153,7 +174,8 @@ def grow(search: Search, enough: float, share: float, limit: int) -> tuple[int, 
     distance, mark, _, heap, aim, world = search
     body, size, target, visits = world.body, heap.size, aim.number, 0
     while size[0] > 0 and (
-        mark[target] == UNREACHED or max(enough, heap.keys[0] / share) < distance[target]
+        mark[target] == UNREACHED
+        or max(enough, heap.keys[0] / share) < distance[target]
     ):
         if visits == limit or size[0] > heap.keys.size - body.start.size:
             return visits, False
@@ -170,12 +192,17 @@ def grow(search: Search, enough: float, share: float, limit: int) -> tuple[int, 
             if not is_inside(column, line, world):
                 continue
             before = number_of(column, line, body.start[primitive], world)
-            if mark[before] != UNREACHED and here + body.cost[primitive] >= distance[before]:
+            if (
+                mark[before] != UNREACHED
+                and here + body.cost[primitive] >= distance[before]
+            ):
                 continue
             if not is_possible(column, line, primitive, world):
                 continue
             found = here + cost_of(column, line, primitive, world)
-            if found == np.inf or (mark[before] != UNREACHED and found >= distance[before]):
+            if found == np.inf or (
+                mark[before] != UNREACHED and found >= distance[before]
+            ):
                 continue
             distance[before] = found
             if mark[before] >= WAITING and aim.weight > 1:
@@ -183,7 +210,11 @@ def grow(search: Search, enough: float, share: float, limit: int) -> tuple[int, 
                 continue
             mark[before] = OPEN
             search.touched[before >> TILE_BITS] = True
-            push(np.float32(found + aim.weight * way_left(column, line, aim)), before, heap)
+            push(
+                np.float32(found + aim.weight * way_left(column, line, aim)),
+                before,
+                heap,
+            )
     return visits, True
 
 
@@ -199,7 +230,9 @@ def next_best(number: int, limit: Any, most: Any, search: Any) -> tuple[Any, int
         if end < 0 or search.mark[end] == UNREACHED or search.distance[end] >= limit:
             continue
         beyond = search.distance[end]
-        if beyond + body.cost[primitive] <= best and is_possible(x, y, primitive, world):
+        if beyond + body.cost[primitive] <= best and is_possible(
+            x, y, primitive, world
+        ):
             found = beyond + cost_of(x, y, primitive, world)
             if found <= best:
                 best, chosen = found, primitive
@@ -216,11 +249,16 @@ def follow(search: Search, number: int, limit: int, way: NDArray[np.float64]) ->
     for _ in range(limit):
         if search.distance[number] == 0:
             break
-        _, chosen = next_best(number, search.distance[number], np.float32(np.inf), search)
+        _, chosen = next_best(
+            number, search.distance[number], np.float32(np.inf), search
+        )
         cost = np.float64(cost_of(x, y, chosen, world))
         total += cost
         for place in range(body.first_pose[chosen], body.first_pose[chosen + 1]):
-            way[0, count], way[1, count] = x + body.pose[place, 0], y + body.pose[place, 1]
+            way[0, count], way[1, count] = (
+                x + body.pose[place, 0],
+                y + body.pose[place, 1],
+            )
             way[2, count] = body.pose[place, 2]
             way[3, count] = total - cost + body.pose[place, 3] * cost
             count += 1
@@ -230,7 +268,9 @@ def follow(search: Search, number: int, limit: int, way: NDArray[np.float64]) ->
 
 
 @in_place
-def leads_to(number: int, mark: NDArray[np.uint8], queue: NDArray[np.int64], world: World) -> int:
+def leads_to(
+    number: int, mark: NDArray[np.uint8], queue: NDArray[np.int64], world: World
+) -> int:
     """Return to how many states primitives lead from one, at most so many as the queue holds."""
     queue[0], mark[number], read, count = number, OPEN, 0, 1
     while read < count < queue.size:
@@ -305,7 +345,9 @@ def may_pass(x: int, y: int, world: Any) -> bool:
         if not is_possible(x, y, core + heading, world):
             continue
         for primitive in range(body.out[heading], body.out[heading + 1]):
-            for place in range(body.first_passed[primitive], body.first_passed[primitive + 1]):
+            for place in range(
+                body.first_passed[primitive], body.first_passed[primitive + 1]
+            ):
                 column, line = x - body.passed[place, 0], y - body.passed[place, 1]
                 inside = is_inside(column, line, world)
                 if inside and is_possible(column, line, primitive, world):
@@ -339,7 +381,10 @@ def way_to_box(x: int, y: int, box: NDArray[np.int64]) -> int:
 
 @in_place
 def look(
-    search: Search, room: NDArray[np.uint8], is_goal: NDArray[np.bool_], box: NDArray[np.int64]
+    search: Search,
+    room: NDArray[np.uint8],
+    is_goal: NDArray[np.bool_],
+    box: NDArray[np.int64],
 ) -> None:
     """Write to an aim what is left from corners of tiles, infinite where no way leads."""
     # By A*, to the nearest goal and as much further: what is not on the way there is left out.
@@ -376,4 +421,6 @@ def look(
             # What was not reached is no nearer than where it ended.
             least = end - way_to_box(x, y, box) if heap.size[0] > 0 else np.inf
             cost = min(left[y, x], least)
-            left[y, x] = (cost / (STRAIGHT * LONGER) - math.sqrt(2.0)) * (1 << aim.shift)
+            left[y, x] = (cost / (STRAIGHT * LONGER) - math.sqrt(2.0)) * (
+                1 << aim.shift
+            )

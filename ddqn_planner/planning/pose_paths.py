@@ -23,7 +23,9 @@ REACH: Final = 5.0, math.pi / 4  # cells and radians that a robot may be beside 
 BETWEEN: Final = 0.25  # cells between two points of a body's outline
 WITHIN: Final = 0.7  # and inside: so each cell there, turned as it may be, has a point
 SAME: Final = 1 + 1e-6  # what is rounded in sums of float32 is less
-AHEAD: Final = 0.9  # the cosine above which a robot drives ahead, not behind or sideways
+AHEAD: Final = (
+    0.9  # the cosine above which a robot drives ahead, not behind or sideways
+)
 
 
 class Way(NamedTuple):
@@ -40,7 +42,10 @@ class Way(NamedTuple):
         poses.flags.writeable = False
         (x, y, _), (column, line) = poses.T, cells.T
         is_next = (column[1:] != column[:-1]) | (line[1:] != line[:-1])
-        cost, least = float(self.spent[-1] - self.spent[first]), self.least - self.spent[first]
+        cost, least = (
+            float(self.spent[-1] - self.spent[first]),
+            self.least - self.spent[first],
+        )
         bound = max(cost / least, 1.0) if least > 0 else math.inf
         return PosePlan(
             PlanStatus.SUCCEEDED,
@@ -68,7 +73,9 @@ def in_cells(poses: Float64, grid: GridMap) -> Float64:
     return np.column_stack([column - 0.5, row - 0.5, yaw - grid.origin[2]])
 
 
-def nearest_pose(poses: Float64, robot: Any, grid: GridMap, reach: tuple[float, float]) -> int:
+def nearest_pose(
+    poses: Float64, robot: Any, grid: GridMap, reach: tuple[float, float]
+) -> int:
     """Return which of some poses (N, 3) is nearest to a robot; -1 if none is within reach."""
     apart = np.hypot(poses[:, 0] - robot[0], poses[:, 1] - robot[1]) / grid.resolution
     near = np.flatnonzero(apart <= reach[0])
@@ -130,7 +137,9 @@ def touches(path: Float64, points: Float64, occupied: NDArray[np.uint8]) -> bool
             over, up = points[point, 0], points[point, 1]
             column = math.floor(x + cos * over - sin * up)
             line = math.floor(y + sin * over + cos * up)
-            is_inside = 0 <= column < occupied.shape[1] and 0 <= line < occupied.shape[0]
+            is_inside = (
+                0 <= column < occupied.shape[1] and 0 <= line < occupied.shape[0]
+            )
             if not is_inside or occupied[line, column]:
                 return True
     return False

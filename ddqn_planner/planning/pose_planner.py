@@ -21,21 +21,36 @@ from ddqn_planner.planning import pose_paths as paths
 from ddqn_planner.planning import unknown_space
 from ddqn_planner.planning.plan import ROUNDING, PlanStatus, PosePlan
 from ddqn_planner.planning.pose_field import PoseField
-from ddqn_planner.planning.pose_world import State, World, body_of, differences, standing, world_of
+from ddqn_planner.planning.pose_world import (
+    State,
+    World,
+    body_of,
+    differences,
+    standing,
+    world_of,
+)
 from ddqn_planner.planning.segments import SAME_COST
 
-Pose: TypeAlias = tuple[float, float, float]  # metres, metres, radians; in the map frame
+Pose: TypeAlias = tuple[
+    float, float, float
+]  # metres, metres, radians; in the map frame
 
 VISITS = 2**16  # states that a field visits in one step of a plan: some 30 ms
 # Whether a path leads through unknown space is looked for in so many such steps, some 0.5 s, within
 # a bound that hardly takes longer than any path.
 MOST_STEPS_OF_REASON, BOUND_OF_REASON = 16, 10.0
 KEPT: Final = 3  # fields, those used last
-SAME_END = 1.0, 0.5  # cells and radians: no yaw is farther from the two headings nearest to it
+SAME_END = (
+    1.0,
+    0.5,
+)  # cells and radians: no yaw is farther from the two headings nearest to it
 # So near to its path, a robot keeps it even if there is none from the state nearest to its pose:
 # a controller has driven it a little aside, where the body of that state has no room.
 BESIDE_PATH = 1.0, 2 * math.pi / HEADINGS
-ON_PATH = 0.5, math.pi / HEADINGS  # a start so near to a pose, in cells and radians, lies on it
+ON_PATH = (
+    0.5,
+    math.pi / HEADINGS,
+)  # a start so near to a pose, in cells and radians, lies on it
 
 
 @dataclass(frozen=True)
@@ -48,12 +63,16 @@ class PoseRequest:
     tolerance: tuple[float, float] = (0.0, 0.0)
     bound: float = 1.2
     under_way: Any = field(default=(), compare=False)  # (N, 3) what the robot follows
-    switch_threshold: float = 0.0  # the share by which the rest of it may cost more than a new path
+    switch_threshold: float = (
+        0.0  # the share by which the rest of it may cost more than a new path
+    )
 
     @property
     def cells(self) -> tuple[Cell, ...]:
         """Those of the start and the goals."""
-        return tuple(self.grid.world_to_cell(x, y) for x, y, _ in (self.start, *self.goals))
+        return tuple(
+            self.grid.world_to_cell(x, y) for x, y, _ in (self.start, *self.goals)
+        )
 
     def to_nearest(self, others: Sequence[Pose]) -> PoseRequest:
         """Return the request for a path to the nearest of several goals, none of which moves."""
@@ -83,7 +102,11 @@ class PosePlanner:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy has, also in another process: no fields, and a lock of its own."""
-        return {name: value for name, value in vars(self).items() if not name.startswith("_")}
+        return {
+            name: value
+            for name, value in vars(self).items()
+            if not name.startswith("_")
+        }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Begin as a copy."""
@@ -96,7 +119,10 @@ class PosePlanner:
             plan = self._rest_of_path(request)
         if plan is None:
             plan = yield from self._find(request)
-        is_outside = plan.status in (PlanStatus.START_OUTSIDE_MAP, PlanStatus.GOAL_OUTSIDE_MAP)
+        is_outside = plan.status in (
+            PlanStatus.START_OUTSIDE_MAP,
+            PlanStatus.GOAL_OUTSIDE_MAP,
+        )
         has_path = len(request.under_way) > 0 and not is_outside
         if has_path:
             plan = self._keep_or_switch(request, plan)
@@ -136,13 +162,17 @@ class PosePlanner:
                 break
         return plan
 
-    def _reason(self, request: PoseRequest, plan: PosePlan) -> Generator[None, None, str]:
+    def _reason(
+        self, request: PoseRequest, plan: PosePlan
+    ) -> Generator[None, None, str]:
         """Return why there is no path, after None before each slow step."""
         status: str = plan.status.value
         several = len(request.goals) > 1
         start_cell, *cells = request.cells
         if not any(map(request.grid.contains, cells)):
-            return unknown_space.reason_of_goals([unknown_space.OUTSIDE] * len(cells), "")
+            return unknown_space.reason_of_goals(
+                [unknown_space.OUTSIDE] * len(cells), ""
+            )
         grid = with_unknown_free(request.grid)
         world = world_of(grid, self.body)
         starts = self._at(grid, request.start, world)
@@ -151,7 +181,9 @@ class PosePlanner:
         if plan.status is PlanStatus.START_OCCUPIED:
             if not len(starts):
                 return status
-            return f"the start {self._place(request, start_cell)}; {unknown_space.REMEDY}"
+            return (
+                f"the start {self._place(request, start_cell)}; {unknown_space.REMEDY}"
+            )
         places = [self._goal_in_words(request, goal, world) for goal in request.goals]
         if several and (all(places) or request.grid.unknown is None or not len(starts)):
             return unknown_space.reason_of_goals(places, "")
@@ -159,7 +191,9 @@ class PosePlanner:
             return f"the goal {places[0]}; {unknown_space.REMEDY}"
         start: State = tuple(starts[0].tolist())
         # Of several goals those count at which the body has room.
-        ends = [goal for goal, place in zip(request.goals, places, strict=True) if not place]
+        ends = [
+            goal for goal, place in zip(request.goals, places, strict=True) if not place
+        ]
         ends = ends or [*request.goals]
         states = np.concatenate([self._at(grid, goal, world) for goal in ends])
         if any(request.tolerance):
@@ -205,7 +239,11 @@ class PosePlanner:
         return "is so near to unknown space that the robot's body touches it"
 
     def rest_of(
-        self, way: Any, robot: Any, grid: GridMap, reach: tuple[float, float] = paths.REACH
+        self,
+        way: Any,
+        robot: Any,
+        grid: GridMap,
+        reach: tuple[float, float] = paths.REACH,
     ) -> NDArray[np.float64]:
         """Return a path from the pose nearest to a robot on; empty if it is far, or has no room."""
         poses: NDArray[np.float64] = np.asarray(way, dtype=np.float64).reshape(-1, 3)
@@ -224,11 +262,17 @@ class PosePlanner:
         cost, new = (paths.cost_of_poses(way, grid) for way in (rest, plan.poses))
         if has_plan and cost > (1 + request.switch_threshold) * new * SAME_COST:
             return plan
-        share, least = cost / new if new else 1.0, 0.0  # without a plan nothing is proved
+        share, least = (
+            cost / new if new else 1.0,
+            0.0,
+        )  # without a plan nothing is proved
         if has_plan:
             of_plan = (plan.cost or 0.0) / (grid.seconds_per_cell or 1.0)
             cost, least = share * of_plan, of_plan / plan.bound
-        cells, spent = paths.cells_of(paths.in_cells(rest, grid)), np.linspace(0, cost, len(rest))
+        cells, spent = (
+            paths.cells_of(paths.in_cells(rest, grid)),
+            np.linspace(0, cost, len(rest)),
+        )
         kept = paths.Way(rest, cells, spent, least).plan(0, grid)
         ms = plan.field_ms, plan.rollout_ms
         return replace(kept, extra_cost=share - 1, field_ms=ms[0], rollout_ms=ms[1])
@@ -245,12 +289,20 @@ class PosePlanner:
         """Return the state (1, 3) of a pose, of the nearer of two headings with room, or none."""
         apart = np.abs(turn_between(self.motions.angles, pose[2] - grid.origin[2]))
         cell = grid.world_to_cell(*pose[:2])
-        states = np.array([(*cell, heading) for heading in np.argsort(apart, kind="stable")[:2]])
+        states = np.array(
+            [(*cell, heading) for heading in np.argsort(apart, kind="stable")[:2]]
+        )
         return states[: min(standing(states, world), 1)]
 
-    def _around(self, request: PoseRequest, start: State, world: World) -> NDArray[np.int64]:
+    def _around(
+        self, request: PoseRequest, start: State, world: World
+    ) -> NDArray[np.int64]:
         """Return the states (N, 3) within the tolerance of the goal at which a path may end."""
-        grid, (metres, radians), (x, y, yaw) = request.grid, request.tolerance, request.goals[0]
+        grid, (metres, radians), (x, y, yaw) = (
+            request.grid,
+            request.tolerance,
+            request.goals[0],
+        )
         column, line = grid.world_to_cell(x, y)
         turn = np.abs(turn_between(self.motions.angles, yaw - grid.origin[2]))
         is_meant = turn <= max(radians * ROUNDING, turn.min())
@@ -272,7 +324,10 @@ class PosePlanner:
     def _rest_of_path(self, request: PoseRequest) -> PosePlan | None:
         """Return the rest of the path that was planned last, if the start lies on it."""
         for asked, known in self._fields.items():
-            if asked[:2] != (request.goals, request.tolerance) or (way := known.way) is None:
+            if (
+                asked[:2] != (request.goals, request.tolerance)
+                or (way := known.way) is None
+            ):
                 continue
             cells = self._differences(known.grid, request.grid)
             if cells is None or len(cells):
@@ -297,13 +352,21 @@ class PosePlanner:
         if field is None or field.grid is not grid:
             cells = self._differences(field.grid, grid) if field else None
             world = self._world(grid)
-            kept = field.repaired(grid, world, cells) if field and cells is not None else None
+            kept = (
+                field.repaired(grid, world, cells)
+                if field and cells is not None
+                else None
+            )
             field = kept or PoseField(states, grid, world)
         self._fields = dict([*self._fields.items(), (asked, field)][-KEPT:])
         return field
 
     def _grow(
-        self, request: PoseRequest, states: NDArray[np.int64], start: State, began: float
+        self,
+        request: PoseRequest,
+        states: NDArray[np.int64],
+        start: State,
+        began: float,
     ) -> PosePlan | None:
         """Grow the field by a step; return the path from the start if it is known then."""
         grid = request.grid
@@ -317,8 +380,12 @@ class PosePlanner:
             if found is None:
                 return PosePlan(PlanStatus.NO_PATH, field_ms=field_ms)
             x, y, yaw, spent = found
-            poses = np.column_stack([*grid.centres(x, y), turn_between(0, yaw + grid.origin[2])])
+            poses = np.column_stack(
+                [*grid.centres(x, y), turn_between(0, yaw + grid.origin[2])]
+            )
             cells = paths.cells_of(np.column_stack([x, y]))
             field.way = paths.Way(poses, cells, spent.copy(), float(spent[-1]) / bound)
             plan = field.way.plan(0, grid)
-        return replace(plan, field_ms=field_ms, rollout_ms=1e3 * (time.perf_counter() - grown))
+        return replace(
+            plan, field_ms=field_ms, rollout_ms=1e3 * (time.perf_counter() - grown)
+        )

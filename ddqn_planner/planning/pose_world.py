@@ -17,10 +17,17 @@ from ddqn_planner.planning.segments import ACTIONS
 
 SHIFT: Final = 2  # so many bits tell where in its tile a cell lies, along a side
 TILE: Final = 1 << SHIFT  # cells of a side
-BORDER: Final = 128  # occupied cells around the map, so that a body sweeps none beyond the bits
+BORDER: Final = (
+    128  # occupied cells around the map, so that a body sweeps none beyond the bits
+)
 State: TypeAlias = tuple[int, int, int]  # x, y, heading
 FINE = 0.01  # cells between two points of the origin's way, which tell the cells that it passes
-WORD, LAST_BIT, ONE, FULL = np.uint64(64), np.uint64(63), np.uint64(1), np.uint64(2**64 - 1)
+WORD, LAST_BIT, ONE, FULL = (
+    np.uint64(64),
+    np.uint64(63),
+    np.uint64(1),
+    np.uint64(2**64 - 1),
+)
 
 
 class Body(NamedTuple):
@@ -30,36 +37,50 @@ class Body(NamedTuple):
     # all: what each primitive that starts with it sweeps around any cell that its origin passes.
     # The last one is all within reach of a tile, around its middle.
 
-    into: NDArray[np.int64]  # (17,): into[h] to into[h + 1] are the places in `ending` of those
+    into: NDArray[
+        np.int64
+    ]  # (17,): into[h] to into[h + 1] are the places in `ending` of those
     ending: NDArray[np.int64]  # (P,): the primitives, by the heading in which they end
     out: NDArray[np.int64]  # (17,): likewise, by the heading in which they start
     start: NDArray[np.int64]  # (P,)
     end: NDArray[np.int64]  # (P,)
     offset: NDArray[np.int64]  # (P, 2)
     cost: NDArray[np.float32]  # (P,)
-    row: NDArray[np.int64]  # (R, 2): y and x of the first of 64 swept cells in a row, or fewer
+    row: NDArray[
+        np.int64
+    ]  # (R, 2): y and x of the first of 64 swept cells in a row, or fewer
     bits: NDArray[np.uint64]  # (R,): which of them
     first: NDArray[np.int64]  # (P + 35,): where the rows of each begin
-    passed: NDArray[np.int64]  # (C, 4): x, y, how the origin leaves the cell, and moves in it
+    passed: NDArray[
+        np.int64
+    ]  # (C, 4): x, y, how the origin leaves the cell, and moves in it
     share: NDArray[np.float32]  # (C,): which part of the cost counts in this cell
     first_passed: NDArray[np.int64]  # (P + 1,)
-    pose: NDArray[np.float64]  # (N, 4): all but the first of each, and its share of the cost
+    pose: NDArray[
+        np.float64
+    ]  # (N, 4): all but the first of each, and its share of the cost
     first_pose: NDArray[np.int64]  # (P + 1,)
     angle: NDArray[np.float64]  # (16,)
-    least: NDArray[np.int64]  # (P, 2): how far its origin leaves its first cell, x and y, at least
+    least: NDArray[
+        np.int64
+    ]  # (P, 2): how far its origin leaves its first cell, x and y, at least
     most: NDArray[np.int64]  # (P, 2): and at most
-    reach: (
-        int  # cells that a primitive, or its origin, gets to any side of its begin or end, at most
-    )
+    reach: int  # cells that a primitive, or its origin, gets to any side of its begin or end, at most
 
 
 class World(NamedTuple):
     """A body on a map as kernels use it; empty arrays for layers that the map does not have."""
 
     body: Body
-    bits: NDArray[np.uint64]  # (rows, words): a bit for each occupied cell, with the border
-    tile: NDArray[np.uint8]  # by tile: whether the body can reach an occupied cell, once known
-    room: NDArray[np.uint8]  # by tile: whether the body may pass one of its cells, likewise
+    bits: NDArray[
+        np.uint64
+    ]  # (rows, words): a bit for each occupied cell, with the border
+    tile: NDArray[
+        np.uint8
+    ]  # by tile: whether the body can reach an occupied cell, once known
+    room: NDArray[
+        np.uint8
+    ]  # by tile: whether the body may pass one of its cells, likewise
     height: int
     width: int
     forbidden: NDArray[np.uint8]  # (H, W)
@@ -75,21 +96,34 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
     standing, core = np.ones((2, HEADINGS, *swept.shape[1:]), dtype=np.bool_)
     either = np.zeros(swept.shape[1:], dtype=np.bool_)
     for mask, before, after, (cells, _) in zip(swept, start, end, passed, strict=True):
-        around = np.array([np.roll(mask, (-up, -over), axis=(0, 1)) for over, up, *_ in cells])
+        around = np.array(
+            [np.roll(mask, (-up, -over), axis=(0, 1)) for over, up, *_ in cells]
+        )
         standing[before] &= around[0]
         standing[after] &= around[-1]
         core[before] &= around.all(axis=0)
         either |= around.any(axis=0)
     least, most = (
-        np.array([bound(cells[:, :2], axis=0) for cells, _ in passed]) for bound in (np.min, np.max)
+        np.array([bound(cells[:, :2], axis=0) for cells, _ in passed])
+        for bound in (np.min, np.max)
     )
     # The origin may lie outside of the body.
-    reach = int(max(np.abs(np.argwhere(either) - swept.shape[1] // 2).max(), (most - least).max()))
+    reach = int(
+        max(
+            np.abs(np.argwhere(either) - swept.shape[1] // 2).max(),
+            (most - least).max(),
+        )
+    )
     around = np.ones((1, 2 * reach + TILE + 1, 2 * reach + TILE + 1), dtype=np.bool_)
-    parts = [rows_of(masks) for masks in (swept, standing, core, core.all(axis=0)[None], around)]
+    parts = [
+        rows_of(masks)
+        for masks in (swept, standing, core, core.all(axis=0)[None], around)
+    ]
     row, bits, counts = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     ending = np.argsort(end, kind="stable")
-    ways = [np.column_stack([way, np.linspace(0, 1, len(way))])[1:] for way in motions.poses]
+    ways = [
+        np.column_stack([way, np.linspace(0, 1, len(way))])[1:] for way in motions.poses
+    ]
     return Body(
         into=np.searchsorted(end[ending], headings),
         ending=ending,
@@ -125,7 +159,9 @@ def rows_of(
     return np.column_stack([y, 64 * word]) - reach, words[number, y, word], counts
 
 
-def _passed(poses: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _passed(
+    poses: NDArray[np.float64],
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the cells that the origin passes, with two actions, 8 for none; and its shares."""
     way = closer(poses, FINE, 0.0)[:, :2]
     middle, length = (way[1:] + way[:-1]) / 2, np.hypot(*np.diff(way, axis=0).T)
@@ -149,20 +185,29 @@ def body_costs(grid: GridMap) -> NDArray[np.int8] | None:
     """Return what cells cost, if they do: the most where only a disc's body is too near."""
     if grid.cost is None or grid.obstacles is None:
         return grid.cost
-    costs: NDArray[np.int8] = grid.cost + np.int8(OCCUPIED) * grid.occupancy  # there it is 0
-    costs.flags.writeable = False  # as all layers: for others numba compiles the kernels again
+    costs: NDArray[np.int8] = (
+        grid.cost + np.int8(OCCUPIED) * grid.occupancy
+    )  # there it is 0
+    costs.flags.writeable = (
+        False  # as all layers: for others numba compiles the kernels again
+    )
     return costs
 
 
 def world_of(
-    grid: GridMap, body: Body, older: World | None = None, cells: NDArray[np.int64] | None = None
+    grid: GridMap,
+    body: Body,
+    older: World | None = None,
+    cells: NDArray[np.int64] | None = None,
 ) -> World:
     """Return a map for kernels: from scratch, or from an older one that differs in cells (N, 2)."""
     occupied = occupied_for_body(grid)
     height, width = occupied.shape
     if older is None or cells is None:
         bits = np.full((height + 2 * BORDER, (width + 2 * BORDER + 63) // 64 + 1), FULL)
-        tile, room = np.zeros((2, -(-height // TILE), -(-width // TILE)), dtype=np.uint8)
+        tile, room = np.zeros(
+            (2, -(-height // TILE), -(-width // TILE)), dtype=np.uint8
+        )
         (left, bottom), (right, top) = (0, 0), (width, height)
     elif not len(cells):
         return older
@@ -170,11 +215,16 @@ def world_of(
         bits, tile, room = older.bits.copy(), older.tile.copy(), older.room.copy()
         (left, bottom), (right, top) = cells.min(axis=0), cells.max(axis=0) + 1
         x, y = np.maximum([left - BORDER, bottom - BORDER], 0) // TILE
-        near = slice(y, (top + BORDER) // TILE + 1), slice(x, (right + BORDER) // TILE + 1)
+        near = (
+            slice(y, (top + BORDER) // TILE + 1),
+            slice(x, (right + BORDER) // TILE + 1),
+        )
         tile[near] = room[near] = 0
     line = np.ones((top - bottom, 64 * bits.shape[1]), dtype=np.bool_)
     line[:, BORDER : BORDER + width] = occupied[bottom:top]
-    bits[BORDER + bottom : BORDER + top] = np.packbits(line, axis=1, bitorder="little").view("<u8")
+    bits[BORDER + bottom : BORDER + top] = np.packbits(
+        line, axis=1, bitorder="little"
+    ).view("<u8")
     _, *layers, _, _ = grid.for_kernels(MoveRule.ROBOT_SAFE)
     if (costs := body_costs(grid)) is not None:
         layers[1] = costs
@@ -197,7 +247,11 @@ def touches(x: int, y: int, mask: int, world: Any) -> bool:
     body = world.body
     for number in range(body.first[mask], body.first[mask + 1]):
         column = np.uint64(x + body.row[number, 1] + BORDER)
-        line, word, place = y + body.row[number, 0] + BORDER, column // WORD, column & LAST_BIT
+        line, word, place = (
+            y + body.row[number, 0] + BORDER,
+            column // WORD,
+            column & LAST_BIT,
+        )
         seen = world.bits[line, word] >> place
         # Two shifts, as one by 64 has no meaning.
         seen |= (world.bits[line, word + ONE] << ONE) << (LAST_BIT - place)
@@ -218,7 +272,9 @@ def is_far(x: int, y: int, world: Any) -> bool:
     row, column = y >> SHIFT, x >> SHIFT
     if world.tile[row, column] == 0:
         x, y = (x & -TILE) + TILE // 2, (y & -TILE) + TILE // 2
-        world.tile[row, column] = 2 if touches(x, y, world.body.first.size - 2, world) else 1
+        world.tile[row, column] = (
+            2 if touches(x, y, world.body.first.size - 2, world) else 1
+        )
     return bool(world.tile[row, column] == 1)
 
 
@@ -230,7 +286,10 @@ def cost_of(x: int, y: int, number: int, world: Any) -> Any:
         return body.cost[number]
     for place in range(body.first_passed[number], body.first_passed[number + 1]):
         column, line = x + body.passed[place, 0], y + body.passed[place, 1]
-        if world.forbidden.size > 0 and world.forbidden[line, column] >> body.passed[place, 2] & 1:
+        if (
+            world.forbidden.size > 0
+            and world.forbidden[line, column] >> body.passed[place, 2] & 1
+        ):
             return np.float32(np.inf)
         factor = np.float32(1)
         if world.cost.size > 0:
@@ -252,7 +311,9 @@ def leaves_map(x: int, y: int, mask: int, world: Any) -> bool:
     if mask >= least.shape[0]:
         return False
     is_first_inside = is_inside(x + least[mask, 0], y + least[mask, 1], world)
-    return not (is_first_inside and is_inside(x + most[mask, 0], y + most[mask, 1], world))
+    return not (
+        is_first_inside and is_inside(x + most[mask, 0], y + most[mask, 1], world)
+    )
 
 
 @inlined

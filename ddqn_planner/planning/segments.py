@@ -15,13 +15,17 @@ from ddqn_planner.grid.moves import UPHILL
 
 Path: TypeAlias = NDArray[np.int32]  # (N, 2): cells, joined by moves or by segments
 LONG: Final = 400  # cells: a longer path is pulled once, as twice saves less than 0.1 %
-SAME_COST: Final = 1 + 1e-9  # a path may cost so much more, and still as much: sums are rounded
+SAME_COST: Final = (
+    1 + 1e-9
+)  # a path may cost so much more, and still as much: sums are rounded
 ACTIONS = np.full((3, 3), 8)  # the action by which a step is taken, 8 for none
 ACTIONS[MOVES[:, 1] + 1, MOVES[:, 0] + 1] = np.arange(8)
 BITS = (1 << ACTIONS).astype(np.uint8)  # that action in a set of them
 
 
-def simplify(cells: Cells, grid: GridMap, move_rule: MoveRule | str) -> tuple[Cell, ...]:
+def simplify(
+    cells: Cells, grid: GridMap, move_rule: MoveRule | str
+) -> tuple[Cell, ...]:
     """Return a path of few legal segments beside a given path, with the same ends: string pulling.
 
     A segment is legal if all cells that it passes through are free; under `MoveRule.ROBOT_SAFE`
@@ -51,7 +55,9 @@ def straightened(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> Path:
     """Do the work of `simplify` for a path of one cell or more."""
     layers, least, best = grid.for_kernels(move_rule), np.inf, np.asarray(path)
     # Without costs, nothing between two cells costs less than a segment.
-    until = np.cumsum(_segment_costs(path, layers, 1.0)) if grid.has_costs else np.empty(0)
+    until = (
+        np.cumsum(_segment_costs(path, layers, 1.0)) if grid.has_costs else np.empty(0)
+    )
     # From the end, other obstacles come first: the path may pass them on the better side.
     for order in (1, -1):
         cells, costs = np.array(path[::order], np.int64), np.zeros(len(path))
@@ -80,7 +86,9 @@ def legal_segments(
     return _segment_costs(path, grid.for_kernels(move_rule), begins)[1:] < np.inf
 
 
-def _segment_costs(path: Cells, layers: tuple[Any, ...], begins: Any) -> NDArray[np.float64]:
+def _segment_costs(
+    path: Cells, layers: tuple[Any, ...], begins: Any
+) -> NDArray[np.float64]:
     """Return 0 and the cost of each segment, see `_cost`, which begins at a share of it."""
     # With 64 bits, whatever is computed with a cell has its type, and numba compiles once for it.
     cells, costs = np.array(path, np.int64), np.full(len(path), begins)
@@ -105,7 +113,9 @@ def multiplier_at(x: int, y: int, layers: Any) -> Any:
     return multiplier * slowness[row, column] if slowness.size else multiplier
 
 
-@partial(inner, _nrt=False)  # not inlined: what few maps need must not slow the others down
+@partial(
+    inner, _nrt=False
+)  # not inlined: what few maps need must not slow the others down
 def uphill_at(x: int, y: int, dx: int, dy: int, layers: Any) -> Any:
     """Return the factor of a way's cost in a cell, see `GridMap.uphill`: between two actions'."""
     uphill = layers[4]
@@ -123,7 +133,11 @@ def uphill_at(x: int, y: int, dx: int, dy: int, layers: Any) -> Any:
 @inlined
 def _is_free(x: int, y: int, occupancy: Any) -> bool:
     """Return whether a cell lies on the map and is free."""
-    return 0 <= x < occupancy.shape[1] and 0 <= y < occupancy.shape[0] and not occupancy[y, x]
+    return (
+        0 <= x < occupancy.shape[1]
+        and 0 <= y < occupancy.shape[0]
+        and not occupancy[y, x]
+    )
 
 
 @inlined
@@ -147,7 +161,10 @@ def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -
     while at < whole and legal:
         until = at_column if at_column < at_row else at_row
         until = until if until < whole else whole
-        column, row = np.uint64(x), np.uint64(y)  # unsigned: no index counts from the end
+        column, row = (
+            np.uint64(x),
+            np.uint64(y),
+        )  # unsigned: no index counts from the end
         blocked = occupancy[row, column]
         if forbidden.size and until < whole:
             blocked |= (forbidden[row, column] & takes) != 0
@@ -176,7 +193,9 @@ def _is_right_angle(
     dx, dy = x + to_x - 2 * at_x, y + to_y - 2 * at_y
     is_blocked = occupancy[at_y + (dy > 0) - (dy < 0), at_x + (dx > 0) - (dx < 0)]
     is_right = (x == at_x or to_x == at_x) and (y == at_y or to_y == at_y)
-    return is_right and is_blocked and cost.size + slowness.size == 0 and not cuts_corners
+    return (
+        is_right and is_blocked and cost.size + slowness.size == 0 and not cuts_corners
+    )
 
 
 @in_place
@@ -185,9 +204,19 @@ def _costs(path: Any, costs: Any, layers: Any) -> None:
     height, width = layers[0].shape
     costs[0] = 0.0
     for index in range(1, path.shape[0]):
-        x, y, to_x, to_y = path[index - 1, 0], path[index - 1, 1], path[index, 0], path[index, 1]
+        x, y, to_x, to_y = (
+            path[index - 1, 0],
+            path[index - 1, 1],
+            path[index, 0],
+            path[index, 1],
+        )
         begin, costs[index] = costs[index], np.inf
-        if 0 <= x < width and 0 <= y < height and 0 <= to_x < width and 0 <= to_y < height:
+        if (
+            0 <= x < width
+            and 0 <= y < height
+            and 0 <= to_x < width
+            and 0 <= to_y < height
+        ):
             costs[index] = _cost(x, y, to_x, to_y, begin, layers)
 
 
@@ -226,7 +255,11 @@ def _pull(path: Any, costs: Any, until: Any, backward: bool, layers: Any) -> int
             doubling = doubling and joins
             step = 2 * step if doubling else step // 2
         first, number = reached, number + 1
-        path[number, 0], path[number, 1], costs[number] = path[reached, 0], path[reached, 1], least
+        path[number, 0], path[number, 1], costs[number] = (
+            path[reached, 0],
+            path[reached, 1],
+            least,
+        )
     return number + 1
 
 
@@ -234,7 +267,9 @@ def _pull(path: Any, costs: Any, until: Any, backward: bool, layers: Any) -> int
 def _move_corners(path: Any, count: int, costs: Any, layers: Any) -> tuple[int, bool]:
     """Move or leave out corners while it costs less; return the cells left, and if any moved."""
     occupancy, is_unit, is_better, corner = layers[0], layers[-1], False, 1
-    moved_by = -1  # the action by which the corner has just moved: it alone is tried again
+    moved_by = (
+        -1
+    )  # the action by which the corner has just moved: it alone is tried again
     while corner < count - 1:
         x, y = path[corner - 1, 0], path[corner - 1, 1]
         at_x, at_y = path[corner, 0], path[corner, 1]

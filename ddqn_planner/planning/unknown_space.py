@@ -42,7 +42,9 @@ def reason_of(request: PlanRequest, plan: Plan) -> str:
     if len(request.goals) > 1:
         places = [goal_in_words(grid, goal) for goal in request.goals]
         free = tuple(goal for goal in request.goals if grid.is_free(goal))
-        is_through = bool(free) and _leads_through_unknown_space(replace(request, goals=free))
+        is_through = bool(free) and _leads_through_unknown_space(
+            replace(request, goals=free)
+        )
         return reason_of_goals(places, THROUGH_UNKNOWN_SPACE if is_through else "")
     if plan.status is PlanStatus.GOAL_OCCUPIED:
         place = place_in_words(grid, request.goals[0])
@@ -60,7 +62,9 @@ def _leads_through_unknown_space(request: PlanRequest) -> bool:
     if request.grid.unknown is None:
         return False
     for possible in _grids_without_unknown(request.grid):
-        goals = tuple(sorted({goal for goal in request.goals if possible.is_free(goal)}))
+        goals = tuple(
+            sorted({goal for goal in request.goals if possible.is_free(goal)})
+        )
         found = way_and_ends(replace(request, grid=possible), goals)
         if isinstance(found, PlanStatus):
             return False
@@ -86,7 +90,9 @@ def place_in_words(grid: GridMap, cell: Cell) -> str:
     if grid.obstacles is None or grid.is_obstacle(cell) or grid.body_radius == 0:
         return ""
     cells = grid.body_radius * (1 - ROUNDING) / grid.resolution
-    rows, columns = wider((slice(y, y + 1), slice(x, x + 1)), int(cells) + 1, grid.occupancy.shape)
+    rows, columns = wider(
+        (slice(y, y + 1), slice(x, x + 1)), int(cells) + 1, grid.occupancy.shape
+    )
     obstacles = grid.obstacles[rows, columns] & ~grid.unknown[rows, columns]
     for row, column in zip(*obstacles.nonzero(), strict=True):
         if math.hypot(row + rows.start - y, column + columns.start - x) < cells:
@@ -106,8 +112,12 @@ def reason_of_goals(places: Sequence[str], through: str) -> str:
     """
     is_unknown = [UNKNOWN_SPACE in place for place in places]
     # Of many, those that the remedy is for are named first of all.
-    named = sorted(range(len(places)), key=lambda index: not is_unknown[index])[:MOST_NAMED]
-    reasons = [f"goal {index + 1} {places[index]}" for index in sorted(named) if places[index]]
+    named = sorted(range(len(places)), key=lambda index: not is_unknown[index])[
+        :MOST_NAMED
+    ]
+    reasons = [
+        f"goal {index + 1} {places[index]}" for index in sorted(named) if places[index]
+    ]
     cut_off = [str(index + 1) for index in sorted(named) if not places[index]]
     if cut_off:
         goals = "goals" if len(cut_off) > 1 else "goal"
@@ -125,5 +135,7 @@ def _grids_without_unknown(grid: GridMap) -> Iterator[GridMap]:
     if grid.body_radius > 0 and grid.obstacles is not None and grid.unknown is not None:
         # To look only at obstacles is quick, and often shows that there is no path either.
         obstacles = grid.obstacles & ~grid.unknown
-        yield grid.with_layers(occupancy=obstacles, obstacles=obstacles, cost=None, unknown=None)
+        yield grid.with_layers(
+            occupancy=obstacles, obstacles=obstacles, cost=None, unknown=None
+        )
     yield with_unknown_free(grid)

@@ -28,7 +28,9 @@ class ReplayBuffer:
         self.capacity = capacity
         self.added = 0
         self.transitions = Transitions._make(
-            np.zeros(capacity, np.float32 if name in ("reward", "discount") else np.int64)
+            np.zeros(
+                capacity, np.float32 if name in ("reward", "discount") else np.int64
+            )
             for name in Transitions._fields
         )
 
@@ -48,7 +50,9 @@ class ReplayBuffer:
         return Transitions._make(stored[indices] for stored in self.transitions)
 
 
-def double_dqn_gradient(kind: str, batch: Transitions, target_BA: Q, online_2BA: Q) -> Q:
+def double_dqn_gradient(
+    kind: str, batch: Transitions, target_BA: Q, online_2BA: Q
+) -> Q:
     """Return the gradient of the mean squared temporal-difference error by Q of states: (B, 8)."""
     # Given is Q of the next states by θ⁻, and Q of the states and then the next ones by θ.
     q_BA, online_BA = np.split(online_2BA, 2)
@@ -57,7 +61,9 @@ def double_dqn_gradient(kind: str, batch: Transitions, target_BA: Q, online_2BA:
     selection_BA = target_BA if kind == "dqn" else online_BA
     evaluation_BA = online_BA if kind == "printed" else target_BA
     each = np.arange(len(q_BA))
-    y_B = batch.reward + batch.discount * evaluation_BA[each, selection_BA.argmax(axis=1)]
+    y_B = (
+        batch.reward + batch.discount * evaluation_BA[each, selection_BA.argmax(axis=1)]
+    )
     gradient_BA = np.zeros_like(q_BA)
     gradient_BA[each, batch.action] = 2 / len(q_BA) * (q_BA[each, batch.action] - y_B)
     return gradient_BA

@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, neighbours, read_map_file
 from ddqn_planner.grid.arguments import as_cell, numbers
 from ddqn_planner.grid.grid_map import check_grid
-from ddqn_planner.model.networks import FREE, GOAL, OBSTACLE, ROBOT, observation_background
+from ddqn_planner.model.networks import (
+    FREE,
+    GOAL,
+    OBSTACLE,
+    ROBOT,
+    observation_background,
+)
 from ddqn_planner.resources import find_resource
 from ddqn_planner.training.exploring_starts import initial_cells
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -39,9 +45,13 @@ class Scenario:
         )  # it is frozen
         for name, cell in (("start", start), ("goal", goal)):
             if not self.grid.is_free(cell):
-                raise ValueError(f"the {name} {cell} is not a free cell of the map; give another")
+                raise ValueError(
+                    f"the {name} {cell} is not a free cell of the map; give another"
+                )
         if start == goal:
-            raise ValueError(f"start and goal are both {start}; give two different cells")
+            raise ValueError(
+                f"start and goal are both {start}; give two different cells"
+            )
         if not self._leads_to_goal(self.move_rule):
             others = [rule.value for rule in MoveRule if self._leads_to_goal(rule)]
             remedy = f"give the move rule {others[0]}" if others else "open the map"
@@ -58,7 +68,9 @@ def paper_scenario() -> Scenario:
     """Return the paper's map with its start and goal."""
     map_file = read_map_file(find_resource("maps", "dilemma.yaml"))
     if map_file.start is None or map_file.goal is None:
-        raise ValueError("maps/dilemma.yaml names no start and goal; restore the shipped file")
+        raise ValueError(
+            "maps/dilemma.yaml names no start and goal; restore the shipped file"
+        )
     return Scenario(map_file.grid(), map_file.start, map_file.goal)
 
 
@@ -75,12 +87,16 @@ class GridVectorEnvironment:
         random: np.random.Generator | None = None,
     ) -> None:
         if not scenarios or not all(isinstance(one, Scenario) for one in scenarios):
-            raise ValueError(f"the scenarios are {scenarios!r}; give at least one Scenario")
+            raise ValueError(
+                f"the scenarios are {scenarios!r}; give at least one Scenario"
+            )
         if not isinstance(parameters, HyperParameters):
             raise ValueError(f"the parameters are {parameters!r}; give HyperParameters")
         shapes = {scenario.grid.occupancy.shape for scenario in scenarios}
         if len(shapes) != 1:
-            raise ValueError(f"the maps have the sizes {sorted(shapes)}; give maps of one size")
+            raise ValueError(
+                f"the maps have the sizes {sorted(shapes)}; give maps of one size"
+            )
         (self.shape,) = shapes
         self.scenarios = tuple(scenarios)
         self.parameters = parameters
@@ -90,7 +106,10 @@ class GridVectorEnvironment:
         self.background, self.next_cell = np.stack(maps), neighbours(self.shape)
         tables, to_number = (len(maps), len(MOVES), -1), np.array([1, self.shape[1]])
         legal = [s.grid.legal_moves(s.move_rule) for s in scenarios]
-        reward = [move_reward(s.grid, s.start, s.goal, s.move_rule, parameters) for s in scenarios]
+        reward = [
+            move_reward(s.grid, s.start, s.goal, s.move_rule, parameters)
+            for s in scenarios
+        ]
         self.legal = np.stack(legal).reshape(tables)
         self.free_reward = np.stack(reward).reshape(tables)
         collision = np.float32(parameters.obstacle_reward)
@@ -106,7 +125,10 @@ class GridVectorEnvironment:
         count, most = parameters.environments, parameters.max_episode_steps
         self.scenario, self.cell, self.steps = np.zeros((3, count), np.int64)
         # Of each robot's episode: the cells in their order, and the sum of the rewards.
-        self.visited, self.total_reward = np.zeros((count, most + 1), np.int64), np.zeros(count)
+        self.visited, self.total_reward = (
+            np.zeros((count, most + 1), np.int64),
+            np.zeros(count),
+        )
         self.terminated, self.truncated = np.zeros((2, count), np.bool_)
 
     def reset(self, mask: Any = ...) -> None:
@@ -122,7 +144,9 @@ class GridVectorEnvironment:
 
     def move(self, actions: NDArray[np.int64]) -> tuple[NDArray[Any], ...]:
         """Move each robot once, (N,) actions; return reward, terminated, truncated: (N,) each."""
-        actions = numbers("the actions", actions, self.cell.shape, "iu", (0, len(MOVES) - 1))
+        actions = numbers(
+            "the actions", actions, self.cell.shape, "iu", (0, len(MOVES) - 1)
+        )
         if (self.terminated | self.truncated).any():
             raise ResetNeeded("an episode has ended; call reset before the next step")
         lookup = (self.scenario, actions, self.cell)
@@ -132,10 +156,14 @@ class GridVectorEnvironment:
         self.visited[np.arange(len(actions)), self.steps] = self.cell
         self.total_reward += reward
         self.terminated[:] = ~legal | (self.cell == self.goal[self.scenario])
-        self.truncated[:] = ~self.terminated & (self.steps >= self.parameters.max_episode_steps)
+        self.truncated[:] = ~self.terminated & (
+            self.steps >= self.parameters.max_episode_steps
+        )
         return reward, self.terminated, self.truncated
 
-    def observe(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Observations:
+    def observe(
+        self, scenario: NDArray[np.int64], cell: NDArray[np.int64]
+    ) -> Observations:
         """Return what robots in `cell` (B,) see of the maps `scenario` (B,): (B, H, W) float32."""
         observations = self.background[scenario]
         observations[np.arange(len(cell)), cell] = ROBOT
@@ -148,7 +176,9 @@ class GridEnvironment(gymnasium.Env[Observations, np.int64]):
     metadata = {"render_modes": []}  # noqa: RUF012
 
     def __init__(
-        self, scenario: Scenario | None = None, parameters: HyperParameters | None = None
+        self,
+        scenario: Scenario | None = None,
+        parameters: HyperParameters | None = None,
     ) -> None:
         if parameters is None:
             parameters = HyperParameters()
@@ -172,7 +202,9 @@ class GridEnvironment(gymnasium.Env[Observations, np.int64]):
         self._is_begun = True
         return self._observe(), {}
 
-    def step(self, action: np.int64) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
+    def step(
+        self, action: np.int64
+    ) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
         """Move the robot once.
 
         Raises
@@ -184,7 +216,9 @@ class GridEnvironment(gymnasium.Env[Observations, np.int64]):
         """
         is_whole = isinstance(action, Integral) and not isinstance(action, bool)
         is_array = (
-            isinstance(action, np.ndarray) and action.shape == () and action.dtype.kind in "iu"
+            isinstance(action, np.ndarray)
+            and action.shape == ()
+            and action.dtype.kind in "iu"
         )
         if not (is_whole or is_array) or not 0 <= action < len(MOVES):
             raise ValueError(
@@ -192,11 +226,15 @@ class GridEnvironment(gymnasium.Env[Observations, np.int64]):
             )
         if not self._is_begun:
             raise ResetNeeded("no episode has begun; call reset before the first step")
-        (reward,), (terminated,), (truncated,) = self.vector.move(np.array([int(action)]))
+        (reward,), (terminated,), (truncated,) = self.vector.move(
+            np.array([int(action)])
+        )
         return self._observe(), float(reward), bool(terminated), bool(truncated), {}
 
     def _observe(self) -> Observations:
-        observation: Observations = self.vector.observe(self.vector.scenario, self.vector.cell)[0]
+        observation: Observations = self.vector.observe(
+            self.vector.scenario, self.vector.cell
+        )[0]
         return observation
 
 

@@ -9,7 +9,9 @@ from typing import NamedTuple
 from ddqn_planner.files import Appender, as_path, read_rows, write_atomically
 from ddqn_planner.grid import Cell, MoveRule, path_length
 
-HEADER = b"episode,step,scenario,outcome,moves,length,total_reward,average_reward,cells\r\n"
+HEADER = (
+    b"episode,step,scenario,outcome,moves,length,total_reward,average_reward,cells\r\n"
+)
 # A complete row: the number of the episode, and its cells.
 ROW = re.compile(rb"(\d{1,18})(?:,[^,]*){7},(\d{1,9}:\d{1,9}(?: \d{1,9}:\d{1,9})*)\r\n")
 
@@ -54,7 +56,16 @@ def record(episode: Episode, move_rule: MoveRule) -> bytes:
     e, length = episode, round(path_length(episode.cells, move_rule), 4)
     rewards = round(e.total_reward, 6), round(e.average_reward, 6)
     cells = " ".join(f"{x}:{y}" for x, y in e.cells)
-    row = e.number, e.step, e.scenario, e.outcome.value, e.moves, length, *rewards, cells
+    row = (
+        e.number,
+        e.step,
+        e.scenario,
+        e.outcome.value,
+        e.moves,
+        length,
+        *rewards,
+        cells,
+    )
     return f"{','.join(map(str, row))}\r\n".encode()
 
 

@@ -19,7 +19,9 @@ class Evaluation(NamedTuple):
     worst_ratio: float
 
 
-def length_ratios(field: QField, grid: GridMap, move_rule: MoveRule) -> NDArray[np.float64]:
+def length_ratios(
+    field: QField, grid: GridMap, move_rule: MoveRule
+) -> NDArray[np.float64]:
     """Return the cost of the greedy rollout from each cell over that of the best path: (H, W)."""
     # Infinite where the rollout is trapped, NaN at the goal and in cells without a path.
     optimum = shortest_distances(grid, field.goal, move_rule)
@@ -37,4 +39,6 @@ def evaluate(field: QField, grid: GridMap, move_rule: MoveRule) -> Evaluation:
     ratios = length_ratios(field, grid, move_rule)
     solved = ratios[np.isfinite(ratios)]
     mean, worst = (solved.mean(), solved.max()) if len(solved) else (np.nan, np.nan)
-    return Evaluation(int((~np.isnan(ratios)).sum()), len(solved), float(mean), float(worst))
+    return Evaluation(
+        int((~np.isnan(ratios)).sum()), len(solved), float(mean), float(worst)
+    )

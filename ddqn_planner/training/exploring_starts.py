@@ -16,4 +16,6 @@ def initial_cells(
     # `free_cells` are those of all maps, goals left out: an episode's map has `count_N` of them,
     # from place `first_N` on.
     at_random_N = random.random(len(start_N)) < p_r
-    return np.where(at_random_N, free_cells[first_N + random.integers(count_N)], start_N)
+    return np.where(
+        at_random_N, free_cells[first_N + random.integers(count_N)], start_N
+    )

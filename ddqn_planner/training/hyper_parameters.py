@@ -23,24 +23,41 @@ class HyperParameters:
         "paper", "propagation", "any_map", source="ours: the Q-network, see model/"
     )
     target: str = _choice(
-        "double_dqn", "dqn", "printed", source="ours: the target, see training/double_dqn.py"
+        "double_dqn",
+        "dqn",
+        "printed",
+        source="ours: the target, see training/double_dqn.py",
     )
-    reward: str = _choice("paper", "path_cost", source="ours: the reward, see training/reward.py")
-    learning_rate: float = _number(0.01, "section on the network: Adam's learning rate", 1e-6, 1.0)
+    reward: str = _choice(
+        "paper", "path_cost", source="ours: the reward, see training/reward.py"
+    )
+    learning_rate: float = _number(
+        0.01, "section on the network: Adam's learning rate", 1e-6, 1.0
+    )
     batch_size: int = _number(32, "Table 1: transitions in a mini-batch", 1, 4096)
     gamma: float = _number(0.95, "Table 1: discount γ", 0.0, 1.0)
     obstacle_reward: float = _number(-10.0, "Table 1: reward of a collision", -1e3, 0.0)
     goal_reward: float = _number(10.0, "Table 1: reward of the end", 0.0, 1e3)
-    p_r: float = _number(0.5, "section 4.1: probability of a random initial cell", 0.0, 1.0)
-    alpha: float = _number(0.6, "section 4.2: weight α of the progress to the end", 0.0, 10.0)
-    beta: float = _number(0.4, "section 4.2: weight β of the detour from the start", 0.0, 10.0)
+    p_r: float = _number(
+        0.5, "section 4.1: probability of a random initial cell", 0.0, 1.0
+    )
+    alpha: float = _number(
+        0.6, "section 4.2: weight α of the progress to the end", 0.0, 10.0
+    )
+    beta: float = _number(
+        0.4, "section 4.2: weight β of the detour from the start", 0.0, 10.0
+    )
     steps: int = _number(50_000, "section 5.1: environment steps of goal i", 1, 10**9)
     filters: int = _number(16, "ours: filters of the convolution", 1, 1024)
     hidden_units: int = _number(
         0, "ours: units of a hidden layer after the convolution; 0 for none", 0, 4096
     )
-    replay_capacity: int = _number(50_000, "ours: transitions in the replay buffer", 1, 10**7)
-    learning_starts: int = _number(500, "ours: environment steps before learning", 0, 10**6)
+    replay_capacity: int = _number(
+        50_000, "ours: transitions in the replay buffer", 1, 10**7
+    )
+    learning_starts: int = _number(
+        500, "ours: environment steps before learning", 0, 10**6
+    )
     update_interval: int = _number(1, "ours: environment steps per update", 1, 10**4)
     target_interval: int = _number(500, "ours: updates per target copy (N)", 1, 10**6)
     epsilon_start: float = _number(1.0, "ours: ε at the first step", 0.0, 1.0)
@@ -54,16 +71,22 @@ class HyperParameters:
             value, choices = getattr(self, entry.name), entry.metadata.get("choices")
             if choices is not None:
                 if not isinstance(value, str) or value not in choices:
-                    raise ValueError(f"{entry.name} is {value!r}; give one of {', '.join(choices)}")
+                    raise ValueError(
+                        f"{entry.name} is {value!r}; give one of {', '.join(choices)}"
+                    )
                 continue
             is_whole, number = entry.type in (int, "int"), real(value)
             low, high = entry.metadata["range"]
             if isinstance(value, bool) or not low <= number <= high:
-                raise ValueError(f"{entry.name} is {value!r}; it must lie in {low} to {high}")
+                raise ValueError(
+                    f"{entry.name} is {value!r}; it must lie in {low} to {high}"
+                )
             if is_whole and not number.is_integer():
                 raise ValueError(f"{entry.name} is {value!r}; give a whole number")
             # Of any type, and the dataclass is frozen.
             vars(self)[entry.name] = int(value) if is_whole else number
         count, most = self.environments, self.replay_capacity
         if count > most:
-            raise ValueError(f"environments is {count}; give at most replay_capacity, {most}")
+            raise ValueError(
+                f"environments is {count}; give at most replay_capacity, {most}"
+            )

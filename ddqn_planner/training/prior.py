@@ -7,7 +7,13 @@ import torch
 from torch import nn
 
 from ddqn_planner.experience.posterior import cells_of
-from ddqn_planner.experience.prior import FEATURES, UNUSUAL, Float32, Prior, map_features
+from ddqn_planner.experience.prior import (
+    FEATURES,
+    UNUSUAL,
+    Float32,
+    Prior,
+    map_features,
+)
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import as_seed
 
@@ -17,14 +23,23 @@ LEARNING_RATE, WEIGHT_DECAY = 0.01, 0.3
 STEPS, CHECKED = 60, 5  # at most so many; the held-out error is seen every so many
 SMALLEST_SCALE = 0.1  # a feature that hardly varies tells nothing of maps where it does
 FOLDS = 6  # networks that each leave out a part of the places; one more learns from all
-BLOCKS, PLACES = 12, (8, 32)  # near places are alike: so many in a row are left out together
-DOUBT = 2.0  # what is foretold must be so many standard errors from nothing to be believed
-REPLAYED = 512  # places of older maps, and as many of this one, are kept to learn from again
+BLOCKS, PLACES = (
+    12,
+    (8, 32),
+)  # near places are alike: so many in a row are left out together
+DOUBT = (
+    2.0  # what is foretold must be so many standard errors from nothing to be believed
+)
+REPLAYED = (
+    512  # places of older maps, and as many of this one, are kept to learn from again
+)
 FEWEST_PLACES = 32  # from which a prior is learned
 MOST = 6.0  # weight of a place: those on every way do not govern all
 
 
-def prior_of(grid: GridMap, table: Any, older: Prior | None, seed: int = 0) -> Prior | None:
+def prior_of(
+    grid: GridMap, table: Any, older: Prior | None, seed: int = 0
+) -> Prior | None:
     """Train a prior on places of `Evidence.table` that are free on a map; few change nothing."""
     cells, inside = cells_of(table[:, 5:], grid)
     x, y = cells.T
@@ -33,7 +48,9 @@ def prior_of(grid: GridMap, table: Any, older: Prior | None, seed: int = 0) -> P
         return older
     weight, log = table[seen, :2].T
     features = map_features(grid)[y[seen], x[seen]]
-    new = np.column_stack([table[seen, 5:], features, log / weight, np.minimum(weight, MOST)])
+    new = np.column_stack(
+        [table[seen, 5:], features, log / weight, np.minimum(weight, MOST)]
+    )
     return train_prior(new.astype(np.float32), older, seed)
 
 
@@ -56,22 +73,40 @@ def train_prior(new: Float32, older: Prior | None = None, seed: int = 0) -> Prio
     # Other maps may be slower as a whole: theirs is a level of its own.
     is_old = (np.arange(len(rows)) < len(old)).astype(np.float32)
     x = np.column_stack([np.clip((x - mean) / scale, -UNUSUAL, UNUSUAL), is_old])
-    target, block = target - level, np.arange(len(rows)) // np.clip(len(rows) // BLOCKS, *PLACES)
-    left_out = random.permutation(block[-1] + 1)[block] % FOLDS == np.arange(FOLDS + 1)[:, None]
-    foretold, trained = _train(x, target, weight, left_out.astype(np.float32), seed=seed)
-    fit, size = (np.bincount(block, weight * foretold * one) for one in (target, foretold))
+    target, block = (
+        target - level,
+        np.arange(len(rows)) // np.clip(len(rows) // BLOCKS, *PLACES),
+    )
+    left_out = (
+        random.permutation(block[-1] + 1)[block] % FOLDS
+        == np.arange(FOLDS + 1)[:, None]
+    )
+    foretold, trained = _train(
+        x, target, weight, left_out.astype(np.float32), seed=seed
+    )
+    fit, size = (
+        np.bincount(block, weight * foretold * one) for one in (target, foretold)
+    )
     share = fit.sum() / max(size.sum(), 1e-9)
     error = np.linalg.norm(fit - share * size) / max(size.sum(), 1e-9)
-    doubt = DOUBT * error / max(share * (1 - 2 / len(fit)), 1e-9)  # fewer blocks, greater errors
+    doubt = (
+        DOUBT * error / max(share * (1 - 2 / len(fit)), 1e-9)
+    )  # fewer blocks, greater errors
     share = min(share, 1) * (1 - min(doubt, 1) ** 2)
-    if older is not None and len(old) == len(older.replay):  # it has seen none of these places
+    if older is not None and len(old) == len(
+        older.replay
+    ):  # it has seen none of these places
         own, others = (share * foretold)[len(old) :], older.log_slowness(new[:, 2:-2])
         if _error(others, new) < _error(own, new):
             return older
     direct, *layers, last = (array[-1].squeeze() for array in trained)
-    kept = [part[np.sort(random.permutation(len(part))[:REPLAYED])] for part in (old, new)]
+    kept = [
+        part[np.sort(random.permutation(len(part))[:REPLAYED])] for part in (old, new)
+    ]
     network = share * direct[:FEATURES], *layers, share * last, np.concatenate(kept)
-    return Prior(*(np.asarray(array, np.float32) for array in (mean, scale, level, *network)))
+    return Prior(
+        *(np.asarray(array, np.float32) for array in (mean, scale, level, *network))
+    )
 
 
 def _error(foretold: Float32, places: Float32) -> float:
@@ -89,7 +124,9 @@ def _train(*arrays: Float32, seed: int) -> tuple[Float32, list[Float32]]:
     parameters = [torch.zeros(networks, *size) for size in sizes]
     direct, weights_1, bias_1, weights_2, bias_2, weights_3 = parameters
     for layer in weights_1, weights_2:
-        layer += torch.randn(layer.shape[1:], generator=generator) / layer.shape[1] ** 0.5
+        layer += (
+            torch.randn(layer.shape[1:], generator=generator) / layer.shape[1] ** 0.5
+        )
     # The best linear prediction is where they begin; few steps then bend it.
     learned = (1 - left_out) * weight
     moments = torch.einsum("kn,ni,nj->kij", learned, x, torch.column_stack([x, target]))
@@ -103,7 +140,9 @@ def _train(*arrays: Float32, seed: int) -> tuple[Float32, list[Float32]]:
         hidden = torch.baddbmm(bias_1, x[..., :FEATURES], weights_1).tanh()
         hidden = torch.baddbmm(bias_2, hidden, weights_2).tanh()
         output = (x @ direct + hidden @ weights_3)[..., 0]
-        loss = nn.functional.huber_loss(output, target.expand_as(output), reduction="none")
+        loss = nn.functional.huber_loss(
+            output, target.expand_as(output), reduction="none"
+        )
         error = (loss * left_out * weight).sum().item()
         if step % CHECKED == 0 and error < least:
             least, foretold = error, (output * left_out).sum(dim=0).detach().numpy()

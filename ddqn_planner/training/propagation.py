@@ -23,7 +23,10 @@ from ddqn_planner.training.environment import GridVectorEnvironment
 Tensors: TypeAlias = Mapping[str, Tensor]
 
 LENGTHS_A: Final = torch.tensor(LENGTHS, dtype=torch.float32)
-FUSED: Final = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 4)  # Adam, on the CPU too
+FUSED: Final = tuple(map(int, torch.__version__.split(".")[:2])) >= (
+    2,
+    4,
+)  # Adam, on the CPU too
 
 
 class PropagationLearner:
@@ -37,9 +40,13 @@ class PropagationLearner:
     ) -> None:
         e = self.environment = environment
         self.uses_costs = network.uses_costs
-        self._parts = [{name: torch.from_numpy(t) for name, t in part.items()} for part in parts]
+        self._parts = [
+            {name: torch.from_numpy(t) for name, t in part.items()} for part in parts
+        ]
         self._online, self._target, *_ = self._parts
-        seen = [(patches(s.grid.occupancy, s.grid.cost), s.move_rule) for s in e.scenarios]
+        seen = [
+            (patches(s.grid.occupancy, s.grid.cost), s.move_rule) for s in e.scenarios
+        ]
         features = np.concatenate([network.features(*of_map) for of_map in seen])
         self._feature_UI, places = np.unique(features, axis=0, return_inverse=True)
         self._place_SC = places.reshape(len(seen), -1)
@@ -57,9 +64,13 @@ class PropagationLearner:
         # A state: the features, the return r + γ V(s') of each move (γ V(s') where r is learned),
         # r_o. A gradient through V would diverge: none flows.
         returns = return_SCA + cost_SCA, np.full_like(return_SCA[..., :1], collision)
-        self._state_SCX = np.concatenate([self._feature_UI[self._place_SC], *returns], axis=2)
+        self._state_SCX = np.concatenate(
+            [self._feature_UI[self._place_SC], *returns], axis=2
+        )
 
-    def q_values(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> NDArray[np.float32]:
+    def q_values(
+        self, scenario: NDArray[np.int64], cell: NDArray[np.int64]
+    ) -> NDArray[np.float32]:
         """Return Q(s, a) of robots in `cell` (B,) on the maps `scenario` (B,): (B, 8)."""
         return self._evaluate(scenario, cell)[0].numpy()
 
@@ -84,7 +95,10 @@ class PropagationLearner:
     def update(self, batch: Transitions, number: int) -> None:
         """Make an update, of this number, with a gradient by hand: in half of autograd's time."""
         count, p = len(batch.cell), self.environment.parameters
-        states = np.tile(batch.scenario, 2), np.concatenate([batch.cell, batch.next_cell])
+        states = (
+            np.tile(batch.scenario, 2),
+            np.concatenate([batch.cell, batch.next_cell]),
+        )
         q_2BA, gain_2BA, activations = self._evaluate(*states)
         q = self._q_SCA[batch.scenario, batch.next_cell], q_2BA.numpy()
         gradient_BA = torch.from_numpy(double_dqn_gradient(p.target, batch, *q))
@@ -108,30 +122,48 @@ class PropagationLearner:
             self.settle()
 
 
-def _take_step(parts: Sequence[Tensors], gradients: Tensors, number: int, rate: float) -> None:
+def _take_step(
+    parts: Sequence[Tensors], gradients: Tensors, number: int, rate: float
+) -> None:
     """Take Adam's step of this number, given θ, θ⁻, Adam's moments and the gradients."""
     of_each = parts[0], gradients, *parts[2:]
     weights, slopes, mean, square = ([of[name] for name in parts[0]] for of in of_each)
     updates = [torch.tensor(number - 1.0) for _ in weights]
-    settings: Any = {"lr": rate, "beta1": 0.9, "beta2": 0.999, "eps": 1e-8, "weight_decay": 0.0}
+    settings: Any = {
+        "lr": rate,
+        "beta1": 0.9,
+        "beta2": 0.999,
+        "eps": 1e-8,
+        "weight_decay": 0.0,
+    }
     settings |= {"fused": FUSED, "amsgrad": False, "maximize": False}
     adam(weights, slopes, mean, square, [], updates, **settings)
 
 
 def _gradients(layer: str, by_output: Tensor, input_BF: Tensor) -> dict[str, Tensor]:
     """Return the gradients of a layer, given that by its output."""
-    return {f"{layer}.weight": by_output.T @ input_BF, f"{layer}.bias": by_output.sum(0)}
+    return {
+        f"{layer}.weight": by_output.T @ input_BF,
+        f"{layer}.bias": by_output.sum(0),
+    }
 
 
 def _layer(weights: Tensors, name: str, input_BF: Tensor) -> Tensor:
-    return functional.linear(input_BF, weights[f"{name}.weight"], weights[f"{name}.bias"])
+    return functional.linear(
+        input_BF, weights[f"{name}.weight"], weights[f"{name}.bias"]
+    )
 
 
 def _activations(weights: Tensors, feature_BI: Tensor) -> list[Tensor]:
     """Return the features, and what each layer makes of what is before it; p(s, a) at the end."""
     first_BF = _layer(weights, "convolution", feature_BI).relu()
     second_BF = _layer(weights, "hidden", first_BF).relu()
-    return [feature_BI, first_BF, second_BF, _layer(weights, "moves", second_BF).sigmoid()]
+    return [
+        feature_BI,
+        first_BF,
+        second_BF,
+        _layer(weights, "moves", second_BF).sigmoid(),
+    ]
 
 
 # Value iteration on many maps at once
@@ -155,10 +187,16 @@ def value_iteration(
     gain_SCA[np.arange(maps), goal_S] = base_SCA[np.arange(maps), goal_S] = 0.0
     # From below, as if every move collided: values then rise outwards from the goal.
     value_SC = np.full((maps, cells + 1), collision, dtype=np.float32)
-    gain_SCA, base_SCA, near_CA = map(np.ascontiguousarray, (gain_SCA, base_SCA, neighbours_AC.T))
+    gain_SCA, base_SCA, near_CA = map(
+        np.ascontiguousarray, (gain_SCA, base_SCA, neighbours_AC.T)
+    )
     _settle(value_SC, gain_SCA, base_SCA, near_CA)
-    return_SCA: NDArray[np.float32] = reward_SCA + np.float32(gamma) * value_SC[:, near_CA]
-    return return_SCA, np.float32(collision) + success_SCA * (return_SCA - np.float32(collision))
+    return_SCA: NDArray[np.float32] = (
+        reward_SCA + np.float32(gamma) * value_SC[:, near_CA]
+    )
+    return return_SCA, np.float32(collision) + success_SCA * (
+        return_SCA - np.float32(collision)
+    )
 
 
 @compiled
@@ -174,7 +212,9 @@ def _settle(value_SC: Any, gain_SCA: Any, base_SCA: Any, neighbours_CA: Any) -> 
                 c = turn if sweep % 2 == 0 else cells - 1 - turn
                 best = base[c, 0] + gain[c, 0] * value[neighbours_CA[c, 0]]
                 for a in range(1, moves):
-                    best = max(best, base[c, a] + gain[c, a] * value[neighbours_CA[c, a]])
+                    best = max(
+                        best, base[c, a] + gain[c, a] * value[neighbours_CA[c, a]]
+                    )
                 change = max(change, abs(best - value[c]))
                 value[c] = best
             if change < np.float32(1e-3):

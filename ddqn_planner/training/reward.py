@@ -3,12 +3,24 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap, MoveRule, move_costs, neighbours
+from ddqn_planner.grid import (
+    LENGTHS,
+    MOVES,
+    Cell,
+    GridMap,
+    MoveRule,
+    move_costs,
+    neighbours,
+)
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
 
 def move_reward(
-    grid: GridMap, start: Cell, goal: Cell, move_rule: MoveRule, parameters: HyperParameters
+    grid: GridMap,
+    start: Cell,
+    goal: Cell,
+    move_rule: MoveRule,
+    parameters: HyperParameters,
 ) -> NDArray[np.float32]:
     """Return the reward R_t of each legal move, action a in (x, y) at ``[a, y, x]``: (8, H, W)."""
     if parameters.reward == "path_cost":

@@ -14,7 +14,11 @@ from ddqn_planner.grid.footprint import read_footprint
 from ddqn_planner.grid.motions import HEADINGS, Motion, make_motions, read_lattice
 from ddqn_planner.model import ModelMetadata, RobotNetwork, package_version
 from ddqn_planner.model.robot import BodyCertificate
-from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions, double_dqn_gradient
+from ddqn_planner.training.double_dqn import (
+    ReplayBuffer,
+    Transitions,
+    double_dqn_gradient,
+)
 from ddqn_planner.training.exploring_starts import initial_cells
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.propagation import value_iteration
@@ -36,9 +40,14 @@ ROBOT: Final = HyperParameters(
     target_interval=2000,
     environments=12,
 )
-FIRST: Final = 0.3, 1.0  # the weights and the thresholds of a network that knows nothing
+FIRST: Final = (
+    0.3,
+    1.0,
+)  # the weights and the thresholds of a network that knows nothing
 PER_UNIT: Final = ("batch_size", "learning_starts", "environments")
-SHRINKS: Final = 3e-5  # what each weight loses per update: an obstacle is harmless unless seen
+SHRINKS: Final = (
+    3e-5  # what each weight loses per update: an obstacle is harmless unless seen
+)
 CAREFUL: Final = 0.1  # of a step is what a threshold moves
 CHECKED: Final = 100  # updates between two proofs
 MOST_STEPS: Final = 10**12
@@ -63,10 +72,16 @@ class RobotTrainer:
         elif lattice is not None and motion is None:
             motions = read_lattice(lattice)
         else:
-            count = "neither motion nor lattice is" if motion is None else "motion and lattice are"
+            count = (
+                "neither motion nor lattice is"
+                if motion is None
+                else "motion and lattice are"
+            )
             remedy = f"give one of the two: motion {', '.join(Motion)}, or lattice FILE"
             raise ValueError(f"{count} given; {remedy}")
-        self.network = RobotNetwork.untrained(read_footprint(footprint, padding), motions)
+        self.network = RobotNetwork.untrained(
+            read_footprint(footprint, padding), motions
+        )
         self.seed = seed = as_seed(seed)
         tensors, units = self.network.tensors, self.network.sizes["units"]
         counts = {name: min(4096, units * getattr(ROBOT, name)) for name in PER_UNIT}
@@ -80,13 +95,19 @@ class RobotTrainer:
         # the draws belong to what one seed gives.
         self.width = width = swept.shape[1] + 5  # more than what the robot sees
         count = max(4, min(16, 60_000 // width**2))  # fewer, if they are large
-        drawn = np.array([maps.choice(width**2, 3, replace=False) for _ in range(count)])
+        drawn = np.array(
+            [maps.choice(width**2, 3, replace=False) for _ in range(count)]
+        )
         self.goal_M = drawn[:, 1] * HEADINGS
         self.obstacle_M2 = np.column_stack(np.divmod(drawn[:, 2], width))
 
-        of_heading = [np.flatnonzero(motions.start == heading) for heading in range(HEADINGS)]
+        of_heading = [
+            np.flatnonzero(motions.start == heading) for heading in range(HEADINGS)
+        ]
         most = max(map(len, of_heading))
-        self.primitive_KN = np.array([np.resize(numbers, most) for numbers in of_heading]).T
+        self.primitive_KN = np.array(
+            [np.resize(numbers, most) for numbers in of_heading]
+        ).T
         y, x = np.mgrid[: self.width, : self.width].reshape(2, -1, 1)
         dx, dy = motions.offset[self.primitive_KN].T[..., None, :].swapaxes(1, 3)
         cell_KCN = (y + dy) % self.width * self.width + (x + dx) % self.width
@@ -94,7 +115,9 @@ class RobotTrainer:
         self.next_KC = next_KCN.reshape(most, -1)
         self.reward_KC = np.tile(-motions.cost[self.primitive_KN], self.width**2)
         is_first_MC = np.arange(self.next_KC.shape[1]) != self.goal_M[:, None]
-        _, self._first = np.nonzero(is_first_MC)  # where episodes start: on obstacles, too
+        _, self._first = np.nonzero(
+            is_first_MC
+        )  # where episodes start: on obstacles, too
         self._replay = ReplayBuffer(self.parameters.replay_capacity)
         self.steps = self.updates = 0
 
@@ -106,7 +129,10 @@ class RobotTrainer:
         self._threshold = tensors["threshold"]
         # Where a robot that has turned by quarters sees an obstacle, so many rows and columns away.
         side = swept.shape[1]
-        near, seen = np.arange(side) - side // 2, np.arange(side * side).reshape(side, side)
+        near, seen = (
+            np.arange(side) - side // 2,
+            np.arange(side * side).reshape(side, side),
+        )
         self._place = np.full((4, self.width, self.width), side * side)
         for quarter in range(4):
             self._place[quarter][np.ix_(near, near)] = np.rot90(seen, -quarter)
@@ -137,8 +163,15 @@ class RobotTrainer:
         occupancy = np.zeros((self.width, self.width), dtype=np.bool_)
         occupancy[tuple(self.obstacle_M2[0])] = True
         p, sizes = self.parameters, self.network.sizes
-        of_training = GridMap(occupancy).fingerprint, self.steps, self.seed, package_version()
-        return ModelMetadata(self.network.name, sizes, MoveRule.ROBOT_SAFE, p.gamma, *of_training)
+        of_training = (
+            GridMap(occupancy).fingerprint,
+            self.steps,
+            self.seed,
+            package_version(),
+        )
+        return ModelMetadata(
+            self.network.name, sizes, MoveRule.ROBOT_SAFE, p.gamma, *of_training
+        )
 
     def _step(self, robots: int) -> None:
         """Let so many robots try a random primitive, and remember what came of it."""
@@ -155,14 +188,19 @@ class RobotTrainer:
         reward = np.where(legal, self.reward_KC[actions, cell], collision)
         goes_on = legal & (next_cell != self.goal_M[scenario])
         discount = np.where(goes_on, p.gamma, 0.0).astype(np.float32)
-        self._replay.add(Transitions(scenario, cell, actions, reward, next_cell, discount))
+        self._replay.add(
+            Transitions(scenario, cell, actions, reward, next_cell, discount)
+        )
         self.steps += robots
 
     def _update(self) -> None:
         """Make one Double DQN update with a batch from the replay buffer."""
         p, units = self.parameters, len(self._weight)
         batch = self._replay.sample(p.batch_size, self._sampling)
-        states = np.tile(batch.scenario, 2), np.concatenate([batch.cell, batch.next_cell])
+        states = (
+            np.tile(batch.scenario, 2),
+            np.concatenate([batch.cell, batch.next_cell]),
+        )
         unit_2BK, place_2B = self._observed(*states)
         p_2BK = self._success(unit_2BK, place_2B)
         collision = np.float32(p.obstacle_reward)
@@ -190,7 +228,11 @@ class RobotTrainer:
         """Return the unit of each action, (B, K), and the place of the obstacle, (B,)."""
         heading, cell, width = cell % HEADINGS, cell // HEADINGS, self.width
         y, x = self.obstacle_M2[scenario].T
-        seen = heading // (HEADINGS // 4), (y - cell // width) % width, (x - cell % width) % width
+        seen = (
+            heading // (HEADINGS // 4),
+            (y - cell // width) % width,
+            (x - cell % width) % width,
+        )
         return self.network.unit[self.primitive_KN[:, heading]].T, self._place[seen]
 
     def _success(
@@ -204,10 +246,14 @@ class RobotTrainer:
     def _settle(self) -> None:
         """As the target network, settle V on every map."""
         p, cells = self.parameters, np.arange(self.next_KC.shape[1])
-        self._return_SCK = np.empty((len(self.goal_M), *self.next_KC.T.shape), np.float32)
+        self._return_SCK = np.empty(
+            (len(self.goal_M), *self.next_KC.T.shape), np.float32
+        )
         self._q_SCK = np.empty_like(self._return_SCK)
         for number in range(len(self.goal_M)):
-            p_1CK = self._success(*self._observed(np.full_like(cells, number), cells))[None]
+            p_1CK = self._success(*self._observed(np.full_like(cells, number), cells))[
+                None
+            ]
             given = self.reward_KC.T[None], self.goal_M[[number]], self.next_KC, p.gamma
             (returns,), (q,) = value_iteration(p_1CK, *given, p.obstacle_reward)
             self._return_SCK[number], self._q_SCK[number] = returns, q

@@ -33,11 +33,15 @@ class TrainingRun(WorkFolder):
             self.trainer = Trainer(scenarios, parameters, seed)
             if self.checkpoint_path.exists():
                 self.trainer.restore(self.checkpoint_path)
-            self._record = open_record(self.folder / "episodes.csv", self.trainer.episodes)
+            self._record = open_record(
+                self.folder / "episodes.csv", self.trainer.episodes
+            )
             self.callback(self._record.close)
         self.asked: set[str] = set()  # to save after the step under way, to stop
         first = self.saved_at = self.trainer.steps
-        self.description = f"training in {self.folder} from step {first} to {parameters.steps}"
+        self.description = (
+            f"training in {self.folder} from step {first} to {parameters.steps}"
+        )
 
     def steps(self, every: int = SAVE_INTERVAL) -> Iterator[list[Episode]]:
         """Train until the end or "stop" is asked for, and save; yield as `Trainer.run` does."""
@@ -45,8 +49,13 @@ class TrainingRun(WorkFolder):
         with _memory_with_remedy():
             for finished in self.trainer.run(until, every):
                 for episode in finished:
-                    self._record.append(record(episode, scenarios[episode.scenario].move_rule))
-                due = self.trainer.steps // SAVE_INTERVAL != self.saved_at // SAVE_INTERVAL
+                    self._record.append(
+                        record(episode, scenarios[episode.scenario].move_rule)
+                    )
+                due = (
+                    self.trainer.steps // SAVE_INTERVAL
+                    != self.saved_at // SAVE_INTERVAL
+                )
                 if (due or "save" in self.asked) and self.trainer.steps < until:
                     self.asked.discard("save")
                     self.try_to_save()

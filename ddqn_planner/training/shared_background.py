@@ -25,16 +25,27 @@ Floats = NDArray[np.floating[Any]]
 Integers = NDArray[np.int64]
 
 # Sums in any order, so that eight are added at once; NaN and infinity as ever.
-FLAGS = {"reassoc": True, "contract": True, "arcp": True, "nsz": True}  # a set has no fixed order
-compiled, inner = (partial(each, fastmath=FLAGS) for each in (compiling.compiled, compiling.inner))
-inner_in_place = partial(inner, _nrt=False)  # without counts of references, as it makes no array
+FLAGS = {
+    "reassoc": True,
+    "contract": True,
+    "arcp": True,
+    "nsz": True,
+}  # a set has no fixed order
+compiled, inner = (
+    partial(each, fastmath=FLAGS) for each in (compiling.compiled, compiling.inner)
+)
+inner_in_place = partial(
+    inner, _nrt=False
+)  # without counts of references, as it makes no array
 
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, np.float32(1e-8)  # Adam's, as torch has them
 LEAST = np.float32(1e-30)  # mean of a gradient: less moves no weight
 WINDOWS = 5_000  # that the steps of one call look at: so it returns within milliseconds
 
 # The hyper-parameters that are numbers, for compiled code.
-NUMBERS: Any = {f.name: type(f.default) for f in fields(HyperParameters) if f.type in (int, float)}
+NUMBERS: Any = {
+    f.name: type(f.default) for f in fields(HyperParameters) if f.type in (int, float)
+}
 Numbers: Any = namedtuple("Numbers", [*NUMBERS])  # type: ignore[misc]
 
 
@@ -48,7 +59,9 @@ class Windows(NamedTuple):
     shape: tuple[int, int]  # (H, W)
     patch: Floats  # (B * D, 9): each state's windows that are not the common ones
     changed: Integers  # (B * D,): which they are
-    first: Integers  # (B + 1,): those of state n are from first[n] to before first[n + 1]
+    first: (
+        Integers  # (B + 1,): those of state n are from first[n] to before first[n + 1]
+    )
     before: Floats  # (B * D, F): their convolution before ReLU by the network that was asked last
 
 
@@ -66,11 +79,15 @@ class Network(NamedTuple):
     output: Floats  # (U,): of the layer after the convolution
     own_output: Floats  # (B, U): of the layer after it
     q: Floats  # (B, 8)
-    eight: tuple[int, ...]  # of 8 zeros where U is 8: a known number of turns is twice as fast
+    eight: tuple[
+        int, ...
+    ]  # of 8 zeros where U is 8: a known number of turns is twice as fast
 
 
 def arrays_of(
-    parts: Sequence[dict[str, Any]], environment: GridVectorEnvironment, replay: ReplayBuffer
+    parts: Sequence[dict[str, Any]],
+    environment: GridVectorEnvironment,
+    replay: ReplayBuffer,
 ) -> tuple[Any, Any, Any]:
     """Return what `play` takes of a training: its game, what it learns, and its robots."""
     e, p = environment, environment.parameters
@@ -80,7 +97,9 @@ def arrays_of(
     online, target, mean, square, gradient = networks
     selection = target if p.target == "dqn" else online  # see `double_dqn_gradient`
     evaluation = online if p.target == "printed" else target
-    numbers = Numbers(*(as_number(getattr(p, name)) for name, as_number in NUMBERS.items()))
+    numbers = Numbers(
+        *(as_number(getattr(p, name)) for name, as_number in NUMBERS.items())
+    )
     batch, actions = ReplayBuffer(p.batch_size).transitions, np.zeros_like(e.cell)
     of_update = batch, selection.q, evaluation.q, gradient, mean.weights, square.weights
     learning = numbers, windows, online, target, replay.transitions, *of_update
@@ -90,33 +109,50 @@ def arrays_of(
 
 
 def networks_of(
-    background_SC: Floats, shape: tuple[int, int], parts: Sequence[dict[str, Any]], batch: int
+    background_SC: Floats,
+    shape: tuple[int, int],
+    parts: Sequence[dict[str, Any]],
+    batch: int,
 ) -> tuple[Windows, list[Network]]:
     """Return networks of the paper's tensors, which from now on are parts of them, for B states.
 
     The maps are of shape (H, W); all floats are as exact as their backgrounds.
     """
     zeros: Any = partial(np.zeros, dtype=background_SC.dtype)
-    own = np.pad(background_SC, [(0, 0), (0, 1)])[:, window_cells(shape)]  # 0 outside the map
+    own = np.pad(background_SC, [(0, 0), (0, 1)])[
+        :, window_cells(shape)
+    ]  # 0 outside the map
     common = np.sort(own, axis=0)[len(own) // 2]
     scenario, differing = np.nonzero((own != common).any(axis=2))
     ends = np.searchsorted(scenario, np.arange(len(own) + 1))
-    rows, filters = batch * (4 + int(np.diff(ends).max())), len(parts[0]["convolution.bias"])
+    rows, filters = (
+        batch * (4 + int(np.diff(ends).max())),
+        len(parts[0]["convolution.bias"]),
+    )
     seen = zeros((rows, 9)), np.zeros(rows, np.int64), np.zeros(batch + 1, np.int64)
-    windows = Windows(common, own, differing, ends, shape, *seen, zeros((rows, filters)))
+    windows = Windows(
+        common, own, differing, ends, shape, *seen, zeros((rows, filters))
+    )
     networks = []
     for tensors in parts:
         turned = [t.T if t.ndim < 3 else t.reshape(-1, 9).T for t in tensors.values()]
         turned += [np.zeros((0, 8)), np.zeros(0)][: 6 - len(turned)]
         weights = np.concatenate([array.ravel() for array in turned], dtype=own.dtype)
         split = np.split(weights, np.cumsum([array.size for array in turned])[:-1])
-        layers: Any = [part.reshape(t.shape) for part, t in zip(split, turned, strict=True)]
+        layers: Any = [
+            part.reshape(t.shape) for part, t in zip(split, turned, strict=True)
+        ]
         units, has_last = len(layers[3]), len(tensors) > 4
         for (name, tensor), array in zip(tensors.items(), layers, strict=False):
             tensors[name] = array.T.reshape(tensor.shape)
-        own_output, of_common = zeros((batch, units)), (zeros((len(common), filters)), zeros(units))
+        own_output, of_common = (
+            zeros((batch, units)),
+            (zeros((len(common), filters)), zeros(units)),
+        )
         q, eight = (zeros((batch, 8)), ()) if has_last else (own_output, (0,) * 8)
-        networks.append(Network._make([weights, *layers, *of_common, own_output, q, eight]))
+        networks.append(
+            Network._make([weights, *layers, *of_common, own_output, q, eight])
+        )
     return windows, networks
 
 
@@ -167,9 +203,16 @@ def evaluate(network: Any, windows: Any, scenario: Any, cell: Any) -> None:
     """Compute Q of robots in cells (B,) of maps (B,)."""
     see(windows, scenario, cell)
     layer, last, output, q = network.layer, network.last, network.own_output, network.q
-    first, changed, after, before = windows.first, windows.changed, network.after, windows.before
+    first, changed, after, before = (
+        windows.first,
+        windows.changed,
+        network.after,
+        windows.before,
+    )
     (count, filters), units = after.shape, network.output.size
-    convolve(network.kernel, network.kernel_bias, windows.patch, first[cell.size], before)
+    convolve(
+        network.kernel, network.kernel_bias, windows.patch, first[cell.size], before
+    )
     for n in range(cell.size):
         put(network.output, output[n])
         for row in range(first[n], first[n + 1]):
@@ -217,14 +260,25 @@ def see(windows: Any, scenario: Any, cell: Any) -> None:
 
 
 @compiled
-def play(game: Any, learning: Any, robots: Any, random: Any, counters: Any, until: int) -> None:
+def play(
+    game: Any, learning: Any, robots: Any, random: Any, counters: Any, until: int
+) -> None:
     """Make steps until an episode ends, or `until`, or some milliseconds have passed.
 
     The counters are steps, updates and replayed transitions.
     """
     legal, rewards, next_cell, goal = game
     numbers, windows, online, target, replay = learning[:5]
-    scenario, cell, actions, episode_steps, visited, total_reward, terminated, truncated = robots
+    (
+        scenario,
+        cell,
+        actions,
+        episode_steps,
+        visited,
+        total_reward,
+        terminated,
+        truncated,
+    ) = robots
     exploration, sampling = random
     look(online, windows)
     look(target, windows)
@@ -232,7 +286,9 @@ def play(game: Any, learning: Any, robots: Any, random: Any, counters: Any, unti
     until = min(until, counters[0] + count * max(1, WINDOWS // len(online.after)))
     while counters[0] < until and not is_over:
         share = min(counters[0] / numbers.epsilon_steps, 1.0)
-        epsilon = numbers.epsilon_start + share * (numbers.epsilon_end - numbers.epsilon_start)
+        epsilon = numbers.epsilon_start + share * (
+            numbers.epsilon_end - numbers.epsilon_start
+        )
         for n in range(count):
             actions[n] = exploration.integers(0, 8)
         evaluate(online, windows, scenario, cell)
@@ -244,7 +300,9 @@ def play(game: Any, learning: Any, robots: Any, random: Any, counters: Any, unti
             after = next_cell[actions[n], cell[n]] if legal[at] else cell[n]
             episode_steps[n] += 1
             terminated[n] = not legal[at] or after == goal[scenario[n]]
-            truncated[n] = not terminated[n] and episode_steps[n] >= numbers.max_episode_steps
+            truncated[n] = (
+                not terminated[n] and episode_steps[n] >= numbers.max_episode_steps
+            )
             is_over |= terminated[n] or truncated[n]
             slot = counters[2] % replay.cell.size
             replay.scenario[slot], replay.action[slot], replay.cell[slot] = at
@@ -268,7 +326,10 @@ def update(learning: Any, sampling: Any, counters: Any) -> None:
     for n in range(size):
         slot = sampling.integers(0, min(counters[2], replay.cell.size))
         batch.scenario[n], batch.cell[n] = replay.scenario[slot], replay.cell[slot]
-        batch.action[n], batch.next_cell[n] = replay.action[slot], replay.next_cell[slot]
+        batch.action[n], batch.next_cell[n] = (
+            replay.action[slot],
+            replay.next_cell[slot],
+        )
         batch.reward[n], batch.discount[n] = replay.reward[slot], replay.discount[slot]
     evaluate(online, windows, batch.scenario, batch.next_cell)
     evaluate(target, windows, batch.scenario, batch.next_cell)
@@ -282,7 +343,14 @@ def update(learning: Any, sampling: Any, counters: Any) -> None:
         gradient.q[n, action] = 2 * (online.q[n, action] - batch.reward[n]) / size
     differentiate(online, windows, gradient, size)
     counters[1] += 1
-    adam(online.weights, gradient.weights, mean, square, numbers.learning_rate, counters[1])
+    adam(
+        online.weights,
+        gradient.weights,
+        mean,
+        square,
+        numbers.learning_rate,
+        counters[1],
+    )
     look(online, windows)
     if counters[1] % numbers.target_interval == 0:
         put(online.weights, target.weights)
@@ -312,7 +380,9 @@ def differentiate(network: Any, windows: Any, gradient: Any, count: int) -> None
             for f in range(filters):
                 feature, through = max(own_before[row, f], np.float32(0)), np.float32(0)
                 change, number = feature - after[window, f], f * total + window
-                if feature != 0 or change != 0:  # most features are 0, with the robot and without
+                if (
+                    feature != 0 or change != 0
+                ):  # most features are 0, with the robot and without
                     for u in range(len(network.eight) or units):
                         layer_gradient[number, u] += change * error[n, u]
                         through += layer[number, u] * error[n, u]
@@ -346,7 +416,9 @@ def add_kernel(kernel: Any, bias: Any, patch: Any, count: int, before: Any) -> N
 
 
 @inner_in_place
-def adam(weights: Any, slopes: Any, means: Any, squares: Any, rate: float, updates: int) -> None:
+def adam(
+    weights: Any, slopes: Any, means: Any, squares: Any, rate: float, updates: int
+) -> None:
     """Take Adam's step number `updates` (Kingma and Ba 2015, with torch's place of epsilon)."""
     step = np.float32(rate / (1 - BETA_1**updates))
     root = np.float32(1 / np.sqrt(1 - BETA_2**updates))

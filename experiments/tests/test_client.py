@@ -17,7 +17,11 @@ def test_the_check_of_an_answer_finds_each_error() -> None:
     cases: list[tuple[Cell, Cell, list[Cell], str]] = [
         ((0, 0), (1, 1), [(0, 0), (0, 1), (1, 1)], ""),
         ((0, 0), (0, 0), [(0, 0)], ""),
-        *((start, goal, [], "") for start in ((0, 0), (1, 0)) for goal in ((2, 0), (9, 9))),
+        *(
+            (start, goal, [], "")
+            for start in ((0, 0), (1, 0))
+            for goal in ((2, 0), (9, 9))
+        ),
         ((0, 0), (1, 1), [], "where there is one"),
         ((0, 0), (1, 1), [(0, 0), (0, 1)], "asked was"),
         ((0, 0), (1, 1), [(0, 0), (1, 1)], "illegal segment"),
@@ -30,7 +34,9 @@ def test_the_check_of_an_answer_finds_each_error() -> None:
         assert (error in found) if error else not found
 
 
-def test_a_signal_while_a_node_is_started_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_signal_while_a_node_is_started_ends_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     children = []
 
     def start(*arguments: Any, **options: Any) -> subprocess.Popen[bytes]:

@@ -25,7 +25,9 @@ def test_a_world_is_always_the_same_and_something_is_slow(kind: str) -> None:
     if world.crowds:
         trip = world.stations[:2]
         world.best_seconds(*trip, 0)
-        assert world.best_seconds(*trip, worlds.HOUR) == again.best_seconds(*trip, worlds.HOUR)
+        assert world.best_seconds(*trip, worlds.HOUR) == again.best_seconds(
+            *trip, worlds.HOUR
+        )
 
 
 def test_held_out_worlds_are_no_worlds_for_tuning() -> None:
@@ -33,7 +35,10 @@ def test_held_out_worlds_are_no_worlds_for_tuning() -> None:
 
 
 def test_a_drive_takes_the_time_of_its_path_and_stands_where_it_waits() -> None:
-    world, random = worlds.generated_world("office-mixture", 0), np.random.default_rng(0)
+    world, random = (
+        worlds.generated_world("office-mixture", 0),
+        np.random.default_rng(0),
+    )
     path = Planner.load("any_map").plan(
         world.known(0), world.stations[0], world.stations[1], MoveRule.ROBOT_SAFE
     )
@@ -41,7 +46,9 @@ def test_a_drive_takes_the_time_of_its_path_and_stands_where_it_waits() -> None:
     assert path.cost == pytest.approx(expected)
     assert world.best_seconds(*world.stations[:2], 0) == pytest.approx(expected)
     drives = [worlds.drive(path.cells, world, 100.0, random) for _ in range(200)]
-    assert np.mean([measured.duration for measured in drives]) == pytest.approx(expected, rel=0.03)
+    assert np.mean([measured.duration for measured in drives]) == pytest.approx(
+        expected, rel=0.03
+    )
     seconds, positions = drives[0].seconds, drives[0].positions
     assert seconds[0] == 100
     assert seconds[-1] == pytest.approx(100 + drives[0].duration, abs=0.2)
@@ -112,13 +119,26 @@ def test_no_learner_is_faster_than_the_one_that_knows(learner: str) -> None:
 def test_the_experiment_writes_its_report(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    command = ["--backend", "sequential", "--quick", "--seeds", "1", "--out", str(tmp_path)]
+    command = [
+        "--backend",
+        "sequential",
+        "--quick",
+        "--seeds",
+        "1",
+        "--out",
+        str(tmp_path),
+    ]
     assert main(command) == 0
     assert "| experience | " in capsys.readouterr().out
-    assert {path.name for path in (tmp_path / "quick").iterdir()} == {"report.md", "curve.png"}
+    assert {path.name for path in (tmp_path / "quick").iterdir()} == {
+        "report.md",
+        "curve.png",
+    }
 
 
-def test_wrong_options_are_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_wrong_options_are_refused(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     for options, words in (
         (["--seeds", "0"], "--seeds is 0; give at least 1"),
         (["--maps", str(tmp_path)], "found no ROS map (.yaml); check the path"),

@@ -22,7 +22,9 @@ def test_a_flip_leads_away_from_what_was_left_within_the_next_metres() -> None:
 
 
 @pytest.mark.parametrize("is_straight", [False, True])
-def test_a_drive_is_the_same_each_time_and_flips_less_with_a_threshold(is_straight: bool) -> None:
+def test_a_drive_is_the_same_each_time_and_flips_less_with_a_threshold(
+    is_straight: bool,
+) -> None:
     planner = Planner.load("any_map")
     without, again, with_threshold = (
         drive(planner, "two ways", 0, threshold, is_straight, side=80)

@@ -8,7 +8,14 @@ from typing import Any
 import generalisation
 import numpy as np
 import pytest
-from generalisation import BenchmarkMap, RequestSettings, Rollout, illegal_moves, main, markdown
+from generalisation import (
+    BenchmarkMap,
+    RequestSettings,
+    Rollout,
+    illegal_moves,
+    main,
+    markdown,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 from map_files import save_map
@@ -43,9 +50,13 @@ class PerfectNetwork:
 
     def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> np.ndarray:
         distance = np.append(shortest_distances(grid, goal, move_rule), np.inf)
-        onward = distance[neighbours(grid.occupancy.shape)].reshape(-1, *grid.occupancy.shape)
+        onward = distance[neighbours(grid.occupancy.shape)].reshape(
+            -1, *grid.occupancy.shape
+        )
         q = -move_costs(grid.cost_multiplier, move_rule) - onward
-        return np.where(legal_moves(grid.occupancy, move_rule), q, self.bonus).astype(np.float32)
+        return np.where(legal_moves(grid.occupancy, move_rule), q, self.bonus).astype(
+            np.float32
+        )
 
 
 class StubbornNetwork(PerfectNetwork):
@@ -72,7 +83,13 @@ def rows(rollouts: list[Rollout]) -> list[list[str]]:
 
 def total(rollouts: list[Rollout], *columns: str) -> list[str]:
     """Cells of the last row, which counts all rollouts."""
-    row = dict(zip(["all", *generalisation.COLUMNS.split(" | ")], rows(rollouts)[-1], strict=True))
+    row = dict(
+        zip(
+            ["all", *generalisation.COLUMNS.split(" | ")],
+            rows(rollouts)[-1],
+            strict=True,
+        )
+    )
     return [row[column] for column in columns]
 
 
@@ -96,13 +113,18 @@ CORNER = ["..@", "...", "..."]
 
 
 @given(
-    RULES, st.sampled_from([*generalisation.COSTS]), st.sampled_from([*KINDS]), st.integers(0, 99)
+    RULES,
+    st.sampled_from([*generalisation.COSTS]),
+    st.sampled_from([*KINDS]),
+    st.integers(0, 99),
 )
 def test_a_perfect_network_solves_every_request_at_the_least_cost(
     rule: MoveRule, costs: str, kind: str, seed: int
 ) -> None:
     maps = list(
-        generalisation.generated_maps([kind], [9], 2, RequestSettings(rule, 27, costs, seed))
+        generalisation.generated_maps(
+            [kind], [9], 2, RequestSettings(rule, 27, costs, seed)
+        )
     )
     for drawn in maps:
         assert len({goal for _, goal in drawn.requests}) <= generalisation.GOALS
@@ -112,18 +134,28 @@ def test_a_perfect_network_solves_every_request_at_the_least_cost(
             assert drawn.grid.reachable([goal], rule)[start[::-1]]
     rollouts = rollouts_of(PerfectNetwork(), *maps, rule=rule)
     columns = generalisation.COLUMNS.split(" | ")[:8]
-    assert total(rollouts, *columns) == ["2", "54", *["54/54"] * 3, *["1.0000"] * 2, "0"]
+    assert total(rollouts, *columns) == [
+        "2",
+        "54",
+        *["54/54"] * 3,
+        *["1.0000"] * 2,
+        "0",
+    ]
     assert rows(rollouts)[1][:4] == [kind, "9x9", "2", "54"]
 
 
 def test_detours_loops_and_starts_on_the_goal_count_as_they_should() -> None:
     # From (0, 0) it goes down, right, right, up; from (1, 0) back to (0, 0) and so round as well.
     network = StubbornNetwork([[2, 4, 0], [0, 0, 6]])
-    rollouts = rollouts_of(network, free_map(((0, 0), (2, 0)), ((1, 0), (1, 1)), ((0, 0), (1, 0))))
+    rollouts = rollouts_of(
+        network, free_map(((0, 0), (2, 0)), ((1, 0), (1, 1)), ((0, 0), (1, 0)))
+    )
     assert sorted(rollout.ratio for rollout in rollouts) == [2.0, 3.0, math.inf]
     cells = total(rollouts, "success", "optimal", "mean", "worst")
     assert cells == ["2/3", "0/3", "2.5000", "3.0000"]
-    trapped = rollouts_of(StubbornNetwork([[4, 4, 4], [4, 4, 4]]), free_map(((0, 0), (2, 0))))
+    trapped = rollouts_of(
+        StubbornNetwork([[4, 4, 4], [4, 4, 4]]), free_map(((0, 0), (2, 0)))
+    )
     assert total(trapped, "success", "mean", "worst") == ["0/1", "nan", "nan"]
     at_goal = rollouts_of(PerfectNetwork(), free_map(((1, 1), (1, 1))))
     assert total(at_goal, "success", "optimal", "worst") == ["1/1", "1/1", "1.0000"]
@@ -131,11 +163,17 @@ def test_detours_loops_and_starts_on_the_goal_count_as_they_should() -> None:
 
 def test_masks_and_costs_count() -> None:
     illegal = rollouts_of(PerfectNetwork(bonus=1.0), free_map(((0, 0), (2, 0))))
-    assert total(illegal, "success", "without action masking", "illegal") == ["1/1", "0/1", "0"]
+    assert total(illegal, "success", "without action masking", "illegal") == [
+        "1/1",
+        "0/1",
+        "0",
+    ]
     cost = np.array([[0, 99, 0], [0, 0, 0]], dtype=np.int8)
     grid = GridMap(np.zeros((2, 3)), cost=cost)
     straight = StubbornNetwork([[0, 0, 0], [0, 0, 0]])
-    (costs,) = rollouts_of(straight, BenchmarkMap("costs", "0", grid, [((0, 0), (2, 0))]))
+    (costs,) = rollouts_of(
+        straight, BenchmarkMap("costs", "0", grid, [((0, 0), (2, 0))])
+    )
     assert costs.optimum == pytest.approx(2 * 2**0.5)
     assert costs.ratio == pytest.approx((1 + 4.96) / (2 * 2**0.5))
 
@@ -152,14 +190,19 @@ def test_steps_through_walls_over_corners_and_of_two_cells_are_illegal() -> None
 
 def test_optima_lie_in_groups_that_double_and_a_millionth_more_is_optimal() -> None:
     one = Rollout("set", "map", "9x9", 70.0, None, 1.00001, True, 0, 1.0, 1.0)
-    others = [replace(one, optimum=optimum, ratio=1.0000009) for optimum in (16, 3, 31.9, 15.9)]
+    others = [
+        replace(one, optimum=optimum, ratio=1.0000009)
+        for optimum in (16, 3, 31.9, 15.9)
+    ]
     groups = [(row[0], row[2], row[5]) for row in rows([one, *others])[-4:]]
     expected = [("0-16", "2", "2/2"), ("16-32", "2", "2/2"), ("64-128", "1", "0/1")]
     assert groups == [*expected, ("all", "5", "4/5")]
 
 
 @pytest.mark.parametrize("costs", generalisation.COSTS)
-def test_the_same_seed_draws_the_same_whichever_other_maps_there_are(costs: str) -> None:
+def test_the_same_seed_draws_the_same_whichever_other_maps_there_are(
+    costs: str,
+) -> None:
     def drawn(kinds: list[str], seed: int) -> tuple[str, list[tuple[Cell, Cell]]]:
         settings = replace(SAFE, requests=30, costs=costs, seed=seed)
         *_, other, last = generalisation.generated_maps(kinds, [20], 2, settings)
@@ -188,11 +231,16 @@ def test_optima_of_a_file_hold_under_the_robot_safe_rule_within_their_rounding(
     write_moving_ai(tmp_path, "c", CORNER, lines)
     rollouts = rollouts_of(PerfectNetwork(), *read(tmp_path))
     assert f"the oracle agrees with {agree}/3." in markdown(rollouts)
-    for settings in (RequestSettings(MoveRule.CORNER_CUTTING), replace(SAFE, costs="random")):
+    for settings in (
+        RequestSettings(MoveRule.CORNER_CUTTING),
+        replace(SAFE, costs="random"),
+    ):
         assert read(tmp_path, settings)[0].optima is None
 
 
-def test_a_sample_of_a_scenario_file_has_short_and_long_paths_alike(tmp_path: Path) -> None:
+def test_a_sample_of_a_scenario_file_has_short_and_long_paths_alike(
+    tmp_path: Path,
+) -> None:
     lines = [f"0 long.map 100 1 0 0 {x} 0 {x}" for x in range(99, 0, -1)]
     for folder in ("maps", "scenarios"):
         (tmp_path / folder).mkdir()
@@ -200,7 +248,9 @@ def test_a_sample_of_a_scenario_file_has_short_and_long_paths_alike(tmp_path: Pa
     (tmp_path / "scenarios" / "long.map.scen").write_text("\n".join(lines))
 
     def lengths(requests: int, seed: int = 0) -> list[float]:
-        return list(read(tmp_path, replace(SAFE, requests=requests, seed=seed))[0].optima or [])
+        return list(
+            read(tmp_path, replace(SAFE, requests=requests, seed=seed))[0].optima or []
+        )
 
     assert [int(length - 1) // 9 for length in lengths(11)] == [*range(11)]
     assert lengths(11) == lengths(11) != lengths(11, seed=1)
@@ -212,14 +262,26 @@ def test_a_sample_of_a_scenario_file_has_short_and_long_paths_alike(tmp_path: Pa
     [
         ("bad.map", "no map", r"bad\.map: begins with"),
         ("bad.yaml", "services: {}", r"bad\.yaml: image"),
-        ("walls.map", "type octile\nheight 1\nwidth 2\nmap\n@@\n", r"walls\.map: no two free"),
+        (
+            "walls.map",
+            "type octile\nheight 1\nwidth 2\nmap\n@@\n",
+            r"walls\.map: no two free",
+        ),
         ("c.scen", "0 c.map 3 3 0 0 1", r"c\.scen: .*; end each line"),
-        ("c.scen", "0 c.map 9 9 0 0 8 0 1", r"no path joins \(0, 0\) and \(8, 0\) on this map"),
+        (
+            "c.scen",
+            "0 c.map 9 9 0 0 8 0 1",
+            r"no path joins \(0, 0\) and \(8, 0\) on this map",
+        ),
         ("c.scen", "version 1", r"c\.scen: has no requests"),
     ],
 )
 def test_a_file_that_cannot_be_used_is_named_and_the_others_go_on(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, name: str, content: str, named: str
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    name: str,
+    content: str,
+    named: str,
 ) -> None:
     write_moving_ai(tmp_path, "c", CORNER, [])
     save_map(GridMap(np.zeros((4, 5))), tmp_path / "hall.yaml")
@@ -237,7 +299,9 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(path)
 
 
-def test_the_program_prints_its_tables(capsys: pytest.CaptureFixture[str], model: str) -> None:
+def test_the_program_prints_its_tables(
+    capsys: pytest.CaptureFixture[str], model: str
+) -> None:
     command = ["--model", model, "--kinds", "maze", "random_10", "--sizes", "8", "16"]
     assert main([*command, "--maps", "2", "--requests", "12"]) == 0
     printed = capsys.readouterr().out

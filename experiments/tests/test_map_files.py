@@ -14,9 +14,9 @@ from ddqn_planner.grid import UNKNOWN, MapFile, MapFileError, read_map_file
 
 # The examples can share a folder: each writes the same files again.
 same_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-percent = st.sampled_from([st.integers(-1, 100), st.sampled_from([-1, 0, 100])]).flatmap(
-    lambda elements: numpy_st.arrays(np.int8, shapes, elements=elements)
-)
+percent = st.sampled_from(
+    [st.integers(-1, 100), st.sampled_from([-1, 0, 100])]
+).flatmap(lambda elements: numpy_st.arrays(np.int8, shapes, elements=elements))
 origins = st.tuples(*3 * [st.floats(-100, 100)])
 
 
@@ -27,7 +27,9 @@ def test_a_saved_file_comes_back(
 ) -> None:
     cells = [st.integers(0, side - 1) for side in values.shape[::-1]]
     start, goal = (data.draw(st.none() | st.tuples(*cells)) for _ in range(2))
-    saved = MapFile(values, np.float64(resolution), origin, start, goal and np.array(goal))
+    saved = MapFile(
+        values, np.float64(resolution), origin, start, goal and np.array(goal)
+    )
     save_map(saved, tmp_path / "saved.yaml")
     read = read_map_file(tmp_path / "saved.yaml")
     np.testing.assert_array_equal(read.values, values)
@@ -37,7 +39,9 @@ def test_a_saved_file_comes_back(
 
 @same_folder
 @given(grids_with_directions())
-def test_a_saved_grid_comes_back_with_directions_and_costs(tmp_path: Path, place: Place) -> None:
+def test_a_saved_grid_comes_back_with_directions_and_costs(
+    tmp_path: Path, place: Place
+) -> None:
     grid, path = place[0], tmp_path / "saved.yaml"
     save_map(grid, path)
     options = {"occupied_threshold": 100, "allow_unknown": True}

@@ -7,7 +7,13 @@ import pytest
 import scipy.ndimage
 from hypothesis import given
 from hypothesis import strategies as st
-from random_maps import KINDS, MINIMUM_SIDE, generate_map, gradient_costs, inflated_costs
+from random_maps import (
+    KINDS,
+    MINIMUM_SIDE,
+    generate_map,
+    gradient_costs,
+    inflated_costs,
+)
 
 from ddqn_planner.grid import MoveRule
 from ddqn_planner.grid.noise import random_costs, random_requests, unknown_costs
@@ -55,9 +61,13 @@ FINGERPRINTS = {
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_seed_makes_the_same_map_requests_and_costs_in_every_version(kind: str) -> None:
+def test_a_seed_makes_the_same_map_requests_and_costs_in_every_version(
+    kind: str,
+) -> None:
     digest = hashlib.sha256()
-    for shape, seed in itertools.product([(5, 7), (9, 200), (64, 64), (150, 131)], range(5)):
+    for shape, seed in itertools.product(
+        [(5, 7), (9, 200), (64, 64), (150, 131)], range(5)
+    ):
         random = np.random.default_rng(seed)
         occupancy = generate_map(kind, shape, random)
         digest.update(np.packbits(occupancy).tobytes())
@@ -69,14 +79,18 @@ def test_a_seed_makes_the_same_map_requests_and_costs_in_every_version(kind: str
 
 
 def test_wrong_kinds_and_sides_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"'cave' is unknown; give one of random_10, .*office"):
+    with pytest.raises(
+        ValueError, match=r"'cave' is unknown; give one of random_10, .*office"
+    ):
         make("cave", (10, 10), 0)
     with pytest.raises(ValueError, match="H, W >= 5"):
         make("maze", (4, 10), 0)
 
 
 @given(SHAPES, SEEDS)
-def test_gradient_costs_rise_evenly_from_0_to_99(shape: tuple[int, int], seed: int) -> None:
+def test_gradient_costs_rise_evenly_from_0_to_99(
+    shape: tuple[int, int], seed: int
+) -> None:
     costs = gradient_costs(np.zeros(shape, dtype=bool), np.random.default_rng(seed))
     assert (costs.min(), costs.max()) == (0, 99)
     for axis in (0, 1):

@@ -23,7 +23,9 @@ _claim = claim_ros_domain()
 def run(script: Path, argument: str, folder: Path) -> str:
     """Run a script, which takes a ROS domain of its own; return what it printed."""
     command = [sys.executable, str(script), argument]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=600)
+    done = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, timeout=600
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -65,13 +67,19 @@ def test_mixed_work_with_bad_input_is_answered_and_sampled(
 
 
 def test_growth_leaves_out_the_warm_up() -> None:
-    assert growth([1.0, 50.0, *7 * [100.0], 104.0]) == (100.0, 104.0, pytest.approx(0.04))
+    assert growth([1.0, 50.0, *7 * [100.0], 104.0]) == (
+        100.0,
+        104.0,
+        pytest.approx(0.04),
+    )
 
 
 def test_a_robot_learns_by_driving_and_what_it_learned_is_drawn(tmp_path: Path) -> None:
     printed = run(ROOT / "examples" / "demo_driving.py", "3", tmp_path)
     # No route is better than the best possible one.
-    routes = re.findall(r"mission +\d: drove +\d+\.\d s; its route takes 1\.\d\d of", printed)
+    routes = re.findall(
+        r"mission +\d: drove +\d+\.\d s; its route takes 1\.\d\d of", printed
+    )
     assert len(routes) == 3
     with Image.open(tmp_path / "demo_driving.gif") as film:
         assert film.n_frames == 3

@@ -44,7 +44,9 @@ def test_every_experiment_writes_its_report_and_trains_what_is_new(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     page = tmp_path / "page.md"
-    page.write_text("before\n<!-- Goal ii: from every free cell -->\nold\n<!-- end -->\nafter\n")
+    page.write_text(
+        "before\n<!-- Goal ii: from every free cell -->\nold\n<!-- end -->\nafter\n"
+    )
     command = ["--backend", "sequential", "--quick", "--out", str(tmp_path)]
     command += ["--noise", "on_path", "--hidden-units", "3", "--page", str(page)]
     assert main([*command, "--seeds", "1"]) == 0
@@ -59,12 +61,16 @@ def test_every_experiment_writes_its_report_and_trains_what_is_new(
             assert len(image.convert("RGB").getcolors(image.width * image.height)) > 20
     assert "| on_path | paper, 3 hidden units |" in report
     assert "near_path" not in report
-    before, _, results = page.read_text().partition("<!-- Goal ii: from every free cell -->\n")
+    before, _, results = page.read_text().partition(
+        "<!-- Goal ii: from every free cell -->\n"
+    )
     assert (before, results[-20:]) == ("before\n", "\n<!-- end -->\nafter\n")
     assert "| propagation | " in results
     assert "](images/page/goal_2.png)" in results
     assert (tmp_path / "images" / "page" / "goal_2.png").exists()
-    trained = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("evaluations.csv")}
+    trained = {
+        path: path.stat().st_mtime_ns for path in tmp_path.rglob("evaluations.csv")
+    }
     assert len(trained) == 8 + 2 + 2
     # Only the second seed of both profiles is new.
     assert main([*command, "--experiment", "goal-2", "--seeds", "2"]) == 0
@@ -73,7 +79,9 @@ def test_every_experiment_writes_its_report_and_trains_what_is_new(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_interrupted_experiments_end_with_all_their_processes(tmp_path: Path, number: int) -> None:
+def test_interrupted_experiments_end_with_all_their_processes(
+    tmp_path: Path, number: int
+) -> None:
     command = [sys.executable, PROGRAM, "--experiment", "goal-1", "--out", tmp_path]
     child = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + PATIENCE
@@ -88,7 +96,9 @@ def test_interrupted_experiments_end_with_all_their_processes(tmp_path: Path, nu
     assert "run the same command to resume" in printed
 
 
-def test_wrong_options_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_options_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     command = ["--experiment", "goal-3", "--hidden-units", "-1", "--out", str(tmp_path)]
     assert main(command) == 2
     assert "hidden_units is -1" in capsys.readouterr().err
@@ -98,7 +108,9 @@ def test_a_training_that_was_cut_off_ends_as_if_it_had_not_been(
     small: Scenario, tmp_path: Path
 ) -> None:
     folders = [tmp_path / name for name in ("whole", "cut")]
-    whole, cut = (trainings.Training(folder, QUICK, (small,), 1, 300) for folder in folders)
+    whole, cut = (
+        trainings.Training(folder, QUICK, (small,), 1, 300) for folder in folders
+    )
     trainings.train(whole)
     trainings.train(replace(cut, parameters=replace(QUICK, steps=600)))
     trainings.in_parallel(trainings.train, [cut])
@@ -116,13 +128,19 @@ def test_a_training_that_was_cut_off_ends_as_if_it_had_not_been(
 def test_the_last_of_the_networks_that_solve_the_most_is_kept(
     small: Scenario, tmp_path: Path
 ) -> None:
-    trainings.train(trainings.Training(tmp_path, QUICK, (small,), seed=1, evaluation_interval=50))
-    solved = np.flatnonzero(trainings.read_csv(tmp_path / "evaluations.csv")["solved"] == 1)
+    trainings.train(
+        trainings.Training(tmp_path, QUICK, (small,), seed=1, evaluation_interval=50)
+    )
+    solved = np.flatnonzero(
+        trainings.read_csv(tmp_path / "evaluations.csv")["solved"] == 1
+    )
     assert len(solved) > 1
     assert load_model(tmp_path / "kept.safetensors")[1].steps == 50 * (solved[-1] + 1)
 
 
-def test_the_over_estimation_is_that_of_the_free_cells_but_the_goal(small: Scenario) -> None:
+def test_the_over_estimation_is_that_of_the_free_cells_but_the_goal(
+    small: Scenario,
+) -> None:
     trainer = Trainer([small], QUICK, seed=0)
     found = trainings.evaluate_training(trainer, np.full(20, -2.0, dtype=np.float32))
     value = trainer.planner().q_field(small.grid, small.goal).q.max(axis=0)
@@ -132,7 +150,9 @@ def test_the_over_estimation_is_that_of_the_free_cells_but_the_goal(small: Scena
 
 
 @pytest.mark.parametrize("alpha", [0.0, 0.6])
-def test_the_optimal_value_is_what_the_best_policy_earns(small: Scenario, alpha: float) -> None:
+def test_the_optimal_value_is_what_the_best_policy_earns(
+    small: Scenario, alpha: float
+) -> None:
     parameters = replace(QUICK, alpha=alpha)
     environment = GridVectorEnvironment([small], parameters)
     value = trainings.optimal_value(environment)
@@ -143,20 +163,26 @@ def test_the_optimal_value_is_what_the_best_policy_earns(small: Scenario, alpha:
             environment.reset()
             environment.cell = np.array([y * 5 + x])
             reward, terminated, _ = environment.move(np.array([action]))
-            onward = 0.0 if terminated[0] else parameters.gamma * value[environment.cell[0]]
+            onward = (
+                0.0 if terminated[0] else parameters.gamma * value[environment.cell[0]]
+            )
             returns.append(float(reward[0] + onward))
         if (x, y) != small.goal:
             assert value[y * 5 + x] == pytest.approx(max(returns), abs=0.02)
 
 
-def test_a_supervised_network_learns_the_best_moves(small: Scenario, tmp_path: Path) -> None:
+def test_a_supervised_network_learns_the_best_moves(
+    small: Scenario, tmp_path: Path
+) -> None:
     best = best_moves(small).reshape(4, 5, 8)
     distance = shortest_distances(small.grid, small.goal, trainings.MOVE_RULE)
     assert not best[small.grid.occupancy].any()
     assert not best[small.goal[::-1]].any()
     for y, x, action in np.argwhere(best):
         dx, dy = MOVES[action]
-        assert distance[y, x] - distance[y + dy, x + dx] == pytest.approx(np.hypot(dx, dy))
+        assert distance[y, x] - distance[y + dy, x + dx] == pytest.approx(
+            np.hypot(dx, dy)
+        )
     training = trainings.Training(tmp_path, replace(QUICK, steps=300), (small,), 0, 300)
     train_supervised(training)
     planner = Planner.load(tmp_path / "model.safetensors")
@@ -188,9 +214,13 @@ def test_a_row_tells_from_when_on_a_path_is_found_and_is_the_shortest() -> None:
     assert convergence_row([always]) == ["1 (0) of 1", "0", "0", "22.97"]
 
 
-def test_moves_count_as_wrong_that_are_legal_and_predicted_to_fail_or_the_other_way() -> None:
+def test_moves_count_as_wrong_that_are_legal_and_predicted_to_fail_or_the_other_way() -> (
+    None
+):
     network = random_network("any_map", filters=2)
-    metadata = ModelMetadata("any_map", {"filters": 2}, trainings.MOVE_RULE, 0.95, "", 0, 0, "")
+    metadata = ModelMetadata(
+        "any_map", {"filters": 2}, trainings.MOVE_RULE, 0.95, "", 0, 0, ""
+    )
     # A straight move is legal in half of the 256 patches with a free centre. A diagonal one too
     # if corners may be cut, else in an eighth.
     legal = 4 * (128 + 128 + 128 + 32)
@@ -200,19 +230,25 @@ def test_moves_count_as_wrong_that_are_legal_and_predicted_to_fail_or_the_other_
 
 
 def test_the_q_that_the_loss_trains_adds_up_the_papers_rewards(paper: Scenario) -> None:
-    metadata = ModelMetadata("propagation", {"filters": 2}, trainings.MOVE_RULE, 0.95, "", 0, 0, "")
+    metadata = ModelMetadata(
+        "propagation", {"filters": 2}, trainings.MOVE_RULE, 0.95, "", 0, 0, ""
+    )
     network = random_network("propagation", filters=2)
     # Told that every move succeeds: its rollouts go straight to the goal, and are trapped by walls.
     network.tensors["moves.bias"].fill(100.0)
     planner = Planner(network, metadata)
-    ratios = length_ratios(planner.q_field(paper.grid, paper.goal), paper.grid, trainings.MOVE_RULE)
+    ratios = length_ratios(
+        planner.q_field(paper.grid, paper.goal), paper.grid, trainings.MOVE_RULE
+    )
     assert STARTS.sum() == 286
     assert 0 < np.isfinite(ratios)[STARTS].sum() < 286
     field = trained_field(planner)
     goal_x, goal_y = paper.goal
     assert field.q[0, goal_y, goal_x - 1] == pytest.approx(10.0, abs=1e-3)
     # Two moves before the end: Section 4.2's reward of one, and the end's, discounted.
-    one, two = (np.hypot(goal_x - k - paper.start[0], goal_y - paper.start[1]) for k in (1, 2))
+    one, two = (
+        np.hypot(goal_x - k - paper.start[0], goal_y - paper.start[1]) for k in (1, 2)
+    )
     expected = 0.6 * 1.0 + 0.4 * (one - two - 1.0) + 0.95 * 10.0
     assert field.q[0, goal_y, goal_x - 2] == pytest.approx(expected, abs=1e-3)
 
@@ -231,7 +267,9 @@ def test_noisy_maps_differ_and_more_test_maps_leave_the_training_maps(
     shortest = shortest_path(paper.grid, paper.start, paper.goal, trainings.MOVE_RULE)
     assert path_length(path) > path_length(shortest)
     if noise == "on_path":  # every inner cell of the path can be avoided at once
-        assert all(scenario.grid.is_free(cell) for scenario in scenarios for cell in path)
+        assert all(
+            scenario.grid.is_free(cell) for scenario in scenarios for cell in path
+        )
 
 
 def test_statistics_say_never_for_infinity_and_leave_nan_out() -> None:

@@ -18,7 +18,11 @@ Poses = tuple[np.ndarray, np.ndarray]
 
 
 def straight(
-    start: Point, end: Point, slowness: float = 1.0, rate: float = 10.0, began: float = 0.0
+    start: Point,
+    end: Point,
+    slowness: float = 1.0,
+    rate: float = 10.0,
+    began: float = 0.0,
 ) -> Poses:
     """A drive at constant speed."""
     duration = math.dist(start, end) / SPEED * slowness
@@ -31,7 +35,9 @@ def uneven(x: np.ndarray, slowness: np.ndarray, rate: float = 10.0) -> Poses:
     """A drive along y = 5.1, of some slowness from each x (N,) to the next."""
     at_x = np.append(0, np.cumsum(np.diff(x) / SPEED * slowness[:-1]))
     seconds = np.arange(0, at_x[-1], 1 / rate)
-    return seconds, np.column_stack([np.interp(seconds, at_x, x), np.full(len(seconds), 5.1)])
+    return seconds, np.column_stack(
+        [np.interp(seconds, at_x, x), np.full(len(seconds), 5.1)]
+    )
 
 
 def driven(*drives: Poses, **options: float) -> Experience:

@@ -16,7 +16,9 @@ UP, DOWN = straight(WEST, EAST, 3), straight(EAST, WEST)
 
 
 def seconds(experience: Experience, grid: GridMap, *ends: tuple[float, float]) -> float:
-    return experience.expected_time(grid, [grid.world_to_cell(*end) for end in ends]).seconds
+    return experience.expected_time(
+        grid, [grid.world_to_cell(*end) for end in ends]
+    ).seconds
 
 
 @pytest.mark.parametrize("yaw", [0.0, math.pi / 2, -2.4])
@@ -45,7 +47,9 @@ def test_noise_and_slow_places_are_no_ramps() -> None:
         return np.append(0, np.cumsum(np.diff(time) * slow[1:])), position
 
     for _ in range(3):
-        experience = driven(*(noisy(*ends) for ends in [(WEST, EAST), (EAST, WEST)] * 20))
+        experience = driven(
+            *(noisy(*ends) for ends in [(WEST, EAST), (EAST, WEST)] * 20)
+        )
         assert experience.apply(HALL).uphill is None
 
 

@@ -153,7 +153,9 @@ def opened(folder: Path, nominal_speed: float = 0.5) -> DriveFolder:
     return DriveFolder(folder, nominal_speed, 0.5)
 
 
-def record(folder: Path, count: int, outcome: DriveEnd = DriveEnd.ARRIVED) -> DriveFolder:
+def record(
+    folder: Path, count: int, outcome: DriveEnd = DriveEnd.ARRIVED
+) -> DriveFolder:
     """Record slow drives, and close the folder."""
     opened_folder = opened(folder)
     for _ in range(count):
@@ -202,7 +204,9 @@ def test_the_record_has_the_columns_that_its_header_names(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("cut", [1, 2, 10, 3000])
-def test_a_row_that_a_crash_cut_is_left_out_and_the_others_stay(tmp_path: Path, cut: int) -> None:
+def test_a_row_that_a_crash_cut_is_left_out_and_the_others_stay(
+    tmp_path: Path, cut: int
+) -> None:
     path = record(tmp_path, 2).record_path
     os.truncate(path, path.stat().st_size - cut)
     assert recorded(tmp_path) == ["arrived"]
@@ -232,9 +236,13 @@ def test_a_row_of_something_else_is_left_out(tmp_path: Path, row: bytes) -> None
     assert recorded(tmp_path) == ["arrived", "stopped", "arrived"]
 
 
-def test_experience_that_is_broken_or_of_another_robot_is_refused(tmp_path: Path) -> None:
+def test_experience_that_is_broken_or_of_another_robot_is_refused(
+    tmp_path: Path,
+) -> None:
     path = record(tmp_path, 1).experience_path
-    with pytest.raises(ValueError, match=r"nominal_speed 0.5 \(now 0.8\); give those values"):
+    with pytest.raises(
+        ValueError, match=r"nominal_speed 0.5 \(now 0.8\); give those values"
+    ):
         opened(tmp_path, 0.8)
     path.write_bytes(path.read_bytes()[:-30])
     before = path.read_bytes()
@@ -254,7 +262,9 @@ def test_a_new_folder_begins_with_older_experience_which_stays(tmp_path: Path) -
         driven = Experience.load(tmp_path / "new").evidence.driven
         assert driven == pytest.approx((3 + drives) * np.ptp(SLOW[0]), rel=0.05)
     assert (older / "experience.npz").read_bytes() == before
-    with pytest.raises(ValueError, match=r"older holds experience with nominal_speed 0.5 \(now 2"):
+    with pytest.raises(
+        ValueError, match=r"older holds experience with nominal_speed 0.5 \(now 2"
+    ):
         DriveFolder(tmp_path / "other", 2.0, 0.5, str(older))
 
 
@@ -263,7 +273,9 @@ def test_a_folder_is_locked_and_keeps_forgotten_experience(tmp_path: Path) -> No
     with pytest.raises(ValueError, match="another process records in"):
         opened(tmp_path)
     (tmp_path / "of" / "a_training").mkdir(parents=True)
-    with pytest.raises(ValueError, match=r"a_training.* no drives; give a new or empty"):
+    with pytest.raises(
+        ValueError, match=r"a_training.* no drives; give a new or empty"
+    ):
         opened(tmp_path / "of")
     assert folder.forget() is None
     folder.add(Drive(DriveEnd.ARRIVED, *SLOW))
@@ -291,7 +303,9 @@ def test_nothing_is_lost_while_the_disk_is_full(tmp_path: Path) -> None:
     folder.close()
     assert recorded(tmp_path) == ["arrived"] * 4
     again = opened(tmp_path)
-    assert again.experience.evidence.driven == pytest.approx(folder.experience.evidence.driven)
+    assert again.experience.evidence.driven == pytest.approx(
+        folder.experience.evidence.driven
+    )
     again.close()
 
 

@@ -39,7 +39,9 @@ def test_what_is_kept_gives_what_is_computed_anew(
         kept.record(*straight((2, 5), (12, y), slowness))
         kept.record_failure((7, y))
         kept.save(file)
-        if data.draw(st.booleans()):  # as a planner does that loads what a trainer saves
+        if data.draw(
+            st.booleans()
+        ):  # as a planner does that loads what a trainer saves
             older, kept = kept, Experience.load(file)
             kept.take_over(older)
         grid = MAPS[number]
@@ -81,16 +83,22 @@ def test_the_posterior_is_that_of_a_gaussian_markov_random_field(seed: int) -> N
     table, (seen, visits) = experience.evidence.table, np.zeros((2, len(precision)))
     cells = np.floor(table[:, 5:] / 0.25).astype(int)
     # What drives in several directions show of climbs is taken off.
-    for (x, y), weight, log in zip(cells, table[:, 0], experience.evidence.flat, strict=True):
+    for (x, y), weight, log in zip(
+        cells, table[:, 0], experience.evidence.flat, strict=True
+    ):
         precision[number[y, x], number[y, x]] += weight / NOISE
         visits[number[y, x]] += weight / NOISE
         seen[number[y, x]] += (log + weight * (NOISE / 2 - common)) / NOISE
     mean = common + np.linalg.solve(precision, seen) + surplus * (1 - posterior.known)
     np.testing.assert_allclose(posterior.mean, mean, atol=0.02)
-    np.testing.assert_allclose(posterior.known, np.linalg.solve(precision, visits), atol=0.01)
+    np.testing.assert_allclose(
+        posterior.known, np.linalg.solve(precision, visits), atol=0.01
+    )
 
 
-def test_without_memory_for_a_map_nothing_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_memory_for_a_map_nothing_is_lost(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     drives = straight((2, 5), (12, 5), 3), straight((2, 5.5), (12, 6), 2)
     experience = driven(drives[0])
     experience.apply(HALL)
@@ -99,7 +107,9 @@ def test_without_memory_for_a_map_nothing_is_lost(monkeypatch: pytest.MonkeyPatc
         patch.setattr(posterior_module, "_relax", Mock(side_effect=MemoryError))
         with pytest.raises(MemoryError):
             experience.apply(HALL)
-    np.testing.assert_array_equal(experience.slowness(HALL), driven(*drives).slowness(HALL))
+    np.testing.assert_array_equal(
+        experience.slowness(HALL), driven(*drives).slowness(HALL)
+    )
 
 
 def test_a_wall_thinner_than_a_place_divides_it() -> None:
@@ -121,10 +131,14 @@ def test_evidence_where_an_obstacle_stands_now_counts_beside_it() -> None:
 
 @pytest.mark.parametrize("resolution", [0.05, 0.2])
 @pytest.mark.parametrize("yaw", [0.0, 0.7])
-def test_a_map_in_another_resolution_and_frame_keeps_it(resolution: float, yaw: float) -> None:
+def test_a_map_in_another_resolution_and_frame_keeps_it(
+    resolution: float, yaw: float
+) -> None:
     experience = driven(*[straight((4, 4), (11, 6), 3)] * 3)
     shape = int(20 / resolution), int(20 / resolution)
-    grid = GridMap(np.zeros(shape, dtype=bool), resolution, (0.0, 0.0 if yaw == 0 else -8.0, yaw))
+    grid = GridMap(
+        np.zeros(shape, dtype=bool), resolution, (0.0, 0.0 if yaw == 0 else -8.0, yaw)
+    )
     for share in (0.2, 0.5, 0.8):
         x, y = 4 + 7 * share, 4 + 2 * share
         assert at(grid, experience.slowness(grid), x, y) == pytest.approx(3, rel=0.1)
@@ -150,7 +164,9 @@ def test_a_place_that_changes_is_learned_anew_at_once() -> None:
     experience.record(*straight((2, 5), (12, 5)))
     experience.record(*straight((2, 5), (12, 5)))
     assert at(HALL, experience.slowness(HALL), 7, 5) < 1.5
-    assert at(HALL, experience.slowness(HALL), 7, 2) > 1.3  # others are likely to have changed, too
+    assert (
+        at(HALL, experience.slowness(HALL), 7, 2) > 1.3
+    )  # others are likely to have changed, too
     experience.record(*straight((2, 2), (12, 2), 3))
     assert at(HALL, experience.slowness(HALL), 7, 2) == pytest.approx(3, rel=0.15)
 
@@ -168,7 +184,10 @@ def test_what_is_slow_in_one_direction_alone_is_no_change() -> None:
 def test_where_parts_of_drives_often_surprise_a_surprise_is_no_change() -> None:
     def drive(slowness: float) -> Poses:
         """Six rows of the hall, of which a part of one may be slow."""
-        legs = [(straight((2, y), (12, y)), straight((12, y), (2, y)))[y % 2] for y in range(2, 8)]
+        legs = [
+            (straight((2, y), (12, y)), straight((12, y), (2, y)))[y % 2]
+            for y in range(2, 8)
+        ]
         position = np.concatenate([leg[1] for leg in legs])
         is_slow = (np.abs(position - (7.5, 4)) < (1.5, 0.1)).all(axis=1)
         return np.cumsum(np.where(is_slow, slowness, 1) * 0.1), position
@@ -178,7 +197,10 @@ def test_where_parts_of_drives_often_surprise_a_surprise_is_no_change() -> None:
         experience.apply(HALL)
         if number == 20:
             experience.record(*straight((2, 9.5), (12, 9.5)))
-            row, weight = len(experience.evidence.table) - 1, experience.evidence.table[-1, 0]
+            row, weight = (
+                len(experience.evidence.table) - 1,
+                experience.evidence.table[-1, 0],
+            )
         experience.record(*drive(4 if number % 4 == 0 else 1))
         experience = Experience.from_bytes(experience.to_bytes())
     assert experience.evidence.table[row, 0] > 0.8 * weight
@@ -189,7 +211,9 @@ def waited(seconds: float, x: float = 7.0) -> Poses:
     (before, way), (after, rest) = straight((2, 5), (x, 5)), straight((x, 5), (12, 5))
     stood = np.arange(0, seconds, 0.1)
     times = [before, before[-1] + 0.1 + stood, before[-1] + 0.1 + seconds + after]
-    return np.concatenate(times), np.concatenate([way, np.full((len(stood), 2), (x, 5.0)), rest])
+    return np.concatenate(times), np.concatenate(
+        [way, np.full((len(stood), 2), (x, 5.0)), rest]
+    )
 
 
 @given(st.floats(6, 80), st.integers(1, 4))
@@ -204,7 +228,9 @@ def test_a_wait_is_added_to_each_passage_as_the_mean_of_its_seconds(
     grid = GridMap(wall, 0.25)
     usual = planner.plan(experience.apply(grid), *ends).cost
     for number in range(10):
-        experience.record(*(waited(seconds) if number % (others + 1) == 0 else waited(0)))
+        experience.record(
+            *(waited(seconds) if number % (others + 1) == 0 else waited(0))
+        )
     waits = len(range(0, 10, others + 1))
     cost = planner.plan(experience.apply(grid), *ends).cost
     assert cost - usual == pytest.approx(seconds * waits / 10, rel=0.15)
@@ -223,13 +249,18 @@ def test_where_ways_part_a_wait_belongs_to_the_one_that_is_taken() -> None:
     after, turned = straight((7.1, 5.1), (7.1, 9.1), began=30.0)
     stood = np.arange(10.1, 30, 0.1)
     there = np.repeat(positions[-1:], len(stood), axis=0)
-    waits = np.concatenate([seconds, stood, after]), np.concatenate([positions, there, turned])
+    waits = (
+        np.concatenate([seconds, stood, after]),
+        np.concatenate([positions, there, turned]),
+    )
     corridors = np.ones((40, 60), dtype=bool)
     corridors[19:22, 8:50] = corridors[19:38, 27:30] = False
     grid, begin = GridMap(corridors, 0.25), (8, 20)
     experience = Experience(SPEED)
     for number in range(24):
-        experience.record(*(straight((2.1, 5.1), (12.1, 5.1)) if number % 6 == 1 else waits))
+        experience.record(
+            *(straight((2.1, 5.1), (12.1, 5.1)) if number % 6 == 1 else waits)
+        )
     ways = [begin, (28, 20), (28, 36)], [begin, (48, 20)]
     turning, ahead = (experience.expected_time(grid, way).seconds for way in ways)
     assert turning == pytest.approx(38, rel=0.1)
@@ -245,7 +276,9 @@ def test_a_wait_beside_a_wall_costs_nothing_behind_it() -> None:
     assert at(HALL, experience.slowness(HALL), 5, 5.4) > 10
 
 
-def test_where_robots_wait_at_several_places_they_are_expected_to_wait_elsewhere_too() -> None:
+def test_where_robots_wait_at_several_places_they_are_expected_to_wait_elsewhere_too() -> (
+    None
+):
     open_way, one, other = (
         driven(*[drive] * 4).slowness(HALL)[:10].mean()
         for drive in (waited(0.0), waited(20.0), waited(20.0, 4.0))

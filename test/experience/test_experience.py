@@ -25,19 +25,27 @@ def test_without_drives_every_place_takes_its_nominal_time() -> None:
     forgotten.forget()
     for experience in (Experience(SPEED), forgotten):
         assert (experience.slowness(HALL) == 1).all()
-        assert (experience.uncertainty(HALL) == experience.uncertainty(HALL)[0, 0]).all()
+        assert (
+            experience.uncertainty(HALL) == experience.uncertainty(HALL)[0, 0]
+        ).all()
         assert experience.expected_time(HALL, [(0, 0)]).seconds == 0
-        experience.record(*straight((9, 5), (4, 6), 2))  # as if there had been no drive before
+        experience.record(
+            *straight((9, 5), (4, 6), 2)
+        )  # as if there had been no drive before
     assert forgotten.evidence.driven == experience.evidence.driven
     np.testing.assert_array_equal(forgotten.evidence.table, experience.evidence.table)
 
 
-@given(st.floats(1.5, 10), st.sampled_from([1, 5, 10, 50]), st.sampled_from([0, 1.75e9]))
+@given(
+    st.floats(1.5, 10), st.sampled_from([1, 5, 10, 50]), st.sampled_from([0, 1.75e9])
+)
 def test_a_place_is_as_slow_as_its_drives_at_any_rate_of_samples_and_time_of_the_clock(
     slowness: float, rate: float, began: float
 ) -> None:
     experience = driven(*[straight((2, 5), (12, 5), slowness, rate, began)] * 4)
-    assert at(HALL, experience.slowness(HALL), 7, 5) == pytest.approx(slowness, rel=0.15)
+    assert at(HALL, experience.slowness(HALL), 7, 5) == pytest.approx(
+        slowness, rel=0.15
+    )
     uncertainty = experience.uncertainty(HALL)
     assert at(HALL, uncertainty, 7, 5) < 0.3 * uncertainty.max()
     assert at(HALL, uncertainty, 7, 9) > 0.95 * uncertainty.max()
@@ -60,11 +68,15 @@ def test_much_noise_of_the_pose_hides_no_slowness() -> None:
     seconds, positions = uneven(x, np.where((x > 5) & (x < 9), 4, 1))
     experience = Experience(SPEED, 0.2)
     for number in range(10):
-        way, clock = (positions[::-1], -seconds[::-1]) if number % 2 else (positions, seconds)
+        way, clock = (
+            (positions[::-1], -seconds[::-1]) if number % 2 else (positions, seconds)
+        )
         experience.record(clock, way + random.normal(0, 0.05, way.shape))
     slowness = experience.slowness(HALL)
     # With twelve seeds 3.97 to 4.04; 3.38 to 3.63 where such noise is averaged over 15 cm.
-    assert np.mean([at(HALL, slowness, x, 5.1) for x in np.arange(5.75, 8.3, 0.25)]) > 3.8
+    assert (
+        np.mean([at(HALL, slowness, x, 5.1) for x in np.arange(5.75, 8.3, 0.25)]) > 3.8
+    )
 
 
 @given(st.floats(0.2, 5), st.floats(1, 4))
@@ -86,12 +98,18 @@ def test_what_is_explored_is_expected_to_take_no_longer_than_the_share(
     random = np.random.default_rng(seed)
     grid = GridMap(random.random((40, 60)) < 0.2, 0.25)
     ends = [grid.free_cells()[i] for i in random.integers(0, 1500, 2)]
-    drives = (straight(*random.uniform(0.5, 9.5, (2, 2)), random.uniform(1, 4)) for _ in range(4))
+    drives = (
+        straight(*random.uniform(0.5, 9.5, (2, 2)), random.uniform(1, 4))
+        for _ in range(4)
+    )
     experience, planner = driven(*drives), Planner.load("any_map")
     best, tried = (planner.plan(experience.apply(grid, e), *ends) for e in (0.0, share))
     if best.cells:
         expected = experience.expected_time(grid, tried.path).seconds
-        assert expected <= experience.expected_time(grid, best.path).seconds * (1 + share) * 1.04
+        assert (
+            expected
+            <= experience.expected_time(grid, best.path).seconds * (1 + share) * 1.04
+        )
 
 
 @given(st.floats(0.1, 1), st.floats(0.5, 4), st.floats(0, 30))
@@ -104,7 +122,8 @@ def test_places_with_and_without_waits_count_as_faster_the_less_of_them_is_known
     grid = experience.apply(HALL, share)
     assert grid.exploration is not None
     expected, bold, safe = (
-        np.log(each.slowness * each.seconds_per_cell) for each in (grid, *grid.exploration[1:])
+        np.log(each.slowness * each.seconds_per_cell)
+        for each in (grid, *grid.exploration[1:])
     )
     of_a_step = 0.021  # in which slowness is told
     unseen, most = math.sqrt(experience.evidence.variance), math.log(1 + share)
@@ -114,7 +133,9 @@ def test_places_with_and_without_waits_count_as_faster_the_less_of_them_is_known
     for y, hope in ((5, often), (6.5, once), (9, never)):
         if at(HALL, grid.exploration.bold.slowness, 7, y) < MAX_SLOWNESS:
             assert at(HALL, expected - bold, 7, y) == pytest.approx(hope, abs=of_a_step)
-            assert at(HALL, expected - safe, 7, y) == pytest.approx(min(hope, most), abs=of_a_step)
+            assert at(HALL, expected - safe, 7, y) == pytest.approx(
+                min(hope, most), abs=of_a_step
+            )
     np.testing.assert_array_equal(grid.slowness, experience.apply(HALL).slowness)
 
 
@@ -162,7 +183,9 @@ def faulty(fault: str) -> Poses:
 FAULTS = "pause", "pause with samples", "teleport", "odometry reset", "not finite"
 
 
-@pytest.mark.parametrize("fault", [*FAULTS, "clock ahead", "clock back", "clock stands"])
+@pytest.mark.parametrize(
+    "fault", [*FAULTS, "clock ahead", "clock back", "clock stands"]
+)
 def test_what_cannot_be_true_is_not_believed(fault: str) -> None:
     experience = driven(faulty(fault))
     slowness = experience.slowness(HALL)
@@ -184,12 +207,18 @@ def test_no_drive_breaks_it(poses: list[tuple[float, float, float]]) -> None:
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_the_cost_of_a_plan_is_its_expected_time_and_no_path_is_faster(seed: int) -> None:
+def test_the_cost_of_a_plan_is_its_expected_time_and_no_path_is_faster(
+    seed: int,
+) -> None:
     random = np.random.default_rng(seed)
     occupancy = random.random((40, 60)) < 0.15
-    grid = GridMap(occupancy, 0.25, cost=random.integers(0, 99, (40, 60)) if seed % 2 else None)
+    grid = GridMap(
+        occupancy, 0.25, cost=random.integers(0, 99, (40, 60)) if seed % 2 else None
+    )
     experience = driven(
-        straight((1, 5), (14, 5), 4), straight((5, 1), (5, 9), 2), straight((1, 1), (14, 9), 3)
+        straight((1, 5), (14, 5), 4),
+        straight((5, 1), (5, 9), 2),
+        straight((1, 1), (14, 9), 3),
     )
     applied = experience.apply(grid)
     goal, planner = grid.free_cells()[5], Planner.load("any_map")
@@ -197,10 +226,14 @@ def test_the_cost_of_a_plan_is_its_expected_time_and_no_path_is_faster(seed: int
     for start in grid.free_cells()[::211]:
         plan = planner.plan(applied, start, goal, MoveRule.ROBOT_SAFE)
         if plan.cells:
-            assert plan.cost == pytest.approx(seconds[start[1], start[0]], rel=1e-6, abs=1e-6)
+            assert plan.cost == pytest.approx(
+                seconds[start[1], start[0]], rel=1e-6, abs=1e-6
+            )
             if grid.cost is None:
                 told = experience.expected_time(grid, plan.path)
-                assert told.seconds == pytest.approx(plan.cost, rel=0.03)  # in steps of 2 %
+                assert told.seconds == pytest.approx(
+                    plan.cost, rel=0.03
+                )  # in steps of 2 %
                 straight_plan = planner.plan(applied, start, goal, simplified=True)
                 told = experience.expected_time(grid, straight_plan.path)
                 # It looks at one cell of each column or row that a segment passes.
@@ -209,7 +242,9 @@ def test_the_cost_of_a_plan_is_its_expected_time_and_no_path_is_faster(seed: int
             assert np.isinf(seconds[start[1], start[0]])
 
 
-@pytest.mark.parametrize("name", ["nominal_speed", "robot_width", "half_life", "max_pause"])
+@pytest.mark.parametrize(
+    "name", ["nominal_speed", "robot_width", "half_life", "max_pause"]
+)
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf, 1e300, 1e-300, True])
 def test_a_wrong_option_is_named(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"{name} is .*; give (metres|seconds)"):
@@ -227,7 +262,10 @@ def test_a_wrong_option_is_named(name: str, value: float) -> None:
 def path(tmp_path: Path) -> Path:
     """The file of a robot that drove and failed."""
     experience = driven(
-        *[straight((2, 5), (12, 5), 3)] * 3, robot_width=0.4, half_life=900.0, max_pause=45.0
+        *[straight((2, 5), (12, 5), 3)] * 3,
+        robot_width=0.4,
+        half_life=900.0,
+        max_pause=45.0,
     )
     experience.record_failure((4, 4))
     experience.save(tmp_path / "folder" / "experience.npz")
@@ -246,9 +284,13 @@ def test_what_is_saved_is_loaded(path: Path) -> None:
         assert getattr(loaded, name) == getattr(experience, name)
     cells = [(x, 20) for x in range(8, 48)]
     for _ in range(2):
-        np.testing.assert_allclose(loaded.slowness(HALL), experience.slowness(HALL), rtol=0.021)
+        np.testing.assert_allclose(
+            loaded.slowness(HALL), experience.slowness(HALL), rtol=0.021
+        )
         expected = experience.expected_time(HALL, cells)
-        np.testing.assert_allclose(loaded.expected_time(HALL, cells), expected, rtol=0.03)
+        np.testing.assert_allclose(
+            loaded.expected_time(HALL, cells), expected, rtol=0.03
+        )
         for one in (loaded, experience):
             one.record(*straight((2, 6), (12, 6), 2))
 
@@ -257,7 +299,9 @@ def test_every_broken_file_is_named(path: Path) -> None:
     content = path.read_bytes()
     broken = [content[: len(content) * part // 8] for part in range(8)]
     for place in range(200, len(content), len(content) // 12):
-        broken.append(content[:place] + bytes([content[place] ^ 0xFF]) + content[place + 1 :])
+        broken.append(
+            content[:place] + bytes([content[place] ^ 0xFF]) + content[place + 1 :]
+        )
     for bad in broken:
         path.write_bytes(bad)
         try:
@@ -296,7 +340,10 @@ def test_a_wrong_value_is_refused(path: Path, name: str, value: object) -> None:
 
 
 def test_two_processes_that_save_one_file_lose_nothing(tmp_path: Path) -> None:
-    file, lines = tmp_path / "experience.npz", {y: straight((2, y), (12, y), 3) for y in (2, 5, 8)}
+    file, lines = (
+        tmp_path / "experience.npz",
+        {y: straight((2, y), (12, y), 3) for y in (2, 5, 8)},
+    )
     driven(lines[2]).save(file)
     one, other = Experience.load(file), Experience.load(file)
     for experience, y in ((one, 5), (other, 8)):
@@ -307,7 +354,9 @@ def test_two_processes_that_save_one_file_lose_nothing(tmp_path: Path) -> None:
         uncertainty = experience.uncertainty(HALL)
         for y in lines:
             assert at(HALL, uncertainty, 7, y) < 0.5 * uncertainty.max()
-            assert at(HALL, experience.slowness(HALL), 7, y) == pytest.approx(3, rel=0.15)
+            assert at(HALL, experience.slowness(HALL), 7, y) == pytest.approx(
+                3, rel=0.15
+            )
     one.forget()
     one.save(file)
     assert (Experience.load(file).slowness(HALL) == 1).all()
@@ -320,7 +369,9 @@ def test_two_processes_that_save_one_file_lose_nothing(tmp_path: Path) -> None:
 
 
 def test_what_was_merged_is_as_if_one_robot_had_driven_all() -> None:
-    drives = [straight((2, y), (12, y), slowness) for y, slowness in ((2, 2), (5, 4), (8, 3))]
+    drives = [
+        straight((2, y), (12, y), slowness) for y, slowness in ((2, 2), (5, 4), (8, 3))
+    ]
     one = driven(drives[0], drives[1])
     other = driven(drives[1], drives[2])
     other.record_failure((7, 7))
@@ -350,7 +401,9 @@ def test_a_file_of_an_older_version_is_read(path: Path) -> None:
         [table[:, :2], table[:, 0] * 9, table[:, 5:], 0 * table[:, 0]]
     )
     np.savez(path, **{**old, "version": 1})
-    assert at(HALL, Experience.load(path).slowness(HALL), 7, 5) == pytest.approx(3, rel=0.15)
+    assert at(HALL, Experience.load(path).slowness(HALL), 7, 5) == pytest.approx(
+        3, rel=0.15
+    )
 
 
 LINE = np.column_stack([np.linspace(0, 10, 41), np.zeros(41)])
@@ -369,13 +422,23 @@ TIMES = np.linspace(0, 20, 41)
         (TIMES[::-1], LINE, "40 times are earlier than those before; sort them"),
         (TIMES * 100, LINE, "the times are up to 50 s apart; give at most"),
         (TIMES / 1000, LINE, r"the robot moves at 500 m/s; give metres"),
-        (TIMES, LINE * 60, r"at 30 m/s; give metres and seconds, or a nominal_speed greater than"),
+        (
+            TIMES,
+            LINE * 60,
+            r"at 30 m/s; give metres and seconds, or a nominal_speed greater than",
+        ),
         (TIMES, LINE * 1000, "the robot moves at 500 m/s; give metres"),
-        (np.arange(410) * 20, np.c_[np.arange(410) / 100, np.zeros(410)], "at most at 0.0005 m/s"),
+        (
+            np.arange(410) * 20,
+            np.c_[np.arange(410) / 100, np.zeros(410)],
+            "at most at 0.0005 m/s",
+        ),
         (TIMES, LINE * 0.001, "no farther than 0.01 m; give a longer drive"),
     ],
 )
-def test_a_drive_that_teaches_nothing_says_why(seconds: Any, positions: Any, reason: str) -> None:
+def test_a_drive_that_teaches_nothing_says_why(
+    seconds: Any, positions: Any, reason: str
+) -> None:
     experience = Experience(nominal_speed=0.5, max_pause=20.0)
     before = experience.to_bytes()
     learned = experience.record(seconds, positions)

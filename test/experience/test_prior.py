@@ -27,7 +27,9 @@ def test_another_resolution_of_the_same_walls_has_nearly_the_same_features(
     fine = map_features(GridMap(occupancy.repeat(5, 0).repeat(5, 1), 0.05))[2::5, 2::5]
     difference = np.abs(fine - coarse)[~occupancy]
     assert difference[:, 3:].max(initial=0) < 1e-5
-    assert difference[:, :3].max(initial=0) < 0.25 / 3  # a corner's distance depends on its cell
+    assert (
+        difference[:, :3].max(initial=0) < 0.25 / 3
+    )  # a corner's distance depends on its cell
 
 
 def test_features_tell_walls_and_narrow_ways_and_a_wall_stands_around_the_map() -> None:
@@ -54,14 +56,18 @@ def some_prior() -> Prior:
     random, units = np.random.default_rng(0), 3
     layers = (FEATURES, units), units, (units, units), units, units
     shapes = FEATURES, FEATURES, (), FEATURES, *layers, (7, FEATURES + 4)
-    return Prior(*(np.abs(random.normal(size=shape)).astype(np.float32) for shape in shapes))
+    return Prior(
+        *(np.abs(random.normal(size=shape)).astype(np.float32) for shape in shapes)
+    )
 
 
 def test_a_prior_survives_as_arrays() -> None:
     prior, features = some_prior(), np.ones((2, 3, FEATURES), dtype=np.float32)
     again = Prior.from_arrays(prior._asdict())
     assert again.log_slowness(features).dtype == np.float32
-    assert all(np.array_equal(one, other) for one, other in zip(prior, again, strict=True))
+    assert all(
+        np.array_equal(one, other) for one, other in zip(prior, again, strict=True)
+    )
 
 
 def test_what_was_foretold_of_places_stays_with_them_after_a_merge() -> None:
@@ -97,7 +103,10 @@ def test_what_is_no_prior_is_refused(name: str) -> None:
         arrays[name].astype(complex),
         np.array("prior"),
     ]
-    if name in ("scale", "replay"):  # neither a scale nor the weight of a place is negative
+    if name in (
+        "scale",
+        "replay",
+    ):  # neither a scale nor the weight of a place is negative
         bad.append(-arrays[name])
     for value in bad:
         with pytest.raises(ValueError, match="cannot be true"):

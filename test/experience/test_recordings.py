@@ -66,10 +66,16 @@ def message(topic: str, kind: str, sample: Sample, frame: str = "map") -> Messag
     return topic, kind, {"header": header(seconds, frame), "pose": placed}
 
 
-def transform(seconds: float, frame: str, child: str, x: float, y: float, yaw: float = 0.0) -> Any:
+def transform(
+    seconds: float, frame: str, child: str, x: float, y: float, yaw: float = 0.0
+) -> Any:
     rotation = {"z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
     moved = {"translation": {"x": x, "y": y}, "rotation": rotation}
-    return {"header": header(seconds, frame), "child_frame_id": child, "transform": moved}
+    return {
+        "header": header(seconds, frame),
+        "child_frame_id": child,
+        "transform": moved,
+    }
 
 
 def write_mcap(path: Path, messages: list[Message]) -> Path:
@@ -78,7 +84,9 @@ def write_mcap(path: Path, messages: list[Message]) -> Path:
 
     fields = dict(line.split(": ") for line in TYPES.split("\n") if line)
     fields = {kind: text.replace(", ", "\n") for kind, text in fields.items()}
-    types = "".join(f"\n{'=' * 80}\nMSG: {kind}\n{text}" for kind, text in fields.items())
+    types = "".join(
+        f"\n{'=' * 80}\nMSG: {kind}\n{text}" for kind, text in fields.items()
+    )
     with path.open("wb") as file:
         writer = Writer(file)
         schemas = {
@@ -127,12 +135,16 @@ def test_a_csv_file_may_have_a_mark_of_its_encoding_and_blanks(tmp_path: Path) -
     assert read_csv(file) == [(1, 2, 3), (4, 5, 6)]
 
 
-def test_recordings_add_to_older_experience(tmp_path: Path, map_file: Path, console: Any) -> None:
+def test_recordings_add_to_older_experience(
+    tmp_path: Path, map_file: Path, console: Any
+) -> None:
     files = [tmp_path / f"{name}.csv" for name in "ab"]
     for file, y in zip(files, (5.0, 8.0), strict=True):
         rows = [f"{t},{x},note,{y}" for t, x, _ in slow_drive()]
         file.write_text("\n".join(["seconds,x,what,y", *rows]))
-    both, first, after = (tmp_path / "new" / f"{name}.npz" for name in ("both", "first", "after"))
+    both, first, after = (
+        tmp_path / "new" / f"{name}.npz" for name in ("both", "first", "after")
+    )
     learn = "learn --nominal-speed 0.8 --map", map_file, "--out"
     console(*learn, both, *files)
     console(*learn, first, files[0])
@@ -141,7 +153,9 @@ def test_recordings_add_to_older_experience(tmp_path: Path, map_file: Path, cons
     assert slowness(both) > 2.5
     one, two, old = map(Experience.load, (both, after, first))
     driven = np.ix_((20, 32), (40, 60, 80))
-    np.testing.assert_allclose(one.slowness(GRID)[driven], two.slowness(GRID)[driven], rtol=0.3)
+    np.testing.assert_allclose(
+        one.slowness(GRID)[driven], two.slowness(GRID)[driven], rtol=0.3
+    )
     assert one.evidence.driven == pytest.approx(two.evidence.driven, rel=0.02)
     assert two.evidence.driven == pytest.approx(2 * old.evidence.driven, rel=0.02)
     assert one.prior is not None
@@ -174,7 +188,12 @@ REFUSED = [
 
 @pytest.mark.parametrize(("name", "text", "reason"), REFUSED)
 def test_what_cannot_be_learned_is_refused(
-    tmp_path: Path, map_file: Path, console: Any, name: str, text: str | None, reason: str
+    tmp_path: Path,
+    map_file: Path,
+    console: Any,
+    name: str,
+    text: str | None,
+    reason: str,
 ) -> None:
     file = tmp_path / name
     if text is not None:
@@ -183,7 +202,9 @@ def test_what_cannot_be_learned_is_refused(
     assert not [*tmp_path.glob("experience.npz"), *tmp_path.glob("*.lock")]
 
 
-@pytest.mark.parametrize("kind", [ODOMETRY, WITH_COVARIANCE, "geometry_msgs/msg/PoseStamped"])
+@pytest.mark.parametrize(
+    "kind", [ODOMETRY, WITH_COVARIANCE, "geometry_msgs/msg/PoseStamped"]
+)
 def test_poses_of_an_mcap_file_are_learned(
     tmp_path: Path, map_file: Path, kind: str, console: Any
 ) -> None:
@@ -198,7 +219,9 @@ def test_poses_of_an_mcap_file_are_learned(
 def tree(robot: str, y: float, topic: str = "/tf") -> list[Message]:
     """What a robot sends that drives 10 m along x: few corrections, dated into the future."""
     kind, map_frame = "tf2_msgs/msg/TFMessage", "map"
-    odom, footprint, base = (f"{robot}{name}" for name in ("odom", "base_footprint", "base_link"))
+    odom, footprint, base = (
+        f"{robot}{name}" for name in ("odom", "base_footprint", "base_link")
+    )
     upwards = transform(0, footprint, base, 1.0, 0.0)
     messages: list[Message] = [(f"{topic}_static", kind, {"transforms": [upwards]})]
     for step in range(200):
@@ -221,7 +244,10 @@ def test_transforms_of_a_bag_lead_from_a_frame_below_the_one_that_moves_to_the_m
     messages = [*tree("", 5.0), message("/goal_pose", ODOMETRY, (100.0, 20.0, 1.0))]
     parts = [
         write_mcap(tmp_path / name, part)
-        for name, part in (("bag_9.mcap", messages[:101]), ("bag_10.mcap", messages[101:]))
+        for name, part in (
+            ("bag_9.mcap", messages[:101]),
+            ("bag_10.mcap", messages[101:]),
+        )
     ]
     source, samples = read_mcap(parts)
     assert source == "/tf of base_link"
@@ -230,12 +256,16 @@ def test_transforms_of_a_bag_lead_from_a_frame_below_the_one_that_moves_to_the_m
     assert "200 poses of /tf of base_link" in printed
 
 
-def test_transforms_with_rounded_rotations_count_and_those_without_do_not(tmp_path: Path) -> None:
+def test_transforms_with_rounded_rotations_count_and_those_without_do_not(
+    tmp_path: Path,
+) -> None:
     messages, empty = tree("", 5.0), {"x": 0.0, "y": 0.0, "z": 0.0, "w": 0.0}
     for _, _, sent in messages:
         for each in sent["transforms"]:
             numbers = each["transform"]["rotation"]
-            each["transform"]["rotation"] = {axis: round(n, 3) for axis, n in numbers.items()}
+            each["transform"]["rotation"] = {
+                axis: round(n, 3) for axis, n in numbers.items()
+            }
     bad = transform(105, "map", "odom", 30.0, 3.0)
     bad["transform"]["rotation"] = empty
     messages.insert(90, ("/tf", "tf2_msgs/msg/TFMessage", {"transforms": [bad]}))
@@ -265,15 +295,23 @@ TWO_ROBOTS: dict[str, tuple[list[Message], dict[str, str]]] = {
 def test_of_several_robots_one_is_chosen(tmp_path: Path, names: str) -> None:
     messages, choice = TWO_ROBOTS[names]
     file = write_mcap(tmp_path / "two.mcap", messages)
-    with pytest.raises(ValueError, match=f"poses of several robots: {names}; give --topic"):
+    with pytest.raises(
+        ValueError, match=f"poses of several robots: {names}; give --topic"
+    ):
         read_mcap([file])
     _, samples = read_mcap([file], **choice)
     np.testing.assert_allclose(samples, driven(9.0), atol=1e-9)
 
 
-def test_an_mcap_file_without_poses_on_the_map_names_what_it_has(tmp_path: Path) -> None:
-    file = write_mcap(tmp_path / "odom.mcap", [message("/odom", ODOMETRY, (1, 2, 3), "odom")])
-    with pytest.raises(ValueError, match=r"no poses in the frame 'map' .*/odom in \['odom'\]"):
+def test_an_mcap_file_without_poses_on_the_map_names_what_it_has(
+    tmp_path: Path,
+) -> None:
+    file = write_mcap(
+        tmp_path / "odom.mcap", [message("/odom", ODOMETRY, (1, 2, 3), "odom")]
+    )
+    with pytest.raises(
+        ValueError, match=r"no poses in the frame 'map' .*/odom in \['odom'\]"
+    ):
         read_mcap([file])
     assert read_mcap([file], "/odom", "odom")[1] == [(1, 2, 3)]
 
@@ -298,7 +336,9 @@ def test_a_recording_of_hours_has_a_drive_for_each_way(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("outcome", [DriveEnd.ARRIVED, DriveEnd.ABORTED])
-def test_a_drive_too_fast_is_kept_and_teaches_nothing(tmp_path: Path, outcome: DriveEnd) -> None:
+def test_a_drive_too_fast_is_kept_and_teaches_nothing(
+    tmp_path: Path, outcome: DriveEnd
+) -> None:
     folder = DriveFolder(tmp_path / "drives", 0.5, 0.5)
     before = folder.experience.to_bytes()
     seconds = np.arange(0, 20, 0.1)

@@ -18,7 +18,15 @@ from hypothesis.extra import numpy as numpy_st
 from scipy.spatial.distance import cdist
 from strategies import Data, grids_with_directions, occupancies, shapes
 
-from ddqn_planner.grid import UNKNOWN, GridMap, MoveRule, clearance, copies, grid_map, inflate
+from ddqn_planner.grid import (
+    UNKNOWN,
+    GridMap,
+    MoveRule,
+    clearance,
+    copies,
+    grid_map,
+    inflate,
+)
 from ddqn_planner.grid.arguments import as_cell
 from ddqn_planner.grid.body import Inflation, grid_from_costmap
 from ddqn_planner.grid.copies import boxes_of, cells_in, replaced
@@ -36,11 +44,16 @@ def test_cells_hold_centres(
     assert grid.world_to_cell(*grid.cell_to_world((x, y))) == (x, y)
 
 
-def test_a_cell_owns_its_lower_edges_and_the_origin_turns_the_map_counter_clockwise() -> None:
+def test_a_cell_owns_its_lower_edges_and_the_origin_turns_the_map_counter_clockwise() -> (
+    None
+):
     grid = GridMap(np.zeros((4, 4)), resolution=0.5, origin=(-1.0, -1.0, 0.0))
     assert grid.world_to_cell(-1.0, -1.0) == (0, 0)
     assert grid.world_to_cell(-0.5, -0.75) == (1, 0)
-    outside = grid.world_to_cell(1.0, 0.0), grid.world_to_cell(math.nextafter(-1.0, -2.0), 0.0)
+    outside = (
+        grid.world_to_cell(1.0, 0.0),
+        grid.world_to_cell(math.nextafter(-1.0, -2.0), 0.0),
+    )
     assert not any(map(grid.contains, [*outside, (-1, 0), (0, -1), (4, 0), (0, 4)]))
     assert all(map(grid.contains, [(0, 0), (3, 3)]))
     turned = GridMap(ZEROS, resolution=1.0, origin=(10.0, 20.0, math.pi / 2))
@@ -50,7 +63,14 @@ def test_a_cell_owns_its_lower_edges_and_the_origin_turns_the_map_counter_clockw
 
 @pytest.mark.parametrize(
     "cell",
-    [(2, 1), [2, 1], np.array([2, 1]), (np.int64(2), np.uint8(1)), (2.0, 1), (Fraction(2), 1.0)],
+    [
+        (2, 1),
+        [2, 1],
+        np.array([2, 1]),
+        (np.int64(2), np.uint8(1)),
+        (2.0, 1),
+        (Fraction(2), 1.0),
+    ],
 )
 def test_a_cell_is_any_pair_of_whole_numbers(cell: Any) -> None:
     assert json.dumps(as_cell(cell)) == "[2, 1]"
@@ -70,12 +90,20 @@ MALFORMED: list[tuple[str, list[Any], str]] = [
     ("resolution", [0.0, math.nan], r"is (0\.0|nan); give metres"),
     ("origin", [(0.0, math.inf, 0.0), (0.0, 0.0)], ".*; give"),
     ("cost", [np.zeros((1, 2)), np.zeros(()), np.zeros(6)], "has shape"),
-    ("cost", [np.full((2, 3), n) for n in (-2, 100, 0.7, math.nan)], "holds .*numbers -1 to 99"),
+    (
+        "cost",
+        [np.full((2, 3), n) for n in (-2, 100, 0.7, math.nan)],
+        "holds .*numbers -1 to 99",
+    ),
     ("cost", [np.full((2, 3), "dear")], ": the elements are of type <U"),
     ("obstacles", [np.eye(2, 3)], "lie on free cells; give some within"),
     ("obstacles", [np.eye(3)], r"has shape \(3, 3\)"),
     ("forbidden", [np.full((2, 3), n) for n in (-1, 256, 0.5)], "holds .* 0 to 255"),
-    ("slowness", [np.full((2, 3), n) for n in (0.5, 100.1, np.nan, np.inf)], "holds .* 1 to 100"),
+    (
+        "slowness",
+        [np.full((2, 3), n) for n in (0.5, 100.1, np.nan, np.inf)],
+        "holds .* 1 to 100",
+    ),
     ("slowness", [np.ones((3, 3))], r"has shape \(3, 3\); give \(2, 3\)"),
     ("seconds_per_cell", [0.0, np.nan], "is (0.0|nan); give more than 0"),
 ]
@@ -91,10 +119,15 @@ def test_a_malformed_map_is_refused_by_name() -> None:
 def test_the_map_keeps_read_only_copies_of_arrays_and_lists() -> None:
     occupancy = np.zeros((2, 2), dtype=bool)
     for cost in ([[99, 100], [-1, 7]], np.array([[99.0, np.nan], [-1.0, 7.0]])):
-        grid = GridMap(occupancy, cost=np.full((2, 2), 7)).with_patch([[0, 1], [0, 0]], 0, 0, cost)
+        grid = GridMap(occupancy, cost=np.full((2, 2), 7)).with_patch(
+            [[0, 1], [0, 0]], 0, 0, cost
+        )
         assert grid.cost is not None
         assert grid.cost.dtype == np.int8
-        assert grid.cost.tolist() == [[99, 0], [-1, 7]]  # those of occupied cells are ignored
+        assert grid.cost.tolist() == [
+            [99, 0],
+            [-1, 7],
+        ]  # those of occupied cells are ignored
         for array in (grid.occupancy, grid.cost):
             with pytest.raises(ValueError, match="read-only"):
                 array[0, 0] = True
@@ -104,7 +137,9 @@ def test_the_map_keeps_read_only_copies_of_arrays_and_lists() -> None:
     assert plain.is_free((0, 0))
 
 
-@given(numpy_st.arrays(np.int8, (2, 5)), st.integers(1, 100), st.booleans(), st.booleans())
+@given(
+    numpy_st.arrays(np.int8, (2, 5)), st.integers(1, 100), st.booleans(), st.booleans()
+)
 def test_each_value_has_a_meaning(
     values: np.ndarray, threshold: int, allow_unknown: bool, use_map_costs: bool
 ) -> None:
@@ -125,7 +160,10 @@ def test_a_wrong_occupancy_value_is_named() -> None:
         ([[0.0, 1.0]], 65, "of type float64; give integers, percent"),
         ([[True, False]], 65, "holds True; give numbers"),
         ([[0, 1], [0]], 65, "no array"),
-        *(([[0, 1]], n, f"occupied_threshold is {n}; give 1 to 100") for n in (0, 101, math.nan)),
+        *(
+            ([[0, 1]], n, f"occupied_threshold is {n}; give 1 to 100")
+            for n in (0, 101, math.nan)
+        ),
     ):
         with pytest.raises(ValueError, match=named):
             GridMap.from_occupancy_values(values, occupied_threshold=threshold)
@@ -135,7 +173,9 @@ def test_a_wrong_occupancy_value_is_named() -> None:
 def full_grids(draw: st.DrawFn) -> GridMap:
     grid, _ = draw(grids_with_directions())
     shape = grid.occupancy.shape
-    slowness = draw(st.none() | numpy_st.arrays(np.float32, shape, elements=st.integers(1, 100)))
+    slowness = draw(
+        st.none() | numpy_st.arrays(np.float32, shape, elements=st.integers(1, 100))
+    )
     known = draw(st.none() | numpy_st.arrays(np.bool_, shape))
     obstacles = None if known is None else known & grid.occupancy
     uphill = draw(st.none() | numpy_st.arrays(np.uint8, shape))
@@ -148,7 +188,14 @@ def derived(grid: GridMap) -> list[Any]:
     rules = [grid.labels(rule).tolist() for rule in MoveRule]
     given_again = {field.name: getattr(grid, field.name) for field in fields(grid)}
     same = grid.same_cells(GridMap(**given_again))
-    return [grid.fingerprint, grid.cost_multiplier.tolist(), grid.height, grid.width, rules, same]
+    return [
+        grid.fingerprint,
+        grid.cost_multiplier.tolist(),
+        grid.height,
+        grid.width,
+        rules,
+        same,
+    ]
 
 
 @given(full_grids(), st.booleans(), st.booleans(), st.data())
@@ -157,32 +204,46 @@ def test_patches_are_exact(
 ) -> None:
     before = derived(grid)
     x, y = (data.draw(st.integers(0, side - 1)) for side in (grid.width, grid.height))
-    shape = tuple(data.draw(st.integers(1, n)) for n in (grid.height - y, grid.width - x))
+    shape = tuple(
+        data.draw(st.integers(1, n)) for n in (grid.height - y, grid.width - x)
+    )
     patch = data.draw(numpy_st.arrays(np.bool_, shape))
     costs = data.draw(numpy_st.arrays(np.int8, shape, elements=st.integers(-1, 99)))
     obstacles = data.draw(numpy_st.arrays(np.bool_, shape))
     patched = grid.with_patch(
-        patch, x, y, costs if with_costs else None, obstacles if with_obstacles else None
+        patch,
+        x,
+        y,
+        costs if with_costs else None,
+        obstacles if with_obstacles else None,
     )
     box = slice(y, y + shape[0]), slice(x, x + shape[1])
-    layers = {field.name: copy.copy(getattr(grid, field.name)) for field in fields(grid)}
+    layers = {
+        field.name: copy.copy(getattr(grid, field.name)) for field in fields(grid)
+    }
     layers["occupancy"][box] = patch
     if with_costs:
-        layers["cost"] = np.zeros(grid.occupancy.shape) if grid.cost is None else layers["cost"]
+        layers["cost"] = (
+            np.zeros(grid.occupancy.shape) if grid.cost is None else layers["cost"]
+        )
         layers["cost"][box] = costs
     if grid.obstacles is not None:
         layers["obstacles"][box] = patch & obstacles if with_obstacles else patch
     expected = GridMap(**layers)
     assert derived(patched) == derived(expected)
     for field in fields(grid):
-        np.testing.assert_array_equal(getattr(patched, field.name), getattr(expected, field.name))
+        np.testing.assert_array_equal(
+            getattr(patched, field.name), getattr(expected, field.name)
+        )
     assert patched.same_cells(expected)
     assert patched.same_cells(grid) == expected.same_cells(grid)
     assert derived(grid) == before
 
 
 @given(full_grids(), full_grids())
-def test_maps_of_the_same_fingerprint_have_the_same_layers(a: GridMap, b: GridMap) -> None:
+def test_maps_of_the_same_fingerprint_have_the_same_layers(
+    a: GridMap, b: GridMap
+) -> None:
     names = "occupancy", "cost", "forbidden", "slowness", "uphill"
     for changed in (None, *names):
         layers = {name: getattr(a, name) for name in names}
@@ -199,11 +260,20 @@ def test_maps_of_the_same_fingerprint_have_the_same_layers(a: GridMap, b: GridMa
 def test_a_wrong_patch_is_named_and_the_remedy_too() -> None:
     one = np.zeros((1, 1))
     for arguments, named in (
-        ((np.zeros((2, 2)), 2, 0), r"2 x 2 cells from \(2, 0\) is not inside .* 3 x 2; cut"),
-        *(((one, *cell), "is not inside") for cell in ((-1, 0), (0, -1), (3, 0), (0, 2))),
+        (
+            (np.zeros((2, 2)), 2, 0),
+            r"2 x 2 cells from \(2, 0\) is not inside .* 3 x 2; cut",
+        ),
+        *(
+            ((one, *cell), "is not inside")
+            for cell in ((-1, 0), (0, -1), (3, 0), (0, 2))
+        ),
         ((one, 0.5, 0), "first cell of the patch is .*; give two whole numbers"),
         ((one, 0, 0, [[1, 2]]), r"cost has shape \(1, 2\); give \(1, 1\)"),
-        ((np.ones((1, 2)), 0, 0, None, [[1]]), r"obstacles has shape \(1, 1\); give \(1, 2\)"),
+        (
+            (np.ones((1, 2)), 0, 0, None, [[1]]),
+            r"obstacles has shape \(1, 1\); give \(1, 2\)",
+        ),
     ):
         for cost in (None, ZEROS):
             with pytest.raises(ValueError, match=named):
@@ -214,7 +284,9 @@ def test_a_wrong_patch_is_named_and_the_remedy_too() -> None:
     ("name", "value"),
     [("slowness", np.float32(2)), ("forbidden", np.uint8(2)), ("uphill", np.uint8(2))],
 )
-def test_maps_tell_their_patches_where_all_else_is_the_same(name: str, value: Any) -> None:
+def test_maps_tell_their_patches_where_all_else_is_the_same(
+    name: str, value: Any
+) -> None:
     grid = GridMap(ZEROS, cost=ZEROS)
     patched, layer = grid.with_patch([[1]], 2, 1), np.full((2, 3), value)
     before, after = (each.with_layers(**{name: layer}) for each in (grid, patched))
@@ -223,10 +295,15 @@ def test_maps_tell_their_patches_where_all_else_is_the_same(name: str, value: An
     for other in (grid, patched, grid.with_layers(**{name: layer.copy()})):
         assert after.patches_since(other) is None
     for name in ("occupancy", "cost"):
-        assert after.with_layers(**{name: getattr(after, name)}).patches_since(before) is None
+        assert (
+            after.with_layers(**{name: getattr(after, name)}).patches_since(before)
+            is None
+        )
 
 
-def test_a_map_knows_so_many_patches_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_map_knows_so_many_patches_and_no_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(grid_map, "MAX_PATCHES", 3)
     maps = [GridMap(ZEROS)]
     for x, y in ((0, 0), (1, 0), (2, 0), (0, 1), (1, 1)):
@@ -239,7 +316,10 @@ def test_a_map_knows_so_many_patches_and_no_more(monkeypatch: pytest.MonkeyPatch
 
 
 RESOLUTION = 0.05
-RADII, WEIGHTS = st.sampled_from([0.0, 0.03, 0.05, 0.1, 0.12, 0.2, 1.0]), st.floats(0, 1)
+RADII, WEIGHTS = (
+    st.sampled_from([0.0, 0.03, 0.05, 0.1, 0.12, 0.2, 1.0]),
+    st.floats(0, 1),
+)
 
 
 @given(occupancies, RADII, WEIGHTS, st.sampled_from([None, UNKNOWN, 0, 40]))
@@ -251,7 +331,9 @@ def test_inflation_is_exact(
     assert clearance(occupancy) == pytest.approx(distance)
     costs = None if cost is None else np.full(occupancy.shape, cost)
     # A message has the resolution in single precision: two cells of 0.05 m may be 0.099999999 m.
-    grid = inflate(GridMap(occupancy, float(np.float32(RESOLUTION)), cost=costs), radius, weight)
+    grid = inflate(
+        GridMap(occupancy, float(np.float32(RESOLUTION)), cost=costs), radius, weight
+    )
     closed = occupancy | (np.round(distance * RESOLUTION, 6) < radius)
     np.testing.assert_array_equal(grid.occupancy, closed)
     for y, x in np.ndindex(occupancy.shape):
@@ -260,23 +342,36 @@ def test_inflation_is_exact(
     added = 99 * weight / (1 + np.maximum(distance * RESOLUTION - radius, 0)) ** 3
     expected = cost if cost == UNKNOWN else np.maximum(np.rint(added), cost or 0)
     found = np.zeros(occupancy.shape) if grid.cost is None else grid.cost
-    np.testing.assert_allclose(found, np.where(closed, 0, expected), atol=float(weight > 0))
+    np.testing.assert_allclose(
+        found, np.where(closed, 0, expected), atol=float(weight > 0)
+    )
 
 
 def test_a_value_out_of_range_is_named() -> None:
     grid = GridMap(np.zeros((2, 2)))
     for wrong in (-0.1, math.nan, math.inf, 1.1):
-        with pytest.raises(ValueError, match=f"clearance_weight is {wrong}; give 0 to 1"):
+        with pytest.raises(
+            ValueError, match=f"clearance_weight is {wrong}; give 0 to 1"
+        ):
             inflate(grid, 0.0, wrong)
         if wrong != 1.1:
-            with pytest.raises(ValueError, match=f"robot_radius is {wrong}; give metres"):
+            with pytest.raises(
+                ValueError, match=f"robot_radius is {wrong}; give metres"
+            ):
                 inflate(grid, wrong)
 
 
-BODIES = st.tuples(st.sampled_from([0.0, 0.4, 1.0, 2.3]), st.sampled_from([0.0, 0.3, 1.0]))
+BODIES = st.tuples(
+    st.sampled_from([0.0, 0.4, 1.0, 2.3]), st.sampled_from([0.0, 0.3, 1.0])
+)
 
 
-@given(st.integers(0, 2**32), st.lists(BODIES, min_size=1, max_size=2), st.booleans(), st.data())
+@given(
+    st.integers(0, 2**32),
+    st.lists(BODIES, min_size=1, max_size=2),
+    st.booleans(),
+    st.data(),
+)
 def test_maps_that_come_one_after_another_are_inflated_as_if_each_were_the_first(
     seed: int, bodies: list[tuple[float, float]], with_costs: bool, data: Data
 ) -> None:
@@ -285,7 +380,9 @@ def test_maps_that_come_one_after_another_are_inflated_as_if_each_were_the_first
     cost = random.integers(-1, 100, occupancy.shape) if with_costs else None
     grid = GridMap(occupancy, 0.5, cost=cost)
     for _ in range(4):
-        change = data.draw(st.sampled_from(["none", "cells", "costs", "resolution", "size"]))
+        change = data.draw(
+            st.sampled_from(["none", "cells", "costs", "resolution", "size"])
+        )
         x, y = random.integers(0, 20, 2).tolist()
         if change == "cells":
             grid = grid.with_patch(random.random((2, 2)) < 0.5, x, y)
@@ -305,7 +402,9 @@ def test_maps_that_come_one_after_another_are_inflated_as_if_each_were_the_first
 
 def test_costs_are_those_of_navfn() -> None:
     costs = np.arange(253).reshape(1, -1)
-    published = np.where(costs > 0, 1 + 97 * (costs - 1) // 251, 0)  # by Nav2, for free cells
+    published = np.where(
+        costs > 0, 1 + 97 * (costs - 1) // 251, 0
+    )  # by Nav2, for free cells
     grid = grid_from_costmap(published.astype(np.int8))
     assert not grid.occupancy.any()
     navfn = np.minimum(50 + 0.8 * costs, 253).astype(int) / 50
@@ -316,10 +415,15 @@ def test_costs_are_those_of_navfn() -> None:
 
 
 @given(numpy_st.arrays(np.int8, shapes), st.booleans())
-def test_unknown_inscribed_lethal_cells_are_closed(values: np.ndarray, allow_unknown: bool) -> None:
+def test_unknown_inscribed_lethal_cells_are_closed(
+    values: np.ndarray, allow_unknown: bool
+) -> None:
     grid = grid_from_costmap(values, allow_unknown=allow_unknown)
     unknown = values < 0
-    assert grid.occupancy.tolist() == ((values >= 99) | (unknown & (not allow_unknown))).tolist()
+    assert (
+        grid.occupancy.tolist()
+        == ((values >= 99) | (unknown & (not allow_unknown))).tolist()
+    )
     assert grid.obstacles is not None
     assert grid.obstacles.tolist() == (grid.occupancy & (values != 99)).tolist()
     if allow_unknown:
@@ -336,14 +440,18 @@ def shared(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(copies, "BOX", 1)
 
 
-BOXES = st.tuples(st.integers(0, 9), st.integers(1, 10), st.integers(0, 9), st.integers(1, 10))
+BOXES = st.tuples(
+    st.integers(0, 9), st.integers(1, 10), st.integers(0, 9), st.integers(1, 10)
+)
 SHAPES = st.sampled_from([(10, 20), (20, 10)])
 FATES = st.sampled_from(["kept", "dropped", "viewed"])
 CHANGES = st.lists(st.tuples(st.integers(0, 100), BOXES, SHAPES, FATES), max_size=80)
 
 
 @given(CHANGES)
-def test_each_copy_keeps_what_it_was_given_whatever_comes_after(changes: list[Any]) -> None:
+def test_each_copy_keeps_what_it_was_given_whatever_comes_after(
+    changes: list[Any],
+) -> None:
     copied = [np.arange(200, dtype=np.int16).reshape(10, 20)]
     expected, views = [copied[0].copy()], []
     for origin, (y, height, x, width), shape, fate in changes:
@@ -367,7 +475,10 @@ def open_files() -> int:
 
 
 def test_maps_that_are_patched_or_kept_leave_files_for_others() -> None:
-    before, grid = open_files(), GridMap(np.zeros((20, 20)), cost=np.zeros((20, 20), np.int8))
+    before, grid = (
+        open_files(),
+        GridMap(np.zeros((20, 20)), cost=np.zeros((20, 20), np.int8)),
+    )
     kept = [grid]
     for step in range(2000):
         grid = grid.with_patch([[step % 2]], step % 20, step // 20 % 20)
@@ -380,13 +491,19 @@ def test_maps_that_are_patched_or_kept_leave_files_for_others() -> None:
     assert open_files() == before
 
 
-def test_a_patched_map_is_copied_whole_and_shares_nothing_with_what_it_was_made_of() -> None:
+def test_a_patched_map_is_copied_whole_and_shares_nothing_with_what_it_was_made_of() -> (
+    None
+):
     given, patch = np.zeros((20, 20), dtype=np.bool_), np.ones((2, 2), dtype=np.bool_)
     grid = GridMap(given)
     patched = grid.with_patch(patch, 3, 3)
     given[:], patch[:] = True, False
     assert [int(each.occupancy.sum()) for each in (grid, patched)] == [0, 4]
-    for copied in (pickle.loads(pickle.dumps(patched)), copy.deepcopy(patched), copy.copy(patched)):
+    for copied in (
+        pickle.loads(pickle.dumps(patched)),
+        copy.deepcopy(patched),
+        copy.copy(patched),
+    ):
         assert copied.same_cells(patched)
         assert copied.fingerprint == patched.fingerprint
         assert copied.with_patch([[0, 0], [0, 0]], 3, 3).same_cells(grid)
@@ -415,14 +532,20 @@ def test_changes_that_lie_apart_have_small_boxes() -> None:
     assert boxes_of(is_set) == [(slice(0, 151), slice(0, 251))]
 
 
-@pytest.mark.parametrize("wrong", [np.array([1, 2]), np.array(["unit"]), ["unit"], {}, None])
+@pytest.mark.parametrize(
+    "wrong", [np.array([1, 2]), np.array(["unit"]), ["unit"], {}, None]
+)
 def test_what_is_no_choice_is_named_whatever_its_kind(wrong: Any) -> None:
-    with pytest.raises(ValueError, match=r"(?s)MoveRule .* is unknown; give one of robot_safe"):
+    with pytest.raises(
+        ValueError, match=r"(?s)MoveRule .* is unknown; give one of robot_safe"
+    ):
         MoveRule(wrong)
     assert MoveRule(np.str_("unit")) is copy.deepcopy(MoveRule.UNIT) is MoveRule.UNIT
 
 
-@pytest.mark.parametrize("layer", ["occupancy", "cost", "forbidden", "slowness", "uphill"])
+@pytest.mark.parametrize(
+    "layer", ["occupancy", "cost", "forbidden", "slowness", "uphill"]
+)
 @pytest.mark.parametrize("row", range(20))
 def test_maps_that_differ_in_one_cell_are_not_the_same(layer: str, row: int) -> None:
     ones = np.ones((20, 3), np.uint8)

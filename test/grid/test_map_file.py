@@ -26,7 +26,12 @@ from ddqn_planner.grid import MapFile, MapFileError, read_map_file
 from ddqn_planner.grid.map_file import MapDataError, MapMetadataError, MapNotFoundError
 from ddqn_planner.resources import find_map
 
-VALID: dict[str, Any] = {"image": "map.png", "mode": "trinary", "resolution": 0.05, "negate": 0}
+VALID: dict[str, Any] = {
+    "image": "map.png",
+    "mode": "trinary",
+    "resolution": 0.05,
+    "negate": 0,
+}
 VALID |= {"origin": [1.0, -2.0, 0.5], "occupied_thresh": 0.65, "free_thresh": 0.25}
 PIXELS = np.zeros((2, 2), dtype=np.uint8)
 
@@ -41,10 +46,14 @@ def put(path: Path, image: np.ndarray | Image.Image | bytes) -> None:
         (Image.fromarray(image) if isinstance(image, np.ndarray) else image).save(path)
 
 
-def write(folder: Path, image: np.ndarray | Image.Image | bytes, /, **changes: Any) -> Path:
+def write(
+    folder: Path, image: np.ndarray | Image.Image | bytes, /, **changes: Any
+) -> Path:
     """Write an image and a YAML; a key with the value None is left out."""
     put(folder / "map.png", image)
-    entries = {key: value for key, value in {**VALID, **changes}.items() if value is not None}
+    entries = {
+        key: value for key, value in {**VALID, **changes}.items() if value is not None
+    }
     (folder / "map.yaml").write_text(yaml.safe_dump(entries))
     return folder / "map.yaml"
 
@@ -53,7 +62,9 @@ def values(path: Path) -> list[list[int]]:
     return read_map_file(path).values.tolist()  # type: ignore[no-any-return]
 
 
-def occupancy_of(grey: int, mode: str, negate: bool, occupied: float, free: float) -> int:
+def occupancy_of(
+    grey: int, mode: str, negate: bool, occupied: float, free: float
+) -> int:
     """The rule of nav2_map_server for one opaque pixel, in its single precision."""
     if mode == "raw":
         return grey if grey <= 100 else -1
@@ -66,20 +77,40 @@ def occupancy_of(grey: int, mode: str, negate: bool, occupied: float, free: floa
 
 
 # Often exactly a grey value.
-thresholds = st.tuples(*2 * [st.integers(0, 255).map(lambda g: g / 255) | st.floats(0, 1)])
+thresholds = st.tuples(
+    *2 * [st.integers(0, 255).map(lambda g: g / 255) | st.floats(0, 1)]
+)
 
 
 modes = st.sampled_from(["trinary", "scale", "raw", "Trinary"])
-negations = st.sampled_from([(0, False), ("off", False), ("n", False), (1, True), ("y", True)])
+negations = st.sampled_from(
+    [(0, False), ("off", False), ("n", False), (1, True), ("y", True)]
+)
 
 
 @same_folder
-@given(numpy_st.arrays(np.uint8, shapes), modes, negations, thresholds.map(sorted), st.data())
+@given(
+    numpy_st.arrays(np.uint8, shapes),
+    modes,
+    negations,
+    thresholds.map(sorted),
+    st.data(),
+)
 def test_each_mode_follows_map_servers_rule_and_row_0_is_the_bottom_one(
-    tmp_path: Path, image: np.ndarray, mode: str, negation: Any, thresholds: Any, data: Any
+    tmp_path: Path,
+    image: np.ndarray,
+    mode: str,
+    negation: Any,
+    thresholds: Any,
+    data: Any,
 ) -> None:
     (free, occupied), (negate, is_negated) = thresholds, negation
-    changes = {"mode": mode, "negate": negate, "free_thresh": free, "occupied_thresh": occupied}
+    changes = {
+        "mode": mode,
+        "negate": negate,
+        "free_thresh": free,
+        "occupied_thresh": occupied,
+    }
     resolution = data.draw(st.sampled_from([0.05, "5e-2", "0.050"]))
     path = write(tmp_path, image, resolution=resolution, **changes)
     map_file = read_map_file(path)
@@ -88,19 +119,25 @@ def test_each_mode_follows_map_servers_rule_and_row_0_is_the_bottom_one(
     np.testing.assert_array_equal(map_file.values, np.array(expected))
     assert (map_file.resolution, map_file.origin) == (0.05, (1.0, -2.0, 0.5))
     options = data.draw(st.tuples(st.integers(1, 100), st.booleans(), st.booleans()))
-    grid = GridMap.from_occupancy_values(map_file.values, 0.05, map_file.origin, *options)
+    grid = GridMap.from_occupancy_values(
+        map_file.values, 0.05, map_file.origin, *options
+    )
     assert load_map(path, *options).fingerprint == grid.fingerprint
 
 
 @pytest.mark.filterwarnings("error")
-def test_between_thresholds_that_nearly_coincide_nothing_overflows(tmp_path: Path) -> None:
+def test_between_thresholds_that_nearly_coincide_nothing_overflows(
+    tmp_path: Path,
+) -> None:
     image = np.array([[0, 128, 255]], dtype=np.uint8)
     file = write(tmp_path, image, mode="scale", free_thresh=0.0, occupied_thresh=1e-40)
     assert values(file) == [[100, 100, 0]]
 
 
 def test_what_is_not_opaque_is_unknown_but_in_mode_raw(tmp_path: Path) -> None:
-    pixels = np.array([[[0, 0, 0, 255], [0, 0, 0, 254], [254, 254, 254, 0]]], dtype=np.uint8)
+    pixels = np.array(
+        [[[0, 0, 0, 255], [0, 0, 0, 254], [254, 254, 254, 0]]], dtype=np.uint8
+    )
     assert values(write(tmp_path, pixels)) == [[100, -1, -1]]
     assert values(write(tmp_path, pixels, mode="raw")) == [[0, 0, -1]]
     image = Image.fromarray(np.array([[0, 1, 2]], dtype=np.uint8), "P")
@@ -111,7 +148,13 @@ def test_what_is_not_opaque_is_unknown_but_in_mode_raw(tmp_path: Path) -> None:
 
 
 # The grey value that map_server's GraphicsMagick gives for each colour.
-COLOURS = {(13, 71, 98): 56, (11, 0, 12): 4, (13, 26, 25): 22, (5, 18, 17): 14, (72, 111, 67): 94}
+COLOURS = {
+    (13, 71, 98): 56,
+    (11, 0, 12): 4,
+    (13, 26, 25): 22,
+    (5, 18, 17): 14,
+    (72, 111, 67): 94,
+}
 
 
 @pytest.mark.parametrize("mode", ["RGB", "P", "RGBA"])
@@ -121,13 +164,17 @@ def test_luma_is_rounded_to_16_bits_and_cut_to_8(tmp_path: Path, mode: str) -> N
     if mode == "P":
         image = Image.fromarray(np.arange(len(COLOURS), dtype=np.uint8)[None], "P")
         image.putpalette(pixels.ravel().tolist())
-    assert values(write(tmp_path, image.convert(mode), mode="raw")) == [list(COLOURS.values())]
+    assert values(write(tmp_path, image.convert(mode), mode="raw")) == [
+        list(COLOURS.values())
+    ]
 
 
 def bitmap_of_32_bits(compression: int) -> bytes:
     """Return a BMP of one black pixel whose fourth byte is 0."""
     masks = struct.pack("<III", 0xFF0000, 0xFF00, 0xFF) if compression else b""
-    header = struct.pack("<IiiHHIIiiII", 40, 1, 1, 1, 32, compression, 4, 0, 0, 0, 0) + masks
+    header = (
+        struct.pack("<IiiHHIIiiII", 40, 1, 1, 1, 32, compression, 4, 0, 0, 0, 0) + masks
+    )
     start = 14 + len(header)
     return b"BM" + struct.pack("<IHHI", start + 4, 0, 0, start) + header + bytes(4)
 
@@ -166,7 +213,9 @@ def test_an_image_that_map_server_reads_differently_is_refused(tmp_path: Path) -
     ):
         assert {*map(max, values(write(tmp_path, content)))} == {100}
     # A wide grey value counts by its upper byte.
-    wide = np.array([[0, 256, 257, 513, 100 * 257, 100 * 257 + 256, 65535]], dtype=np.uint16)
+    wide = np.array(
+        [[0, 256, 257, 513, 100 * 257, 100 * 257 + 256, 65535]], dtype=np.uint16
+    )
     assert values(write(tmp_path, wide, mode="raw")) == [[0, 0, 1, 1, 100, 100, -1]]
 
 
@@ -185,27 +234,53 @@ def test_an_impossible_map_file_is_not_made() -> None:
     ("changes", "named"),
     [
         *(({key: None}, f"{key} is missing") for key in VALID if key != "mode"),
-        *(({"resolution": 0}, "resolution is 0"), ({"resolution": 10**400}, "resolution is inf")),
-        ({"resolution": float("nan")}, "resolution is nan; give metres per cell, 1e-06 to"),
+        *(
+            ({"resolution": 0}, "resolution is 0"),
+            ({"resolution": 10**400}, "resolution is inf"),
+        ),
+        (
+            {"resolution": float("nan")},
+            "resolution is nan; give metres per cell, 1e-06 to",
+        ),
         ({"resolution": "1_0"}, "resolution is '1_0'; give numbers"),
         *(({"resolution": wrong}, "resolution is '") for wrong in ("fine", True)),
-        *(({"origin": wrong}, "origin is") for wrong in ([0, 0, 10**400], ["a", 0, 0], "here")),
+        *(
+            ({"origin": wrong}, "origin is")
+            for wrong in ([0, 0, 10**400], ["a", 0, 0], "here")
+        ),
         *(({"origin": wrong}, "origin is") for wrong in ([0, 0], [0] * 4, 0)),
         *(
             ({"negate": wrong}, f"negate is '{wrong}'; give 0 or 1")
             for wrong in ("08", "tRUE", "0.0", "")
         ),
         ({"occupied_thresh": 1.5}, r"occupied_thresh is 1\.5"),
-        *(({"free_thresh": 0.7}, r"free_thresh is 0\.7"), ({"image": []}, r"image is \[\]")),
-        *(({"mode": "quaternary"}, "mode is 'quaternary'"), ({"mode": []}, r"mode is \[\]")),
-        ({"ddqn_planner": {"start": [0, 9]}}, r"start \(0, 9\) lies outside the map of 2 x 2"),
+        *(
+            ({"free_thresh": 0.7}, r"free_thresh is 0\.7"),
+            ({"image": []}, r"image is \[\]"),
+        ),
+        *(
+            ({"mode": "quaternary"}, "mode is 'quaternary'"),
+            ({"mode": []}, r"mode is \[\]"),
+        ),
+        (
+            {"ddqn_planner": {"start": [0, 9]}},
+            r"start \(0, 9\) lies outside the map of 2 x 2",
+        ),
         ({"ddqn_planner": {"goal": [0.5, 0]}}, r"goal is \[0\.5, 0\.0\]"),
         ({"ddqn_planner": {"goal": "there"}}, "goal is 'there'"),
-        *(({"ddqn_planner": {"goal": wrong}}, "goal is .* two") for wrong in ("12", [1], [0] * 9)),
-        *(({"ddqn_planner": wrong}, "ddqn_planner is") for wrong in ({"gaol": [0, 0]}, 5)),
+        *(
+            ({"ddqn_planner": {"goal": wrong}}, "goal is .* two")
+            for wrong in ("12", [1], [0] * 9)
+        ),
+        *(
+            ({"ddqn_planner": wrong}, "ddqn_planner is")
+            for wrong in ({"gaol": [0, 0]}, 5)
+        ),
     ],
 )
-def test_a_wrong_yaml_value_is_named(tmp_path: Path, changes: dict[str, Any], named: str) -> None:
+def test_a_wrong_yaml_value_is_named(
+    tmp_path: Path, changes: dict[str, Any], named: str
+) -> None:
     with pytest.raises(MapMetadataError, match=named):
         read_map_file(write(tmp_path, PIXELS, **changes))
 
@@ -227,8 +302,17 @@ def test_what_is_no_map_yaml_is_refused(tmp_path: Path, text: str) -> None:
 def test_a_missing_file_and_a_broken_one_have_different_errors(tmp_path: Path) -> None:
     (tmp_path / "folder.yaml").mkdir()
     os.mkfifo(tmp_path / "pipe.yaml")
-    missing = [tmp_path / name for name in ("none.yaml", "folder.yaml", "pipe.yaml", "", "nul\0")]
-    for name in (*missing, "~\0/map.yaml", "~\ud800/map.yaml", "nul\0.yaml", "x" * 5000):
+    missing = [
+        tmp_path / name
+        for name in ("none.yaml", "folder.yaml", "pipe.yaml", "", "nul\0")
+    ]
+    for name in (
+        *missing,
+        "~\0/map.yaml",
+        "~\ud800/map.yaml",
+        "nul\0.yaml",
+        "x" * 5000,
+    ):
         with pytest.raises(
             MapNotFoundError, match=r"no such file|is a |give (a|another) path|too long"
         ):
@@ -243,13 +327,18 @@ def test_a_missing_file_and_a_broken_one_have_different_errors(tmp_path: Path) -
 
 def test_an_unreadable_file_is_refused(plain_folder: Path) -> None:
     path = write(plain_folder, PIXELS)
-    for unreadable, error in ((plain_folder / "map.png", MapDataError), (path, MapMetadataError)):
+    for unreadable, error in (
+        (plain_folder / "map.png", MapDataError),
+        (path, MapMetadataError),
+    ):
         unreadable.chmod(0)
         with pytest.raises(error, match=r"[Pp]ermission denied"):
             read_map_file(path)
 
 
-def test_a_moving_ai_map_keeps_its_rows_and_columns_or_is_refused(tmp_path: Path) -> None:
+def test_a_moving_ai_map_keeps_its_rows_and_columns_or_is_refused(
+    tmp_path: Path,
+) -> None:
     path, octile = tmp_path / "broken.map", "type octile\nheight {}\nwidth 2\nmap\n{}"
     path.write_text("type octile\nheight 2\nwidth 4\nmap\n.GS@\nTOW.\n")
     grid = load_map(path)
@@ -289,7 +378,11 @@ def test_the_bottom_row_of_the_image_of_directions_is_row_0(tmp_path: Path) -> N
 
 def test_an_image_that_holds_no_directions_is_refused(tmp_path: Path) -> None:
     for image, name, named in (
-        (GREY.resize((2, 3)), "d.png", "has 2 x 3 pixels; give 3 x 2, as the map's image"),
+        (
+            GREY.resize((2, 3)),
+            "d.png",
+            "has 2 x 3 pixels; give 3 x 2, as the map's image",
+        ),
         *(
             (GREY.convert(mode), "d.png", f"stored as zip {mode}")
             for mode in ("RGB", "LA", "P", "1")
@@ -320,7 +413,12 @@ def test_a_map_of_a_service_names_no_image_outside_of_its_folder(folder: Path) -
     for inside in ("./good.pgm", f"{folder}/good.pgm", "below/good.pgm", "link.pgm"):
         path = write(folder, PIXELS, image=inside)
         assert read_map_file(path, only_below=True).values.shape == (3, 3)
-    outside = ["../good.pgm", f"{folder.parent}/good.pgm", "outside.pgm", "above/good.pgm"]
+    outside = [
+        "../good.pgm",
+        f"{folder.parent}/good.pgm",
+        "outside.pgm",
+        "above/good.pgm",
+    ]
     for name, key in itertools.product(outside, ("image", "directions")):
         changes = {"ddqn_planner": {key: name}} if key == "directions" else {key: name}
         path = write(folder, np.zeros((3, 3), dtype=np.uint8), **changes)
@@ -332,12 +430,16 @@ def test_a_map_of_a_service_names_no_image_outside_of_its_folder(folder: Path) -
             assert read_map_file(path).values.shape == (3, 3)
 
 
-@pytest.mark.parametrize("image", ["/home/r/maps/map.png", "maps/map.png", r"C:\maps\map.png"])
+@pytest.mark.parametrize(
+    "image", ["/home/r/maps/map.png", "maps/map.png", r"C:\maps\map.png"]
+)
 def test_an_image_of_another_computer_is_named_where_it_lies_beside(
     tmp_path: Path, image: str
 ) -> None:
     path = write(tmp_path, PIXELS, image=image)
-    with pytest.raises(MapDataError, match=r"'map.png' lies beside .* write 'image: map.png'"):
+    with pytest.raises(
+        MapDataError, match=r"'map.png' lies beside .* write 'image: map.png'"
+    ):
         read_map_file(path)
     (tmp_path / "map.png").unlink()
     with pytest.raises(MapDataError, match="no such image; check 'image'"):
@@ -352,33 +454,48 @@ SAME_MAPS: dict[str, str | bytes] = {
     "tabs after colons": (BEGIN + END).replace(": ", ":\t"),
     "tabs before comments": (BEGIN + END).replace("\n", "\t# a comment\n"),
     "tabs at ends of lines": (BEGIN + END).replace("\n", "\t\r\n"),
-    "tabs in a list": (BEGIN + END).replace("[1.0, -2.0, 0.5]", "[\t1.0,\t-2.0\t,\n\t0.5\t]"),
+    "tabs in a list": (BEGIN + END).replace(
+        "[1.0, -2.0, 0.5]", "[\t1.0,\t-2.0\t,\n\t0.5\t]"
+    ),
     "tabs in JSON": '{\n\t"image": "map.png",\n\t"resolution":0.05,\n\t"origin":[1,-2,0.5],'
     '\n\t"negate":false, "occupied_thresh":0.65,\n\t"free_thresh":0.196}',
     "tabs after dashes": (BEGIN + END).replace(
         "[1.0, -2.0, 0.5]", "\n-\t1.0\t# x\n-\t-2.0\n-\t0.5"
     ),
     "tabs first": "\t\n\t# a comment\n" + BEGIN + END,
-    "keys twice": BEGIN + END + "image: x.png\nresolution: 9\norigin: [0, 0, 0]\nnegate: 1\n",
+    "keys twice": BEGIN
+    + END
+    + "image: x.png\nresolution: 9\norigin: [0, 0, 0]\nnegate: 1\n",
     "a wrong second value": BEGIN + END + "resolution: none\n'resolution': {}\n",
     "two documents": BEGIN + END + "---\nresolution: 9\n",
     "a broken second document": BEGIN + END + "...\n---\n[[[\n",
     "a directive": "%YAML 1.2\n---\n" + BEGIN + END,
     "a directive and no start": "# a\n%YAML 1.1\n" + BEGIN + END,
-    "Latin-1": ("# K\xfcche\n" + BEGIN + "author: J\xf6rg # \xe9\n" + END).encode("latin-1"),
+    "Latin-1": ("# K\xfcche\n" + BEGIN + "author: J\xf6rg # \xe9\n" + END).encode(
+        "latin-1"
+    ),
     "cp1252 and control characters": b"# \x80 \x93\x94 \x00\x01\x04\x1b\x7f\n"
     + (BEGIN + END).encode(),
     "line separators": "# a\x85b\u2028c\u2029d\n" + BEGIN + END,
     "half a character": b"# \xe2\x82\n" + (BEGIN + END).encode(),
     **{
         code: (BEGIN + END + "# Küche\n").encode(code)
-        for code in ("utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-32-be")
+        for code in (
+            "utf-8-sig",
+            "utf-16",
+            "utf-16-le",
+            "utf-16-be",
+            "utf-32",
+            "utf-32-be",
+        )
     },
     "numbers": (BEGIN + END)
     .replace("0.05", "+00.05")
     .replace("0.196", ".196")
     .replace("[1.0, -2.0, 0.5]", "[01, -2., 5e-1]"),
-    "numbers as text": (BEGIN + END).replace("0.05", "'0.05'").replace("0.65", '"0.65 "'),
+    "numbers as text": (BEGIN + END)
+    .replace("0.05", "'0.05'")
+    .replace("0.65", '"0.65 "'),
     "tags": (BEGIN + END).replace("0.05", "!!float 0.05").replace("0.65", "!x 0.65"),
     "anchors": "a: &x 9\nb: &x 0.05\n" + (BEGIN + END).replace("0.05", "*x"),
     "lists as keys": BEGIN + END + "[1, 2]: 3\n{a: b}: 4\n",
@@ -400,7 +517,9 @@ def test_a_yaml_is_read_as_map_server_reads_it(tmp_path: Path, case: str) -> Non
     assert read.values.tolist() == [[100, -1, 0]]
 
 
-@pytest.mark.parametrize("negate", ["01", "0x1", "010", "2", "-1", "+1", "'1'", "TRUE", "Y", "On"])
+@pytest.mark.parametrize(
+    "negate", ["01", "0x1", "010", "2", "-1", "+1", "'1'", "TRUE", "Y", "On"]
+)
 def test_what_is_not_0_negates_as_for_map_server(tmp_path: Path, negate: str) -> None:
     path = write(tmp_path, np.array([[0, 100, 255]], np.uint8))
     path.write_text(f"{WITHOUT_NEGATE}negate: {negate}\n")
@@ -414,7 +533,9 @@ def test_an_image_named_in_latin_1_is_found(tmp_path: Path) -> None:
     assert read_map_file(path).values.shape == (2, 2)
 
 
-def test_a_yaml_that_is_a_link_reads_the_image_beside_it_or_its_target(folder: Path) -> None:
+def test_a_yaml_that_is_a_link_reads_the_image_beside_it_or_its_target(
+    folder: Path,
+) -> None:
     linked, target = folder / "linked", folder / "below"
     linked.mkdir()
     (linked / "good.yaml").symlink_to(target / "good.yaml")
@@ -451,7 +572,11 @@ def png_of(width: int, height: int) -> bytes:
 
     def chunk(kind: bytes, content: bytes) -> bytes:
         checked = kind + content
-        return struct.pack(">I", len(content)) + checked + struct.pack(">I", zlib.crc32(checked))
+        return (
+            struct.pack(">I", len(content))
+            + checked
+            + struct.pack(">I", zlib.crc32(checked))
+        )
 
     header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
     rows = zlib.compress(bytes(min(height * (width + 1), 2**24)), 9)
@@ -468,7 +593,9 @@ def laughs(key: str) -> str:
 
 
 def test_a_small_file_of_gigabytes_is_refused_before_it_is_read(tmp_path: Path) -> None:
-    files = {f"laughs_{key}.yaml": laughs(key).encode() for key in (*VALID, "ddqn_planner")}
+    files = {
+        f"laughs_{key}.yaml": laughs(key).encode() for key in (*VALID, "ddqn_planner")
+    }
     files |= {
         "long.yaml": b"a: b\n" * 2**20,
         "rows.map": b"type octile\nheight 1\nwidth 1\nmap\n" + b"\n" * 2**24 + b".",
@@ -477,7 +604,8 @@ def test_a_small_file_of_gigabytes_is_refused_before_it_is_read(tmp_path: Path) 
     images = {
         "header.pgm": b"P5 100000 10000 255\n",
         "plain.pgm": b"P2 100000 10000 255\n0 0",
-        "bitmap.bmp": b"BM" + struct.pack("<IIIIiiHHI", 0, 0, 54, 40, 32000, 32000, 1, 8, 0),
+        "bitmap.bmp": b"BM"
+        + struct.pack("<IIIIiiHHI", 0, 0, 54, 40, 32000, 32000, 1, 8, 0),
         "header.png": png_of(100000, 10000),
         "over.png": png_of(2**13, 2**13 + 1),
     }
@@ -493,20 +621,34 @@ def test_a_small_file_of_gigabytes_is_refused_before_it_is_read(tmp_path: Path) 
             assert len(str(caught.value)) < 2000
 
 
-def test_nothing_in_a_yaml_grows_or_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_in_a_yaml_grows_or_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     path = write(tmp_path, PIXELS)
     merges = ["a0: &a0 {k: 1}"]
-    merges += [f"a{i}: &a{i} {{<<: [{', '.join([f'*a{i - 1}'] * 9)}]}}" for i in range(1, 12)]
+    merges += [
+        f"a{i}: &a{i} {{<<: [{', '.join([f'*a{i - 1}'] * 9)}]}}" for i in range(1, 12)
+    ]
     tags = ["!!bool x", "!!timestamp x", "!!python/object/apply:os.mkdir [exploded]"]
-    tags += ["!!python/object/new:os.mkdir [exploded]", "!!python/name:os.mkdir", "!!set {a, b}"]
+    tags += [
+        "!!python/object/new:os.mkdir [exploded]",
+        "!!python/name:os.mkdir",
+        "!!set {a, b}",
+    ]
     lines = [f"t{number}: {tag}" for number, tag in enumerate(tags)]
     path.write_text("\n".join([path.read_text(), *merges, *lines]))
     assert read_map_file(path).values.all()
     assert not (tmp_path / "exploded").exists()
 
 
-SCALARS = st.none() | st.booleans() | st.integers(-(10**400), 10**400) | st.floats() | st.text()
+SCALARS = (
+    st.none()
+    | st.booleans()
+    | st.integers(-(10**400), 10**400)
+    | st.floats()
+    | st.text()
+)
 YAML_VALUES = json_values(SCALARS | st.binary() | st.dates())
 CHANGES, SCENARIOS = (
     st.dictionaries(st.sampled_from(keys), YAML_VALUES, min_size=1)
@@ -519,7 +661,9 @@ CHANGES, SCENARIOS = (
 def test_any_value_of_any_key_is_read_or_refused(
     tmp_path: Path, changes: dict[str, Any], scenario: Any, only_scenario: bool
 ) -> None:
-    path = write(tmp_path, PIXELS, **({} if only_scenario else changes), ddqn_planner=scenario)
+    path = write(
+        tmp_path, PIXELS, **({} if only_scenario else changes), ddqn_planner=scenario
+    )
     with suppress(MapFileError):
         map_file = read_map_file(path)
         assert map_file.values.shape == (2, 2)
@@ -529,9 +673,13 @@ def test_any_value_of_any_key_is_read_or_refused(
             assert cell is None or map_file.grid().contains(cell)
 
 
-def test_an_image_that_is_cut_off_anywhere_is_complete_or_refused(tmp_path: Path) -> None:
+def test_an_image_that_is_cut_off_anywhere_is_complete_or_refused(
+    tmp_path: Path,
+) -> None:
     for suffix in (".png", ".bmp", ".jpg", ".ppm"):
-        Image.fromarray(np.zeros((9, 9), dtype=np.uint8)).save(tmp_path / f"whole{suffix}")
+        Image.fromarray(np.zeros((9, 9), dtype=np.uint8)).save(
+            tmp_path / f"whole{suffix}"
+        )
         content = (tmp_path / f"whole{suffix}").read_bytes()
         for length in range(0, len(content), max(1, len(content) // 50)):
             path = write(tmp_path, content[:length], mode="raw")

@@ -63,8 +63,22 @@ FORMS = {
         (-0.3, 0.2),
     ],
     "closed": [(0.4, 0.2), (-0.4, 0.2), (-0.4, -0.2), (0.4, -0.2), (0.4, 0.2)],
-    "corners twice": [(0.4, 0.2), (0.4, 0.2), (-0.4, 0.2), (-0.4, -0.2), (-0.4, -0.2), (0.4, -0.2)],
-    "points on a side": [(0.4, 0.2), (0.1, 0.2), (0, 0.2), (-0.4, 0.2), (-0.4, -0.2), (0.4, -0.2)],
+    "corners twice": [
+        (0.4, 0.2),
+        (0.4, 0.2),
+        (-0.4, 0.2),
+        (-0.4, -0.2),
+        (-0.4, -0.2),
+        (0.4, -0.2),
+    ],
+    "points on a side": [
+        (0.4, 0.2),
+        (0.1, 0.2),
+        (0, 0.2),
+        (-0.4, 0.2),
+        (-0.4, -0.2),
+        (0.4, -0.2),
+    ],
     "origin on a side": [(0, 0.2), (0, -0.2), (0.5, -0.2), (0.5, 0.2)],
     "origin in a corner": [(0, 0), (0.4, 0), (0.4, 0.4), (0, 0.4)],
     "origin outside": [(0.5, 0.2), (0.9, 0.2), (0.9, -0.2), (0.5, -0.2)],
@@ -94,8 +108,20 @@ def test_primitives_lead_from_heading_to_heading_and_turn_no_sharper_than_allowe
 def test_footprints_are_taken_in_every_form_that_nav2_takes(form: str) -> None:
     points, expected = FORMS[form], shapely.Polygon(FORMS[form])
     text = str(points).replace("(", "[").replace(")", "]")
-    written = text, text.replace(",", " "), text.replace("], ", "],\n\t"), f'"{text}"', str(points)
-    for footprint in (points, points[::-1], [*map(list, points)], np.array(points), *written):
+    written = (
+        text,
+        text.replace(",", " "),
+        text.replace("], ", "],\n\t"),
+        f'"{text}"',
+        str(points),
+    )
+    for footprint in (
+        points,
+        points[::-1],
+        [*map(list, points)],
+        np.array(points),
+        *written,
+    ):
         corners = read_footprint(footprint)
         body = shapely.Polygon(corners)
         assert body.is_valid
@@ -104,7 +130,9 @@ def test_footprints_are_taken_in_every_form_that_nav2_takes(form: str) -> None:
     np.testing.assert_array_equal(read_footprint(corners), corners)
 
 
-@pytest.mark.parametrize("radius", [1, 0.5, "0.5", " .5\n", "5e-1", np.float32(0.5), np.array(0.5)])
+@pytest.mark.parametrize(
+    "radius", [1, 0.5, "0.5", " .5\n", "5e-1", np.float32(0.5), np.array(0.5)]
+)
 def test_a_radius_is_a_circle_that_the_body_contains(radius: Any) -> None:
     body = shapely.Polygon(read_footprint(radius))
     assert body.buffer(1e-9).contains(shapely.Point(0, 0).buffer(float(radius)))
@@ -113,7 +141,10 @@ def test_a_radius_is_a_circle_that_the_body_contains(radius: Any) -> None:
 
 @given(
     points=st.lists(
-        st.tuples(st.integers(-3, 3), st.integers(-3, 3)), min_size=3, max_size=7, unique=True
+        st.tuples(st.integers(-3, 3), st.integers(-3, 3)),
+        min_size=3,
+        max_size=7,
+        unique=True,
     )
 )
 def test_every_polygon_without_crossing_sides_is_taken(points: Any) -> None:
@@ -122,7 +153,9 @@ def test_every_polygon_without_crossing_sides_is_taken(points: Any) -> None:
     crosses = any(
         one.crosses(other)
         and one.intersection(other).geom_type == "Point"
-        and not any(one.intersection(other).equals(shapely.Point(corner)) for corner in points)
+        and not any(
+            one.intersection(other).equals(shapely.Point(corner)) for corner in points
+        )
         for one, other in combinations(lines, 2)
     )
     if crosses or np.linalg.matrix_rank(np.subtract(points[1:], points[0])) < 2:
@@ -132,19 +165,28 @@ def test_every_polygon_without_crossing_sides_is_taken(points: Any) -> None:
         corners = read_footprint(points)
         if polygon.is_valid:
             assert shapely.Polygon(corners).equals(polygon)
-            axes = (np.arange(first, 3.4, 0.2618) for first in (-3.31415, -3.2718))  # on no side
+            axes = (
+                np.arange(first, 3.4, 0.2618) for first in (-3.31415, -3.2718)
+            )  # on no side
             cells = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
             within = shapely.contains_xy(polygon, cells)
             np.testing.assert_array_equal(inside(cells, corners), within)
 
 
-@given(form=st.sampled_from([*FORMS, LONG, "0.2", "triangle"]), padding=st.floats(1e-3, 0.5))
+@given(
+    form=st.sampled_from([*FORMS, LONG, "0.2", "triangle"]),
+    padding=st.floats(1e-3, 0.5),
+)
 def test_padding_makes_a_body_larger_on_each_side(form: str, padding: float) -> None:
-    footprint = {"triangle": [(0.9, 0), (-0.2, 0.05), (-0.2, -0.05)], **FORMS}.get(form, form)
+    footprint = {"triangle": [(0.9, 0), (-0.2, 0.05), (-0.2, -0.05)], **FORMS}.get(
+        form, form
+    )
     body = shapely.Polygon(read_footprint(footprint))
     closes = form in ("U", "forklift") and padding >= (0.2 if form == "U" else 0.1)
     if closes:
-        with pytest.raises(ValueError, match=r"padding of .* closes a gap .*; give less"):
+        with pytest.raises(
+            ValueError, match=r"padding of .* closes a gap .*; give less"
+        ):
             read_footprint(footprint, padding)
         return
     padded = shapely.Polygon(read_footprint(footprint, padding))
@@ -154,7 +196,10 @@ def test_padding_makes_a_body_larger_on_each_side(form: str, padding: float) -> 
 
 
 def test_an_outline_that_leads_around_twice_has_the_same_inside() -> None:
-    once, points = np.array(FORMS["L"]), np.random.default_rng(0).uniform(-0.6, 0.6, (200, 2))
+    once, points = (
+        np.array(FORMS["L"]),
+        np.random.default_rng(0).uniform(-0.6, 0.6, (200, 2)),
+    )
     twice = read_footprint(np.tile(once, (2, 1)))
     assert 50 < inside(points, once).sum() < 150
     np.testing.assert_array_equal(inside(points, twice), inside(points, once))
@@ -227,7 +272,9 @@ def test_swept_cells_are_those_that_a_polygon_touches(footprint: Any) -> None:
     for number in (0, 4, 11, 30):
         placed = [
             shapely.affinity.translate(
-                shapely.affinity.rotate(body, yaw, origin=(0, 0), use_radians=True), x, y
+                shapely.affinity.rotate(body, yaw, origin=(0, 0), use_radians=True),
+                x,
+                y,
             )
             for x, y, yaw in motions.poses[number]
         ]
@@ -270,7 +317,10 @@ def test_swept_cells_are_those_that_a_polygon_touches(footprint: Any) -> None:
         ([[0, 1], [math.nan, 2], [1, 2]], "no numbers"),
         ([[0, 1], [math.inf, 2], [1, 2]], "no numbers from -100 to 100 metres"),
         ([[0, 1e300], [0, 2], [1, 2]], "no numbers from -100 to 100 metres"),
-        ([[x, x * x % 97] for x in np.linspace(0, 9, 2000)], "2000 corners, and at most 1000"),
+        (
+            [[x, x * x % 97] for x in np.linspace(0, 9, 2000)],
+            "2000 corners, and at most 1000",
+        ),
     ],
 )
 def test_wrong_footprints_are_named(text: Any, problem: str) -> None:

@@ -22,7 +22,9 @@ def test_a_rule_is_a_member_or_its_value() -> None:
         message = f"{wrong!r} is unknown; give one of robot_safe, corner_c.*, unit"
         with pytest.raises(ValueError, match=message):
             GridMap([[0]]).legal_moves(wrong)
-    with pytest.raises(ValueError, match="'nope' is unknown; give one of greedy, astar_fallback"):
+    with pytest.raises(
+        ValueError, match="'nope' is unknown; give one of greedy, astar_fallback"
+    ):
         PlanMethod("nope")
 
 
@@ -41,24 +43,34 @@ def test_legal_moves_follow_the_rule_in_each_cell(place: Place, rule: MoveRule) 
     ):
         expected = grid.is_free((x, y)) and grid.is_free((x + dx, y + dy))
         if rule is MoveRule.ROBOT_SAFE:
-            expected = expected and grid.is_free((x + dx, y)) and grid.is_free((x, y + dy))
+            expected = (
+                expected and grid.is_free((x + dx, y)) and grid.is_free((x, y + dy))
+            )
         if grid.forbidden is not None:
             expected = expected and not grid.forbidden[y, x] >> action & 1
         assert legal[action, y, x] == expected
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 4), (3, 5)])
-def test_neighbours_are_numbered_row_by_row_and_outside_comes_last(shape: tuple[int, int]) -> None:
+def test_neighbours_are_numbered_row_by_row_and_outside_comes_last(
+    shape: tuple[int, int],
+) -> None:
     (height, width), size = shape, math.prod(shape)
     numbers = np.pad(np.arange(size).reshape(shape), 1, constant_values=size)
-    expected = [numbers[1 + y : 1 + y + height, 1 + x : 1 + x + width].ravel() for x, y in MOVES]
+    expected = [
+        numbers[1 + y : 1 + y + height, 1 + x : 1 + x + width].ravel() for x, y in MOVES
+    ]
     np.testing.assert_array_equal(neighbours(shape), expected, strict=True)
 
 
-def test_a_length_counts_moves_under_the_unit_rule_and_along_straight_segments() -> None:
+def test_a_length_counts_moves_under_the_unit_rule_and_along_straight_segments() -> (
+    None
+):
     for cells in ([(0, 0), (1, 1), (2, 2), (3, 2)], [(0, 0), (2, 2), (3, 2)]):
         assert path_length(cells) == pytest.approx(2 * 2**0.5 + 1)
-        assert path_length(cells, MoveRule.CORNER_CUTTING) == pytest.approx(2 * 2**0.5 + 1)
+        assert path_length(cells, MoveRule.CORNER_CUTTING) == pytest.approx(
+            2 * 2**0.5 + 1
+        )
         assert path_length(cells, MoveRule.UNIT) == 3
     assert path_length([(0, 0), (-5, 3)], "unit") == 5
     assert path_length([(0, 0), (1, -4)], "unit") == 4
@@ -66,19 +78,27 @@ def test_a_length_counts_moves_under_the_unit_rule_and_along_straight_segments()
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.1, 0.4, 0.5, 0.6, 1.0]), RULES)
-def test_cells_of_one_label_reach_each_other(seed: int, share: float, rule: MoveRule) -> None:
+def test_cells_of_one_label_reach_each_other(
+    seed: int, share: float, rule: MoveRule
+) -> None:
     random = np.random.default_rng(seed)
     grid = GridMap(random.random(random.integers(1, 90, 2)) < share)
     labels, cells = grid.labels(rule), grid.free_cells()
     assert (labels == 0).tolist() == grid.occupancy.tolist()
     for x, y in cells[:: len(cells) // 9 + 1]:
-        np.testing.assert_array_equal(labels == labels[y, x], grid.reachable([(x, y)], rule))
+        np.testing.assert_array_equal(
+            labels == labels[y, x], grid.reachable([(x, y)], rule)
+        )
 
 
 @given(grids_with_directions(), RULES, st.booleans(), st.data())
-def test_reachable_is_exact(place: Place, rule: MoveRule, has_directions: bool, data: Data) -> None:
+def test_reachable_is_exact(
+    place: Place, rule: MoveRule, has_directions: bool, data: Data
+) -> None:
     grid = place[0] if has_directions else replace(place[0], forbidden=None)
-    cells = data.draw(st.lists(st.sampled_from(grid.free_cells()), min_size=1, max_size=3))
+    cells = data.draw(
+        st.lists(st.sampled_from(grid.free_cells()), min_size=1, max_size=3)
+    )
     distances = [shortest_distances(grid, cell, rule) for cell in cells]
     backward = grid.reachable(cells, rule, backward=True)
     np.testing.assert_array_equal(backward, np.isfinite(distances).any(axis=0))
@@ -90,10 +110,15 @@ def test_reachable_is_exact(place: Place, rule: MoveRule, has_directions: bool, 
 
 
 @given(grids_with_directions() | grids_uphill(), RULES, st.data())
-def test_distances_and_paths_are_exact(place: Place, rule: MoveRule, data: Data) -> None:
+def test_distances_and_paths_are_exact(
+    place: Place, rule: MoveRule, data: Data
+) -> None:
     grid, goal = place
     distance = shortest_distances(grid, goal, rule)
-    legal, cost = grid.legal_moves(rule), move_costs(grid.cost_multiplier, rule, grid.uphill)
+    legal, cost = (
+        grid.legal_moves(rule),
+        move_costs(grid.cost_multiplier, rule, grid.uphill),
+    )
     assert distance[goal[1], goal[0]] == 0
     assert np.isinf(distance[grid.occupancy]).all()
     for x, y in set(grid.free_cells()) - {goal}:

@@ -13,13 +13,19 @@ from ddqn_planner.training.environment import Scenario
 
 
 @pytest.mark.parametrize("reach", [0, 1])
-def test_new_obstacles_lie_within_a_reach_of_a_path(paper: Scenario, reach: int) -> None:
+def test_new_obstacles_lie_within_a_reach_of_a_path(
+    paper: Scenario, reach: int
+) -> None:
     grid, rule = paper.grid, MoveRule.CORNER_CUTTING
     path = shortest_path(grid, paper.start, paper.goal, rule)
     counts, distances = set(), set()
     for seed in range(40):
-        noisy, rejected = scatter_obstacles(grid, path, rule, np.random.default_rng(seed), reach)
-        again, _ = scatter_obstacles(grid, path, rule, np.random.default_rng(seed), reach)
+        noisy, rejected = scatter_obstacles(
+            grid, path, rule, np.random.default_rng(seed), reach
+        )
+        again, _ = scatter_obstacles(
+            grid, path, rule, np.random.default_rng(seed), reach
+        )
         assert noisy.fingerprint == again.fingerprint
         assert rejected >= 0
         assert not (grid.occupancy & ~noisy.occupancy).any()
@@ -43,11 +49,15 @@ def test_a_path_that_leaves_no_obstacle_a_place_is_refused() -> None:
     ):
         path = [(x, 0) for x in range(grid.width)]
         with pytest.raises(ValueError, match=named):
-            scatter_obstacles(grid, path, MoveRule.ROBOT_SAFE, np.random.default_rng(0), reach)
+            scatter_obstacles(
+                grid, path, MoveRule.ROBOT_SAFE, np.random.default_rng(0), reach
+            )
 
 
 @given(occupancies, RULES, st.integers(0, 2**32 - 1))
-def test_a_path_joins_ends_of_requests(occupancy: np.ndarray, rule: MoveRule, seed: int) -> None:
+def test_a_path_joins_ends_of_requests(
+    occupancy: np.ndarray, rule: MoveRule, seed: int
+) -> None:
     random = np.random.default_rng(seed)
     if not legal_moves(occupancy, rule).any():
         with pytest.raises(ValueError, match="no two free cells"):
@@ -66,7 +76,9 @@ def test_requests_are_uniform_over_the_cells_that_have_a_move(rule: MoveRule) ->
     occupancy = np.array(
         [[0, 0, 0, 1, 1, 1], [1, 1, 1, 0, 1, 1], [1, 1, 1, 1, 1, 0], [1] * 5 + [0]]
     )
-    cells = {(0, 0), (1, 0), (2, 0), (5, 2), (5, 3)} | ({(3, 1)} if rule.cuts_corners else set())
+    cells = {(0, 0), (1, 0), (2, 0), (5, 2), (5, 3)} | (
+        {(3, 1)} if rule.cuts_corners else set()
+    )
     requests = random_requests(occupancy == 1, rule, 12000, np.random.default_rng(0))
     for counts in map(Counter, zip(*requests, strict=True)):
         assert counts.keys() == cells
@@ -77,7 +89,10 @@ def test_requests_are_uniform_over_the_cells_that_have_a_move(rule: MoveRule) ->
 def test_costs_of_free_cells_are_uniform_or_unknown_in_a_share_of_them() -> None:
     random = np.random.default_rng(0)
     occupancy = random.random((200, 200)) < 0.3
-    costs, unknown = random_costs(occupancy, random), unknown_costs(occupancy, 0.2, random)
+    costs, unknown = (
+        random_costs(occupancy, random),
+        unknown_costs(occupancy, 0.2, random),
+    )
     for values in (costs, unknown):
         assert values.dtype == np.int8
         assert not values[occupancy].any()

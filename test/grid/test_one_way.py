@@ -18,15 +18,33 @@ SIDES = st.sampled_from([0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 11.0])
 PLACES = st.integers(-40, 40).map(lambda eighths: eighths / 8 + 1 / 32)
 
 
-def zones_of(forbidden: np.ndarray, resolution: float = 1.0, yaw: float = 0.0) -> GridMap:
+def zones_of(
+    forbidden: np.ndarray, resolution: float = 1.0, yaw: float = 0.0
+) -> GridMap:
     free = np.zeros(forbidden.shape, dtype=np.bool_)
     return GridMap(free, resolution, (3.0, -1.0, yaw), forbidden=forbidden)
 
 
 @settings(max_examples=200, deadline=None)
-@given(SIZES, SIZES, SIZES, SIZES, SIDES, PLACES, PLACES, st.sampled_from([0.0, 0.3, -math.pi]))
+@given(
+    SIZES,
+    SIZES,
+    SIZES,
+    SIZES,
+    SIDES,
+    PLACES,
+    PLACES,
+    st.sampled_from([0.0, 0.3, -math.pi]),
+)
 def test_each_cell_forbids_what_the_zones_at_its_place_forbid(
-    height: int, width: int, rows: int, columns: int, side: float, x: float, y: float, yaw: float
+    height: int,
+    width: int,
+    rows: int,
+    columns: int,
+    side: float,
+    x: float,
+    y: float,
+    yaw: float,
 ) -> None:
     forbidden = np.arange(1, rows * columns + 1, dtype=np.uint8).reshape(rows, columns)
     zones = zones_of(forbidden, 0.5, yaw)
@@ -87,4 +105,7 @@ def test_maps_that_are_turned_have_no_common_directions() -> None:
 @pytest.mark.parametrize("x", [1e9, -1e9])
 def test_maps_far_apart_have_no_zones(x: float) -> None:
     zones = zones_of(np.full((3, 3), EAST, dtype=np.uint8), 1e-3)
-    assert forbidden_on(GridMap(np.zeros((3, 3), np.bool_), 1e-3, (x, 0.0, 0.0)), zones) is None
+    assert (
+        forbidden_on(GridMap(np.zeros((3, 3), np.bool_), 1e-3, (x, 0.0, 0.0)), zones)
+        is None
+    )

@@ -22,10 +22,16 @@ def difference(one: float, other: float) -> float:
     return abs(math.remainder(one - other, 2 * math.pi))
 
 
-@pytest.mark.parametrize(("decimals", "error"), [(4, 1e-4), (3, 1e-3), (2, 1e-2), (1, 0.1)])
-def test_each_degree_that_is_rounded_is_a_rotation_of_that_yaw(decimals: int, error: float) -> None:
+@pytest.mark.parametrize(
+    ("decimals", "error"), [(4, 1e-4), (3, 1e-3), (2, 1e-2), (1, 0.1)]
+)
+def test_each_degree_that_is_rounded_is_a_rotation_of_that_yaw(
+    decimals: int, error: float
+) -> None:
     for degree, sign in product(range(360), (1, -1)):
-        rounded = Rotation(*(sign * number for number in of_yaw(math.radians(degree), decimals)))
+        rounded = Rotation(
+            *(sign * number for number in of_yaw(math.radians(degree), decimals))
+        )
         assert rounded.is_rounded
         assert difference(rounded.yaw, math.radians(degree)) < 1.5 * error
         assert rounded.normalised().norm == pytest.approx(1.0, abs=1e-12)
@@ -38,7 +44,9 @@ def test_a_norm_near_to_1_is_rounded(norm: float) -> None:
     assert Rotation(0.0, 0.0, 0.0, -norm).normalised() == (0, 0, 0, -1)
 
 
-@pytest.mark.parametrize("number", [0.0, 0.899, 1.101, 9.0, 1e200, math.inf, -math.inf, math.nan])
+@pytest.mark.parametrize(
+    "number", [0.0, 0.899, 1.101, 9.0, 1e200, math.inf, -math.inf, math.nan]
+)
 def test_other_norms_are_not(number: float) -> None:
     for place in range(4):
         numbers = [0.0] * 4
@@ -49,10 +57,14 @@ def test_other_norms_are_not(number: float) -> None:
 
 
 @given(NUMBERS, NUMBERS, NUMBERS, NUMBERS)
-def test_yaw_and_tilt_are_those_of_the_turned_axes(x: float, y: float, z: float, w: float) -> None:
+def test_yaw_and_tilt_are_those_of_the_turned_axes(
+    x: float, y: float, z: float, w: float
+) -> None:
     rotation = Rotation(x, y, z, w)
     assume(rotation.norm > 0.1)
     ahead, up = Oracle.from_quat(rotation).apply([(1, 0, 0), (0, 0, 1)])
     if math.hypot(*ahead[:2]) > 1e-3:  # else it looks up or down
         assert difference(rotation.yaw, math.atan2(ahead[1], ahead[0])) < 1e-9
-    assert rotation.tilt == pytest.approx(math.sin(np.arccos(np.clip(up[2], -1, 1)) / 2), abs=1e-7)
+    assert rotation.tilt == pytest.approx(
+        math.sin(np.arccos(np.clip(up[2], -1, 1)) / 2), abs=1e-7
+    )

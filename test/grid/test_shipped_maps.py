@@ -39,11 +39,15 @@ def greedy_neighbour_walk(paper: Scenario, start: Cell, rule: MoveRule) -> set[C
     cell, entered = start, set()
     while cell not in entered:
         entered.add(cell)
-        cell = min(next_cells(paper, cell, rule), key=lambda c: math.dist(c, paper.goal))
+        cell = min(
+            next_cells(paper, cell, rule), key=lambda c: math.dist(c, paper.goal)
+        )
     return entered
 
 
-def test_the_start_lies_in_a_dead_end_that_opens_away_from_the_end(paper: Scenario) -> None:
+def test_the_start_lies_in_a_dead_end_that_opens_away_from_the_end(
+    paper: Scenario,
+) -> None:
     assert paper.grid.occupancy.shape == (20, 20)
     # Checkpoints name their maps so, and older ones still load.
     assert Planner.load("dilemma").metadata.map_fingerprint == paper.grid.fingerprint
@@ -51,7 +55,9 @@ def test_the_start_lies_in_a_dead_end_that_opens_away_from_the_end(paper: Scenar
     assert paper.start in START_DEAD_END
     assert len(START_DEAD_END - {paper.start}) == 10
     opening = mouth(paper, START_DEAD_END)
-    assert all(math.dist(c, paper.goal) > math.dist(paper.start, paper.goal) for c in opening)
+    assert all(
+        math.dist(c, paper.goal) > math.dist(paper.start, paper.goal) for c in opening
+    )
     closed = paper.grid.occupancy.copy()
     for x, y in opening:
         closed[y, x] = True
@@ -65,24 +71,38 @@ def test_the_start_lies_in_a_dead_end_that_opens_away_from_the_end(paper: Scenar
         distances = shortest_distances(paper.grid, paper.goal, rule)
         np.testing.assert_array_equal(np.isfinite(distances), ~paper.grid.occupancy)
         length = straight + diagonal * math.sqrt(2)
-        assert distances[paper.start[1], paper.start[0]] == pytest.approx(length, abs=1e-9)
+        assert distances[paper.start[1], paper.start[0]] == pytest.approx(
+            length, abs=1e-9
+        )
 
 
 @pytest.mark.parametrize("dead_end", DEAD_ENDS_ON_THE_WAY)
-def test_two_dead_ends_catch_a_robot_on_its_way(paper: Scenario, dead_end: set[Cell]) -> None:
+def test_two_dead_ends_catch_a_robot_on_its_way(
+    paper: Scenario, dead_end: set[Cell]
+) -> None:
     opening = mouth(paper, dead_end)
     deepest = min(dead_end, key=lambda cell: math.dist(cell, paper.goal))
-    assert min(math.dist(c, paper.start) for c in opening) < math.dist(deepest, paper.start)
+    assert min(math.dist(c, paper.start) for c in opening) < math.dist(
+        deepest, paper.start
+    )
     outside = set(paper.grid.free_cells()) - dead_end
-    walks = [greedy_neighbour_walk(paper, cell, MoveRule.CORNER_CUTTING) for cell in outside]
+    walks = [
+        greedy_neighbour_walk(paper, cell, MoveRule.CORNER_CUTTING) for cell in outside
+    ]
     assert sum(paper.goal not in walk and bool(walk & dead_end) for walk in walks) > 20
 
 
 def test_the_shipped_office_is_a_generated_one_of_six_times_the_cells() -> None:
     plan = generate_map("office", (64, 96), np.random.default_rng(4))
     shipped = read_map_file(find_map("office"))
-    np.testing.assert_array_equal(shipped.values, OCCUPIED * np.kron(plan, np.ones((6, 6), bool)))
-    assert (shipped.resolution, shipped.start, shipped.goal) == (0.05, (15, 15), (550, 330))
+    np.testing.assert_array_equal(
+        shipped.values, OCCUPIED * np.kron(plan, np.ones((6, 6), bool))
+    )
+    assert (shipped.resolution, shipped.start, shipped.goal) == (
+        0.05,
+        (15, 15),
+        (550, 330),
+    )
     assert all(map(shipped.grid().is_free, ((15, 15), (550, 330))))
 
 
@@ -94,7 +114,10 @@ EAST, NORTH, WEST, SOUTH = (
 
 
 def test_robots_keep_right_and_drive_there_and_back_in_different_aisles() -> None:
-    map_file, grid = read_map_file(find_map("warehouse")), load_map(find_map("warehouse"))
+    map_file, grid = (
+        read_map_file(find_map("warehouse")),
+        load_map(find_map("warehouse")),
+    )
     ends, planner = (map_file.start, map_file.goal), Planner.load("any_map")
     there, back = (planner.plan(grid, *order).cells for order in (ends, ends[::-1]))
     for cells, along in ((there, 1), (back, -1)):
@@ -102,21 +125,29 @@ def test_robots_keep_right_and_drive_there_and_back_in_different_aisles() -> Non
         assert aisle
         assert all(along * (after[1] - before[1]) >= 0 for before, after in aisle)
         corridor = [step for step in itertools.pairwise(cells) if step[0][1] < 5]
-        lanes = {before[1] in (1, 2) for before, after in corridor if before[1] == after[1]}
+        lanes = {
+            before[1] in (1, 2) for before, after in corridor if before[1] == after[1]
+        }
         assert lanes == {along > 0}
     aisles = [{x // 6 for x, y in cells if 6 <= y < 30} for cells in (there, back)]
     assert aisles[0].isdisjoint(aisles[1])
     assert not set(there[1:-1]) & set(back[1:-1])
 
 
-def test_the_lanes_are_as_documented(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = (Path(__file__).parents[2] / "docs" / "one_way.md").read_text(encoding="utf-8")
+def test_the_lanes_are_as_documented(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "one_way.md").read_text(
+        encoding="utf-8"
+    )
     (example,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     monkeypatch.chdir(tmp_path)
     save_map(GridMap(np.zeros((240, 200))), "hall.yaml")
     exec(example, {})
     yaml = Path("hall.yaml").read_text(encoding="utf-8")
-    Path("hall.yaml").write_text(yaml + "ddqn_planner: {directions: hall_directions.png}\n")
+    Path("hall.yaml").write_text(
+        yaml + "ddqn_planner: {directions: hall_directions.png}\n"
+    )
     forbidden = load_map("hall.yaml").forbidden
     assert forbidden is not None
     # Cells count from the bottom.
@@ -124,6 +155,8 @@ def test_the_lanes_are_as_documented(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert lanes == [NORTH, SOUTH, EAST, WEST]
     # The arrows of the table stand where they point.
     table = np.array([[8, 4, 2], [16, 0, 1], [32, 64, 128]])
-    assert [int(table[1 - dy, 1 + dx]) for dx, dy in MOVES] == [1 << a for a in range(8)]
+    assert [int(table[1 - dy, 1 + dx]) for dx, dy in MOVES] == [
+        1 << a for a in range(8)
+    ]
     numbers = re.findall(r"[↖↑↗←→↙↓↘] (\d+)", text)
     assert [int(number) for number in numbers[:8]] == table[table > 0].tolist()

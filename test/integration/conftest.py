@@ -33,7 +33,12 @@ _claim = claim_ros_domain()
 
 
 # The folder of each library's shared objects.
-HEAVY = {"matplotlib": "matplotlib", "numba": "llvmlite", "scipy": "scipy", "torch": "torch"}
+HEAVY = {
+    "matplotlib": "matplotlib",
+    "numba": "llvmlite",
+    "scipy": "scipy",
+    "torch": "torch",
+}
 
 
 @dataclass
@@ -61,7 +66,9 @@ class NodeProcess:
         deadline = time.monotonic() + TIMEOUT
         while not re.search(pattern, self.log):
             assert self.process.poll() is None, f"the node ended:\n{self.log}"
-            assert time.monotonic() < deadline, f"no {pattern!r} in the log:\n{self.log}"
+            assert time.monotonic() < deadline, (
+                f"no {pattern!r} in the log:\n{self.log}"
+            )
             time.sleep(0.02)
 
     def stop(self, signal_number: int = signal.SIGINT) -> int:
@@ -92,7 +99,10 @@ def run_node(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Any]:
         # As a file: on the command line a YAML parser guesses the types of strings.
         file = folder / "parameters.yaml"
         file.write_text(yaml.safe_dump({"/**": {"ros__parameters": parameters or {}}}))
-        arguments = ["--ros-args", *(["--params-file", str(file)] if parameters else [])]
+        arguments = [
+            "--ros-args",
+            *(["--params-file", str(file)] if parameters else []),
+        ]
         for remap in [*remaps, *([f"__ns:={namespace}"] if namespace else [])]:
             arguments += ["-r", remap]
         arguments += settings
@@ -148,7 +158,9 @@ def planner(run_node: Any, model: Path) -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def make_robot(make_client: Any, small_values: np.ndarray, model: Path) -> Callable[..., Any]:
+def make_robot(
+    make_client: Any, small_values: np.ndarray, model: Path
+) -> Callable[..., Any]:
     """Return what makes the user of a planner in a namespace, with a map of some values."""
     from integration.robot import Robot
 
@@ -159,12 +171,17 @@ def make_robot(make_client: Any, small_values: np.ndarray, model: Path) -> Calla
 
 
 @pytest.fixture(scope="module")
-def run_robot(run_node: Any, make_robot: Any, small_values: np.ndarray) -> Callable[..., Any]:
+def run_robot(
+    run_node: Any, make_robot: Any, small_values: np.ndarray
+) -> Callable[..., Any]:
     """Return a context manager that runs a planner in a namespace, and gives its user."""
 
     @contextmanager
     def run(
-        space: str, parameters: Any = None, values: np.ndarray = small_values, **options: Any
+        space: str,
+        parameters: Any = None,
+        values: np.ndarray = small_values,
+        **options: Any,
     ) -> Iterator[Any]:
         with run_node("planner_node", parameters, namespace=space, **options) as node:
             yield make_robot(space, node, values)

@@ -93,7 +93,9 @@ class Workspace:
         programs.mkdir(parents=True, exist_ok=True)
         for name in executables:
             program = programs / name
-            program.write_text(RECORDER.format(python=sys.executable, records=self.records))
+            program.write_text(
+                RECORDER.format(python=sys.executable, records=self.records)
+            )
             program.chmod(0o755)
         share = self.prefix / "share" / package
         share.mkdir(parents=True, exist_ok=True)
@@ -111,14 +113,21 @@ class Workspace:
             return self._really_launch(file, arguments)
         return _launch_stand_ins(file, arguments, self.prefix)
 
-    def _really_launch(self, file: Path, arguments: Mapping[str, str]) -> dict[str, Started]:
+    def _really_launch(
+        self, file: Path, arguments: Mapping[str, str]
+    ) -> dict[str, Started]:
         for record in self.records.iterdir():
             record.unlink()
         paths = [str(self.prefix), os.environ.get("AMENT_PREFIX_PATH", "")]
-        environment = {**os.environ, "AMENT_PREFIX_PATH": os.pathsep.join(filter(None, paths))}
+        environment = {
+            **os.environ,
+            "AMENT_PREFIX_PATH": os.pathsep.join(filter(None, paths)),
+        }
         words = [f"{name}:={value}" for name, value in arguments.items()]
         command = [sys.executable, "-c", LAUNCH, str(file), *words]
-        run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        run = subprocess.run(
+            command, env=environment, capture_output=True, text=True, check=False
+        )
         if run.returncode:
             raise RuntimeError(run.stdout + run.stderr)
         started = {}
@@ -144,7 +153,9 @@ def _read_record(record: Any) -> tuple[str, Started]:
             parameters[key] = yaml.safe_load(value)
     files = _together(yaml.safe_load(content) for content in record["contents"])
     parameters.update(_parameters_of(name, namespace, files))
-    return name, Started(Path(path).name, namespace, parameters, remaps, files, words, None)
+    return name, Started(
+        Path(path).name, namespace, parameters, remaps, files, words, None
+    )
 
 
 def _together(documents: Iterable[Any]) -> dict[str, Any]:
@@ -156,7 +167,9 @@ def _together(documents: Iterable[Any]) -> dict[str, Any]:
     return files
 
 
-def _parameters_of(name: str, namespace: str, files: Mapping[str, Any]) -> dict[str, Any]:
+def _parameters_of(
+    name: str, namespace: str, files: Mapping[str, Any]
+) -> dict[str, Any]:
     """Return what a node takes of parameter files; its full name goes before a wildcard."""
     full_name = f"{namespace.rstrip('/')}/{name}"
     return {**files.get("/**", {}), **files.get(full_name, {})}
@@ -195,7 +208,9 @@ def _stand_ins() -> dict[str, ModuleType]:
     return modules
 
 
-def _flat(actions: Any, scope: Mapping[str, str]) -> Iterator[tuple[Any, Mapping[str, str]]]:
+def _flat(
+    actions: Any, scope: Mapping[str, str]
+) -> Iterator[tuple[Any, Mapping[str, str]]]:
     """Yield actions with what the groups around them have set."""
     scope = dict(scope)
     for action in actions:
@@ -209,7 +224,9 @@ def _flat(actions: Any, scope: Mapping[str, str]) -> Iterator[tuple[Any, Mapping
             yield action, scope
 
 
-def _launch_stand_ins(file: Path, arguments: Mapping[str, str], prefix: Path) -> dict[str, Started]:
+def _launch_stand_ins(
+    file: Path, arguments: Mapping[str, str], prefix: Path
+) -> dict[str, Started]:
     spec = importlib.util.spec_from_file_location("launch_file", file)
     assert spec is not None
     assert spec.loader is not None
@@ -218,8 +235,12 @@ def _launch_stand_ins(file: Path, arguments: Mapping[str, str], prefix: Path) ->
     with patch.dict(sys.modules, _stand_ins()), patch.dict(os.environ, environment):
         spec.loader.exec_module(module)
         actions = module.generate_launch_description().values[0]
-        declared = [action for action in actions if action.kind == "DeclareLaunchArgument"]
-        values = {action.values[0]: action.options["default_value"] for action in declared}
+        declared = [
+            action for action in actions if action.kind == "DeclareLaunchArgument"
+        ]
+        values = {
+            action.values[0]: action.options["default_value"] for action in declared
+        }
         assert set(arguments) <= set(values)
         assert all(action.options["description"] for action in declared)
         context = SimpleNamespace(launch_configurations={**values, **arguments})
@@ -234,7 +255,9 @@ def _launch_stand_ins(file: Path, arguments: Mapping[str, str], prefix: Path) ->
     return started
 
 
-def _read_action(action: Any, scope: Mapping[str, str], prefix: Path) -> tuple[str, Started]:
+def _read_action(
+    action: Any, scope: Mapping[str, str], prefix: Path
+) -> tuple[str, Started]:
     options = action.options
     pushed = scope.get("namespace", "/")
     if action.kind == "IncludeLaunchDescription":
@@ -258,4 +281,6 @@ def _read_action(action: Any, scope: Mapping[str, str], prefix: Path) -> tuple[s
     parameters.update(_parameters_of(name, namespace, files))
     remaps = dict(options.get("remappings", []))
     words, respawn = options["arguments"], options.get("respawn")
-    return name, Started(executable, namespace, parameters, remaps, files, words, respawn)
+    return name, Started(
+        executable, namespace, parameters, remaps, files, words, respawn
+    )

@@ -37,7 +37,9 @@ START, GOAL = (0, 0), (5, 5)
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 RESOLUTION, ORIGIN, GOAL_YAW = 0.5, (-1.0, 2.0, 0.5), 1.2
 
-NUMBERS = itertools.count(1)  # stamps of maps and yaws of goals, to tell one from another
+NUMBERS = itertools.count(
+    1
+)  # stamps of maps and yaws of goals, to tell one from another
 
 ALL = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """The last message of a latched topic, and every one after it."""
@@ -46,7 +48,9 @@ ALL = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 class Robot:
     """A planner node and what its user sees and does."""
 
-    def __init__(self, client: Client, values: np.ndarray, model: Any, node: Any = None) -> None:
+    def __init__(
+        self, client: Client, values: np.ndarray, model: Any, node: Any = None
+    ) -> None:
         self.client, self.values, self.model, self.node = client, values, model, node
         self.name = f"{client.node.get_namespace().rstrip('/')}/planner"
         self.plans = client.subscribe(Path, "plan", ALL)
@@ -73,16 +77,24 @@ class Robot:
 
     def reset(self, **values: Any) -> None:
         """Set what has not its default, or these values."""
-        declared = {name: it for name, it in PLANNER_PARAMETERS.items() if not it.read_only}
+        declared = {
+            name: it for name, it in PLANNER_PARAMETERS.items() if not it.read_only
+        }
         wanted = {name: it.default for name, it in declared.items()}
         wanted |= {"model": str(self.model), **values}
         request = GetParameters.Request(names=[*wanted])
-        found = self.client.call(GetParameters, "planner/get_parameters", request).values
+        found = self.client.call(
+            GetParameters, "planner/get_parameters", request
+        ).values
         are = dict(zip(wanted, map(parameter_value_to_python, found), strict=True))
-        self.set(**{name: value for name, value in wanted.items() if are[name] != value})
+        self.set(
+            **{name: value for name, value in wanted.items() if are[name] != value}
+        )
 
     @staticmethod
-    def grid_of(values: np.ndarray, origin: tuple[float, float, float] = ORIGIN) -> GridMap:
+    def grid_of(
+        values: np.ndarray, origin: tuple[float, float, float] = ORIGIN
+    ) -> GridMap:
         return GridMap.from_occupancy_values(values, RESOLUTION, origin)
 
     def map_message(self) -> OccupancyGrid:
@@ -91,7 +103,9 @@ class Robot:
     def send_map(self, message: OccupancyGrid | None = None) -> None:
         self.client.publish("map", message or self.map_message(), LATCHED)
 
-    def pose(self, cell: Cell, yaw: float = 0.0, grid: GridMap | None = None) -> PoseStamped:
+    def pose(
+        self, cell: Cell, yaw: float = 0.0, grid: GridMap | None = None
+    ) -> PoseStamped:
         return pose(grid or self.grid, cell, yaw, offset=0.05)
 
     def send_start(self, stamped: PoseStamped) -> None:
@@ -109,7 +123,11 @@ class Robot:
         return self.client.subscribe(Path, "plan", LATCHED).wait()
 
     def wait_for_path(
-        self, start: Cell, goal: Cell, grid: GridMap | None = None, yaw: float | None = None
+        self,
+        start: Cell,
+        goal: Cell,
+        grid: GridMap | None = None,
+        yaw: float | None = None,
     ) -> Path:
         """Wait for a plan between two cells, to this yaw, and check all that can be said of it."""
         grid = grid or self.grid
@@ -128,7 +146,9 @@ class Robot:
                 any(math.dist(point, place) < 1e-6 for place in places)
                 for point, places in zip((points[0], points[-1]), ends, strict=True)
             ]
-            return all(is_there) and bool(np.isclose(last, last if yaw is None else yaw))
+            return all(is_there) and bool(
+                np.isclose(last, last if yaw is None else yaw)
+            )
 
         path: Path = self.plans.wait(is_asked_for)
         check_path(path, grid)
@@ -161,7 +181,9 @@ class Robot:
 
     def stamped_map(self, values: np.ndarray | None = None) -> OccupancyGrid:
         """Return the message of the map, or of other values, with a stamp of its own."""
-        return map_message(self.values if values is None else values, self.grid, next(NUMBERS))
+        return map_message(
+            self.values if values is None else values, self.grid, next(NUMBERS)
+        )
 
     def map_with(self, box: Any, value: int) -> OccupancyGrid:
         """Return the message of the map with another value in some cells, indexed by [y, x]."""
@@ -174,7 +196,9 @@ class Robot:
         self.send_map(message)
         self.wait_for_map(message)
 
-    def plan_on(self, message: OccupancyGrid, reason: str = "^a path of ") -> DiagnosticStatus:
+    def plan_on(
+        self, message: OccupancyGrid, reason: str = "^a path of "
+    ) -> DiagnosticStatus:
         """Send a map, and wait until the plan for the active goal is one on it."""
         self.send_map(message)
         stamp = seconds(message.header.stamp)
@@ -192,7 +216,9 @@ class Robot:
         self.send_goal(self.pose(goal, yaw))
         self.wait_for_path(start, goal, yaw=yaw)
         planned_on = seconds(message.header.stamp)
-        self.wait_for_reason("^a path of [^;]*$", {"planned on the map of (s)": planned_on})
+        self.wait_for_reason(
+            "^a path of [^;]*$", {"planned on the map of (s)": planned_on}
+        )
         self.clear()
 
     def transition(self, label: str = "", number: int = 0) -> bool:
@@ -217,7 +243,9 @@ def ask_for_plan(robot: Robot) -> Any:
     robot.send_start(robot.pose(START))
     robot.send_goal(robot.pose(GOAL))
     plans = robot.client.service(GetPlan, "planner/get_plan")
-    plan = plans.call_async(GetPlan.Request(start=robot.pose(START), goal=robot.pose(GOAL)))
+    plan = plans.call_async(
+        GetPlan.Request(start=robot.pose(START), goal=robot.pose(GOAL))
+    )
     robot.wait_until_received()
     return plan
 
@@ -250,7 +278,9 @@ def yaw_of(rotation: Quaternion) -> float:
     return 2 * math.atan2(rotation.z, rotation.w)
 
 
-def check_path(path: Path, grid: GridMap, move_rule: MoveRule = MoveRule.ROBOT_SAFE) -> None:
+def check_path(
+    path: Path, grid: GridMap, move_rule: MoveRule = MoveRule.ROBOT_SAFE
+) -> None:
     """Check that a path turns at cell centres, on legal segments, densely, looking ahead."""
     assert path.header.frame_id == "map"
     assert all(pose.header == path.header for pose in path.poses)
@@ -270,7 +300,11 @@ def corners_of(path: Path) -> list[tuple[float, float]]:
     """Return the first and last points of a path, and those where it turns."""
     points = points_of(path)
     yaws = [math.atan2(y - v, x - u) for (u, v), (x, y) in pairwise(points)]
-    turns = [point for point, step in zip(points[1:], pairwise(yaws), strict=False) if turned(step)]
+    turns = [
+        point
+        for point, step in zip(points[1:], pairwise(yaws), strict=False)
+        if turned(step)
+    ]
     return [*points[:1], *turns, *points[-1:]] if len(points) > 1 else points
 
 

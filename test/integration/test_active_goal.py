@@ -49,14 +49,18 @@ UPPER, LOWER = np.s_[8:11, 15], np.s_[:3, 15]  # walls across the ways
 
 
 @pytest.mark.parametrize("period", [SOON, 0.0])
-def test_the_plan_is_quiet_while_the_map_changes_elsewhere(robot: Robot, period: float) -> None:
+def test_the_plan_is_quiet_while_the_map_changes_elsewhere(
+    robot: Robot, period: float
+) -> None:
     set_and_settle(robot, replan_period=period)
     robot.plan_on(robot.stamped_map())
     first = robot.last_plan()
     for x in (10, 13, 16):
         robot.plan_on(robot.map_with((1, x), 100))
     values = np.pad(robot.values, ((4, 0), (6, 2)), constant_values=100)
-    shift = np.subtract(robot.grid.cell_to_world((-6, -4)), robot.grid.cell_to_world((0, 0)))
+    shift = np.subtract(
+        robot.grid.cell_to_world((-6, -4)), robot.grid.cell_to_world((0, 0))
+    )
     x, y, yaw = robot.grid.origin
     grid = robot.grid_of(values, (x + shift[0], y + shift[1], yaw))
     robot.plan_on(map_message(values, grid, next(NUMBERS)))
@@ -129,7 +133,9 @@ def test_what_a_user_sets_is_always_answered_by_a_plan(robot: Robot) -> None:
     robot.change(tolerance=0.0)
 
 
-def test_the_path_of_a_moving_robot_is_published_only_where_it_leaves_it(robot: Robot) -> None:
+def test_the_path_of_a_moving_robot_is_published_only_where_it_leaves_it(
+    robot: Robot,
+) -> None:
     robot.set(start_source="odometry", transform_tolerance=1000.0)
     robot.client.publisher(Odometry, "odom")
     robot.client.wait_for_discovery("planner")
@@ -139,10 +145,16 @@ def test_the_path_of_a_moving_robot_is_published_only_where_it_leaves_it(robot: 
     first = robot.last_plan()
     for index in (1, 4, 10):
         robot.client.publish("odom", odometry(robot, path[index]))
-        rest = sum(math.dist(*step) for step in pairwise(points[index:])) / robot.grid.resolution
+        rest = (
+            sum(math.dist(*step) for step in pairwise(points[index:]))
+            / robot.grid.resolution
+        )
 
         def follows(message: DiagnosticArray, rest: float = rest) -> bool:
-            return abs(float(values_of(message.status[0])["path length (cells)"]) - rest) < 1.2
+            return (
+                abs(float(values_of(message.status[0])["path length (cells)"]) - rest)
+                < 1.2
+            )
 
         robot.diagnostics.wait(follows)
         assert robot.last_plan().header.stamp == first.header.stamp
@@ -171,7 +183,9 @@ def docks(dock_robot: Robot) -> Robot:
 
 def send_goals(docks: Robot, *cells: Cell, frame: str = "map") -> None:
     poses = [docks.pose(cell, YAWS[cell]).pose for cell in cells]
-    docks.client.publish("goal_poses", PoseArray(header=Header(frame_id=frame), poses=poses))
+    docks.client.publish(
+        "goal_poses", PoseArray(header=Header(frame_id=frame), poses=poses)
+    )
 
 
 def wait_for_dock(docks: Robot, dock: Cell, reason: str, start: Cell = DOCKED) -> None:
@@ -179,7 +193,9 @@ def wait_for_dock(docks: Robot, dock: Cell, reason: str, start: Cell = DOCKED) -
     docks.wait_for_reason(f"^a path of .* cells {reason}, by greedy steps")
 
 
-def test_the_nearest_free_dock_is_taken_and_kept_up_to_the_threshold(docks: Robot) -> None:
+def test_the_nearest_free_dock_is_taken_and_kept_up_to_the_threshold(
+    docks: Robot,
+) -> None:
     send_goals(docks, WALL, LEFT, OUTSIDE, RIGHT)
     wait_for_dock(docks, LEFT, "to goal 2 of 4")
     docks.clear()
@@ -191,7 +207,9 @@ def test_the_nearest_free_dock_is_taken_and_kept_up_to_the_threshold(docks: Robo
     # Between two docks it keeps to one, up to the threshold.
     docks.change(switch_threshold=0.3)
     docks.clear()
-    docks.send_start(docks.pose((16, 5)))  # 15 cells from the left dock, 13 from the right one
+    docks.send_start(
+        docks.pose((16, 5))
+    )  # 15 cells from the left dock, 13 from the right one
     docks.wait_for_path((16, 5), LEFT, yaw=YAWS[LEFT])
     docks.wait_for_reason(r"to goal 2 of 4, by greedy steps, kept: its cost is \+15.4%")
     docks.set(switch_threshold=0.1)
@@ -208,9 +226,7 @@ def test_goals_none_of_which_can_be_reached_have_an_empty_plan(docks: Robot) -> 
     docks.wait_for_reason(none.format(2) + occupied)
     docks.set_map(docks.map_with(np.s_[:, (5, 25)], 100))
     send_goals(docks, WALL, LEFT, RIGHT)
-    cut_off = (
-        "goal 1 is occupied, no path leads to goals 2, 3 .*; set the goal where free cells lead to$"
-    )
+    cut_off = "goal 1 is occupied, no path leads to goals 2, 3 .*; set the goal where free cells lead to$"
     docks.wait_for_reason(none.format(3) + cut_off)
     docks.clear()
     docks.send_map(docks.stamped_map())
@@ -219,14 +235,18 @@ def test_goals_none_of_which_can_be_reached_have_an_empty_plan(docks: Robot) -> 
 
 def test_bad_goals_are_named_and_an_empty_array_leaves_the_goal(docks: Robot) -> None:
     send_goals(docks)
-    docks.wait_for_reason("; goal_poses refused: the array has no pose; give one or more")
+    docks.wait_for_reason(
+        "; goal_poses refused: the array has no pose; give one or more"
+    )
     assert cell_of(docks.grid, docks.last_plan().poses[-1]) == RIGHT
     docks.clear()
     send_goals(docks, LEFT)
     docks.wait_for_reason("^a path of [^;]*$")
     poses = [docks.pose(LEFT).pose, docks.pose(RIGHT).pose]
     poses[1].orientation.w = 9.0
-    docks.client.publish("goal_poses", PoseArray(header=Header(frame_id="map"), poses=poses))
+    docks.client.publish(
+        "goal_poses", PoseArray(header=Header(frame_id="map"), poses=poses)
+    )
     reason = "^goal 2's orientation is .*; give one of norm 1"
     docks.wait_for_reason(reason, {"status": "INVALID_GOAL"})
     assert docks.plans.wait(lambda path: not path.poses)

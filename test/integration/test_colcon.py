@@ -21,7 +21,9 @@ from ddqn_planner.training.environment import Scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 
-COLCON = shutil.which("colcon", path=os.pathsep.join([sysconfig.get_path("scripts"), os.defpath]))
+COLCON = shutil.which(
+    "colcon", path=os.pathsep.join([sysconfig.get_path("scripts"), os.defpath])
+)
 
 pytestmark = [
     pytest.mark.slow,
@@ -30,11 +32,20 @@ pytestmark = [
 
 
 def build(workspace: Path, *options: str) -> Path:
-    command = [str(COLCON), "build", "--base-paths", "src", "--event-handlers", "console_direct+"]
+    command = [
+        str(COLCON),
+        "build",
+        "--base-paths",
+        "src",
+        "--event-handlers",
+        "console_direct+",
+    ]
     # A home of its own: the user's defaults may ask for another layout.
     environment = {**os.environ, "COLCON_HOME": str(workspace / "home")}
     command += options
-    built = subprocess.run(command, cwd=workspace, env=environment, capture_output=True, text=True)
+    built = subprocess.run(
+        command, cwd=workspace, env=environment, capture_output=True, text=True
+    )
     assert built.returncode == 0, built.stdout + built.stderr
     return workspace / "install"
 
@@ -60,21 +71,32 @@ def test_colcon_puts_everything_where_ros_looks_for_it(install: Path) -> None:
     assert (share / "package.xml").is_file()
     for folder in ("maps", "models", "rviz", "launch"):
         shipped = {path.name: path.read_bytes() for path in (ROOT / folder).glob("*.*")}
-        assert {path.name: path.read_bytes() for path in (share / folder).glob("*.*")} == shipped
+        assert {
+            path.name: path.read_bytes() for path in (share / folder).glob("*.*")
+        } == shipped
 
 
-def test_a_linked_workspace(source_copy: Path, tmp_path: Path, monkeypatch: Any) -> None:
+def test_a_linked_workspace(
+    source_copy: Path, tmp_path: Path, monkeypatch: Any
+) -> None:
     (tmp_path / "src").symlink_to(source_copy.parent)
     install = build(tmp_path, "--symlink-install")
     look = (
         "from ddqn_planner.resources import find_map; from ddqn_planner.model import find_model\n"
         "print(find_map('dilemma').resolve(), find_model('any_map').resolve())"
     )
-    monkeypatch.delenv("PYTHONPATH", raising=False)  # else the tests' own source may come first
-    shipped = [source_copy / "maps/dilemma.yaml", source_copy / "models/any_map.safetensors"]
+    monkeypatch.delenv(
+        "PYTHONPATH", raising=False
+    )  # else the tests' own source may come first
+    shipped = [
+        source_copy / "maps/dilemma.yaml",
+        source_copy / "models/any_map.safetensors",
+    ]
     # In the workspace: from the repository's folder Python would import the source.
     command = sourced(install, sys.executable, "-c", look)
-    found = subprocess.run(command, cwd=install, capture_output=True, text=True, check=True)
+    found = subprocess.run(
+        command, cwd=install, capture_output=True, text=True, check=True
+    )
     assert found.stdout.split() == [*map(str, shipped)]
 
 
@@ -97,18 +119,26 @@ def test_nodes_of_the_workspace_plan_with_its_model_on_its_map(
     paper: Scenario,
     capfd: Any,
 ) -> None:
-    (package,) = (install / "ddqn_planner" / "lib").glob("python*/site-packages/ddqn_planner")
+    (package,) = (install / "ddqn_planner" / "lib").glob(
+        "python*/site-packages/ddqn_planner"
+    )
     take_compiled(ROOT / "ddqn_planner", package)
 
-    def node(name: str, *arguments: str) -> AbstractContextManager[subprocess.Popen[bytes]]:
+    def node(
+        name: str, *arguments: str
+    ) -> AbstractContextManager[subprocess.Popen[bytes]]:
         program = install / "ddqn_planner" / "lib" / "ddqn_planner" / name
         return running(*sourced(install, program, *arguments))
 
     client = make_client()
     plans = client.subscribe(PathMessage, "plan", LATCHED)
     with (
-        node("map_server_node", "--ros-args", "-p", "yaml_filename:=dilemma.yaml") as map_server,
-        node("planner_node", "--ros-args", "-p", "path_simplification:=none") as planner,
+        node(
+            "map_server_node", "--ros-args", "-p", "yaml_filename:=dilemma.yaml"
+        ) as map_server,
+        node(
+            "planner_node", "--ros-args", "-p", "path_simplification:=none"
+        ) as planner,
     ):
         client.publish("initialpose", initial_pose(pose(paper.grid, paper.start)))
         client.publish("goal_pose", pose(paper.grid, paper.goal))
@@ -119,4 +149,6 @@ def test_nodes_of_the_workspace_plan_with_its_model_on_its_map(
     assert (map_server.returncode, planner.returncode) == (0, 0)
     log = capfd.readouterr().err
     assert f"serving {package / 'maps' / 'dilemma.yaml'}" in log
-    assert f"planning with the model {package / 'models' / 'any_map.safetensors'}" in log
+    assert (
+        f"planning with the model {package / 'models' / 'any_map.safetensors'}" in log
+    )

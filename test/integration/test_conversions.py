@@ -53,7 +53,9 @@ def map_message(yaw: float = 0.3) -> OccupancyGrid:
     return occupancy_message(values, 0.5, (-1.0, 2.0, yaw), Header(frame_id="map"))
 
 
-@pytest.mark.parametrize(("yaw", "sign"), [(0.0, 1), (1.0, -1), (-3.0, 1), (math.pi, -1)])
+@pytest.mark.parametrize(
+    ("yaw", "sign"), [(0.0, 1), (1.0, -1), (-3.0, 1), (math.pi, -1)]
+)
 def test_a_map_survives_the_way_to_a_message_and_back(yaw: float, sign: int) -> None:
     message = map_message(yaw)
     assert (message.info.width, message.info.height) == (3, 2)
@@ -64,7 +66,9 @@ def test_a_map_survives_the_way_to_a_message_and_back(yaw: float, sign: int) -> 
     assert grid.occupancy.tolist() == [[False, True, True], [False, True, False]]
     x, y, read = grid.origin
     assert (grid.resolution, x, y) == (0.5, -1.0, 2.0)
-    assert (math.cos(read), math.sin(read)) == pytest.approx((math.cos(yaw), math.sin(yaw)))
+    assert (math.cos(read), math.sin(read)) == pytest.approx(
+        (math.cos(yaw), math.sin(yaw))
+    )
     grid = grid_from_message(message, 64, True)
     assert grid.occupancy.tolist() == [[False, True, False], [True, True, False]]
 
@@ -73,13 +77,19 @@ def test_a_malformed_map_is_refused() -> None:
     rolled, at = Quaternion(x=math.sin(0.1), w=math.cos(0.1)), "info.origin.orientation"
     for field, value, reason in (
         ("header.frame_id", "", "frame is ''"),
-        *(("info.resolution", n, f"resolution is {n}") for n in (0.0, math.nan, math.inf)),
+        *(
+            ("info.resolution", n, f"resolution is {n}")
+            for n in (0.0, math.nan, math.inf)
+        ),
         *(("info.width", 0, "0 x 2 cells"), ("info.height", 0, "3 x 0 cells")),
         ("info.width", 2**31, "give at most"),
         ("info.width", 4, "data has 6 values; its 4 x 2 cells need 8"),
         ("info.origin.position.x", math.nan, "position is .x = nan"),
         ("info.origin.position.z", math.inf, "z = inf"),
-        *((at, Quaternion(w=1.2), "norm 1.2"), (at, Quaternion(x=math.nan), "norm nan")),
+        *(
+            (at, Quaternion(w=1.2), "norm 1.2"),
+            (at, Quaternion(x=math.nan), "norm nan"),
+        ),
         (at, Quaternion(w=0.0), "norm 0"),
         (at, rolled, "rolled or pitched"),
         (at, Quaternion(x=1.0, w=0.0), "rolled or pitched"),
@@ -101,11 +111,15 @@ def test_a_malformed_map_is_refused() -> None:
         ((0, 0, 0, 1.1), 0.0),
     ],
 )
-def test_the_origin_of_a_map_may_be_rounded(numbers: tuple[float, ...], yaw: float) -> None:
+def test_the_origin_of_a_map_may_be_rounded(
+    numbers: tuple[float, ...], yaw: float
+) -> None:
     turned = quaternion_of(numbers)
     grid = grid_from_message(changed(map_message(), "info.origin.orientation", turned))
     assert grid.origin[:2] == (-1.0, 2.0)
-    assert math.remainder(grid.origin[2] - yaw, 2 * math.pi) == pytest.approx(0, abs=0.02)
+    assert math.remainder(grid.origin[2] - yaw, 2 * math.pi) == pytest.approx(
+        0, abs=0.02
+    )
 
 
 def test_a_rounded_pose_is_read_with_the_norm_1_and_others_stay_as_they_are() -> None:
@@ -130,14 +144,20 @@ def test_a_rounded_pose_is_read_with_the_norm_1_and_others_stay_as_they_are() ->
         assert with_unit_quaternion(sent) is sent
 
 
-def test_a_pose_has_a_cell_also_off_the_map_or_is_refused_by_the_name_of_its_value() -> None:
+def test_a_pose_has_a_cell_also_off_the_map_or_is_refused_by_the_name_of_its_value() -> (
+    None
+):
     grid, stamped = GridMap(np.zeros((2, 2)), 0.5), PoseStamped(header=HEADER)
     at = stamped.pose.position
     for at.x, at.y, cell in ((0.5, 0.99, (1, 1)), (-0.1, 1.0, (-1, 2))):
         assert cell_from_pose("the goal", stamped, grid, "map") == cell
     for field, value, reason in (
         ("position.y", -math.inf, "the goal's position is .*y = -inf"),
-        ("orientation.w", 1e200, "the goal's orientation is .*quaternion of norm 1e[+]200"),
+        (
+            "orientation.w",
+            1e200,
+            "the goal's orientation is .*quaternion of norm 1e[+]200",
+        ),
         ("position.x", 1e308, "x = 1e[+]308.* too far"),
     ):
         bad = changed(PoseStamped(header=HEADER), f"pose.{field}", value)
@@ -174,10 +194,15 @@ def test_a_path_looks_ahead_and_ends_as_the_goal_and_is_the_same_serialized(
     assert all(pose.pose.orientation == quaternion(0.7) for pose in path.poses[-1:])
     content = path_bytes(*poses, header, quaternion(0.7))
     sent = deserialize_message(content, Path)
-    assert [sent.header, *(pose.header for pose in sent.poses)] == [header] * (1 + len(points))
+    assert [sent.header, *(pose.header for pose in sent.poses)] == [header] * (
+        1 + len(points)
+    )
     for name, axes in (("position", "xyz"), ("orientation", "xyzw")):
         values, expected = (
-            [[getattr(getattr(p.pose, name), axis) for axis in axes] for p in message.poses]
+            [
+                [getattr(getattr(p.pose, name), axis) for axis in axes]
+                for p in message.poses
+            ]
             for message in (sent, path)
         )
         np.testing.assert_allclose(values, expected, atol=1e-12)
@@ -214,7 +239,10 @@ ROUNDED = st.builds(
 
 @given(POINTS, ROUNDED, POINTS, ROUNDED)
 def test_a_pose_is_turned_and_moved_in_space_and_projected_to_the_plane(
-    point: tuple[float, ...], facing: Quaternion, shift: tuple[float, ...], turn: Quaternion
+    point: tuple[float, ...],
+    facing: Quaternion,
+    shift: tuple[float, ...],
+    turn: Quaternion,
 ) -> None:
     found = transformed(stamped_pose(point, facing), transform(shift, turn))
     position, rotation = found.pose.position, found.pose.orientation
@@ -226,7 +254,9 @@ def test_a_pose_is_turned_and_moved_in_space_and_projected_to_the_plane(
     looks = in_map * Rotation.from_quat([facing.x, facing.y, facing.z, facing.w])
     ahead = complex(*looks.apply((1, 0, 0))[:2])
     if abs(ahead) > 1e-3:  # else it looks up or down
-        assert complex(rotation.w, rotation.z) ** 2 == pytest.approx(ahead / abs(ahead), abs=1e-6)
+        assert complex(rotation.w, rotation.z) ** 2 == pytest.approx(
+            ahead / abs(ahead), abs=1e-6
+        )
 
 
 NAN = math.nan
@@ -238,7 +268,10 @@ NAN = math.nan
         ((0.0, 0.0, 0.707, 0.707), ""),
         ((0.0, 0.0, 0.65, 0.65), ""),
         ((0.0, 0.0, 0.0, 1.09), ""),
-        ((0.0, 0.0, 0.0, 0.5), r"quaternion \(0, 0, 0, 0.5\) of norm 0.5; publish one of norm 1"),
+        (
+            (0.0, 0.0, 0.0, 0.5),
+            r"quaternion \(0, 0, 0, 0.5\) of norm 0.5; publish one of norm 1",
+        ),
         ((0.0, 0.0, 3.0, 4.0), r"quaternion \(0, 0, 3, 4\) of norm 5"),
         ((0.0, 0.0, 0.0, 0.0), r"of norm 0;"),
         ((0.0, 0.0, NAN, 1.0), r"of norm nan;"),
@@ -252,12 +285,16 @@ def test_tf2_gets_unit_quaternions_and_others_are_refused_and_logged_once(
     checked = CheckedTransforms(buffer, node)
     warning = node.get_logger().warning
     for _ in range(3):
-        getattr(checked, method)(transform((1.0, 2.0, 0.0), Quaternion(**zipped(numbers))), "robot")
+        getattr(checked, method)(
+            transform((1.0, 2.0, 0.0), Quaternion(**zipped(numbers))), "robot"
+        )
     handed = [call.args for call in getattr(buffer, method).call_args_list]
     assert len(buffer.method_calls) == len(handed) == (0 if problem else 3)
     for stamped, authority in handed:
         turn = rotation(stamped.transform.rotation)
-        assert turn == pytest.approx([it / math.hypot(*numbers) for it in numbers], abs=1e-12)
+        assert turn == pytest.approx(
+            [it / math.hypot(*numbers) for it in numbers], abs=1e-12
+        )
         assert authority == "robot"
     assert warning.call_count == len(checked.refused) == bool(problem)
     if problem:
@@ -280,7 +317,9 @@ def zipped(numbers: tuple[float, ...]) -> dict[str, float]:
 @pytest.mark.parametrize("w", [0.0, 0.8, math.nan, math.inf])
 def test_a_transform_without_a_rotation_is_named(w: float) -> None:
     bad = transform((1.0, 2.0, 0.0), Quaternion(w=w))
-    with pytest.raises(ValueError, match=f"'odom' to 'map' has the .* of norm {w:.6g}; pub"):
+    with pytest.raises(
+        ValueError, match=f"'odom' to 'map' has the .* of norm {w:.6g}; pub"
+    ):
         transformed(stamped_pose((2.0, 0.0, 0.0), Quaternion()), bad)
 
 
@@ -293,7 +332,9 @@ class Buffer:
     def clear(self) -> None:
         self.seconds = ()
 
-    def lookup_transform(self, target: str, source: str, stamp: Time) -> TransformStamped:
+    def lookup_transform(
+        self, target: str, source: str, stamp: Time
+    ) -> TransformStamped:
         if (target, source) != ("map", "odom") or not self.seconds:
             raise KeyError(f"{source} does not exist")
         nanoseconds = stamp.nanoseconds or max(self.seconds) * 10**9
@@ -332,7 +373,9 @@ def listening(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Frames]:
 
 def pose_at(seconds: float, frame: str = "odom") -> PoseStamped:
     stamped = stamped_pose((2.0, 0.0, 0.0), Quaternion())
-    stamped.header = Header(stamp=Time(nanoseconds=int(seconds * 1e9)).to_msg(), frame_id=frame)
+    stamped.header = Header(
+        stamp=Time(nanoseconds=int(seconds * 1e9)).to_msg(), frame_id=frame
+    )
     return stamped
 
 
@@ -343,7 +386,9 @@ def refusal(status: str, get: Callable[[], object]) -> str:
     return str(error.value)
 
 
-def test_a_pose_is_transformed_by_the_transform_of_its_time_or_refused(listening: Any) -> None:
+def test_a_pose_is_transformed_by_the_transform_of_its_time_or_refused(
+    listening: Any,
+) -> None:
     asked_found = (100, 100), (105, 105), (0, 110)  # the last one has no time
     for asked, known, found in (
         *((asked, (100, 110), found) for asked, found in asked_found),
@@ -358,7 +403,9 @@ def test_a_pose_is_transformed_by_the_transform_of_its_time_or_refused(listening
         (pose_at(110.5), r"the goal's frame is 'odom'.*extrapol.*; publish"),
         (pose_at(100, "moon"), "from 'moon' to 'map' .*moon does not exist"),
     ):
-        refused = refusal("TF_ERROR", partial(frames.to_map, "the goal", stamped, "map"))
+        refused = refusal(
+            "TF_ERROR", partial(frames.to_map, "the goal", stamped, "map")
+        )
         assert re.search(reason, refused)
 
 
@@ -378,7 +425,9 @@ def test_a_newest_transform_beyond_the_tolerance_is_not_used(listening: Any) -> 
             assert goal_in_map().header.stamp.sec == stamp
 
 
-def test_transforms_from_before_the_clock_jumped_back_are_forgotten(listening: Any) -> None:
+def test_transforms_from_before_the_clock_jumped_back_are_forgotten(
+    listening: Any,
+) -> None:
     frames = listening(100)
     assert frames.origin_of("odom", "map").pose.position.x == 1.0
     frames.began -= 60
@@ -397,11 +446,15 @@ def test_a_set_start_outlives_time_and_a_jump_of_the_clock() -> None:
     places._take(pose)
     for forget in node.after_jump_back:
         forget()
-    node.get_clock().now.return_value = Time(seconds=2 * NOW, clock_type=ClockType.ROS_TIME)
+    node.get_clock().now.return_value = Time(
+        seconds=2 * NOW, clock_type=ClockType.ROS_TIME
+    )
     assert places.start() is pose
 
 
-def test_other_frames_are_refused_without_tf_and_the_remedy_names_it(listening: Any) -> None:
+def test_other_frames_are_refused_without_tf_and_the_remedy_names_it(
+    listening: Any,
+) -> None:
     stamped, frames = pose_at(1), listening()
     frames.check("the goal", stamped, "map")
     check_pose("the start", stamped)  # in any frame
@@ -410,7 +463,9 @@ def test_other_frames_are_refused_without_tf_and_the_remedy_names_it(listening: 
     with pytest.raises(ValueError, match="the start's frame is '', the map's is 'map'"):
         check_pose("the start", PoseStamped(), "map")
     frames.available = False
-    with pytest.raises(ValueError, match=r"'odom', the map's is 'map'; transform .* tf2_ros"):
+    with pytest.raises(
+        ValueError, match=r"'odom', the map's is 'map'; transform .* tf2_ros"
+    ):
         frames.check("the goal", stamped, "map")
     with pytest.raises(ValueError, match="install tf2_ros"):
         frames.to_map("the goal", stamped, "map")

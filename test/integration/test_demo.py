@@ -32,7 +32,10 @@ class Demo:
         self._entry = f"{MARK}={mark}".encode()
         self._output = folder / "output.txt"
         with self._output.open("wb") as file:
-            options: Any = {"env": {**os.environ, MARK: mark}, "start_new_session": True}
+            options: Any = {
+                "env": {**os.environ, MARK: mark},
+                "start_new_session": True,
+            }
             options |= {"cwd": folder, "stdout": file, "stderr": subprocess.STDOUT}
             self.process = subprocess.Popen([sys.executable, DEMO], **options)
 
@@ -49,7 +52,9 @@ class Demo:
         for folder in Path("/proc").glob("[0-9]*"):
             with suppress(OSError):  # it has ended, or is another user's
                 if self._entry in (folder / "environ").read_bytes().split(b"\0"):
-                    found[int(folder.name)] = (folder / "cmdline").read_text().replace("\0", " ")
+                    found[int(folder.name)] = (
+                        (folder / "cmdline").read_text().replace("\0", " ")
+                    )
         return found
 
 
@@ -64,7 +69,9 @@ def demo(tmp_path: Path) -> Iterator[Demo]:
     demo.process.wait()
 
 
-def test_demo_finds_the_shortest_paths_and_draws_them(demo: Demo, tmp_path: Path) -> None:
+def test_demo_finds_the_shortest_paths_and_draws_them(
+    demo: Demo, tmp_path: Path
+) -> None:
     assert demo.process.wait(TIMEOUT) == 0, demo.output
     assert "length 22.97 cells, optimum 22.97" in demo.output
     assert "length 789.95 cells, optimum 789.95" in demo.output
@@ -79,9 +86,12 @@ def test_demo_finds_the_shortest_paths_and_draws_them(demo: Demo, tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("signal_number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)]
+    ("signal_number", "code"),
+    [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)],
 )
-def test_no_process_outlives_the_demo(demo: Demo, signal_number: int, code: int) -> None:
+def test_no_process_outlives_the_demo(
+    demo: Demo, signal_number: int, code: int
+) -> None:
     for node in ("map_server_node", "planner_node"):
         wait_for(node, partial(demo.runs, node), [demo.process])
     demo.process.send_signal(signal_number)

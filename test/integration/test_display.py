@@ -13,7 +13,14 @@ from rclpy.serialization import serialize_message
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, legal_moves, shortest_distances
+from ddqn_planner.grid import (
+    MOVES,
+    Cell,
+    GridMap,
+    MoveRule,
+    legal_moves,
+    shortest_distances,
+)
 from ddqn_planner.nodes.display import MAX_ARROWS, policy_message, value_message
 from ddqn_planner.nodes.runtime import LATCHED
 from ddqn_planner.planning import QField
@@ -54,7 +61,9 @@ def arrows_of(marker: Marker) -> np.ndarray:
     return np.array([(point.x, point.y) for point in marker.points]).reshape(-1, 6, 2)
 
 
-@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (-1.0, 2.0, 0.7), (3.0, 0.0, -2.5)])
+@pytest.mark.parametrize(
+    "origin", [(0.0, 0.0, 0.0), (-1.0, 2.0, 0.7), (3.0, 0.0, -2.5)]
+)
 def test_each_free_cell_has_its_greedy_arrow(
     small_values: np.ndarray, origin: tuple[float, float, float]
 ) -> None:
@@ -66,7 +75,9 @@ def test_each_free_cell_has_its_greedy_arrow(
     assert marker.pose.orientation.w == 1.0
     assert min(marker.scale.x, marker.color.a) > 0
     found = set()
-    for tail, tip, tip_1, barb_1, tip_2, barb_2 in (arrows_of(marker) @ [1, 1j]).tolist():
+    for tail, tip, tip_1, barb_1, tip_2, barb_2 in (
+        arrows_of(marker) @ [1, 1j]
+    ).tolist():
         assert [tip_1, tip_2] == pytest.approx([tip, tip])
         middle = (tail + tip) / 2
         x, y = cell = grid.world_to_cell(middle.real, middle.imag)
@@ -74,7 +85,9 @@ def test_each_free_cell_has_its_greedy_arrow(
         found.add(cell)
         # A barb lies behind the tip, and the two are mirrored.
         ahead = cmath.rect(1.0, origin[2] + field.policy[y, x] * math.pi / 4)
-        along, *barbs = ((point / ahead) for point in (tip - tail, barb_1 - tip, barb_2 - tip))
+        along, *barbs = (
+            (point / ahead) for point in (tip - tail, barb_1 - tip, barb_2 - tip)
+        )
         assert along == pytest.approx(abs(along))
         assert barbs[0] == pytest.approx(barbs[1].conjugate())
         assert barbs[0].real < 0 != barbs[0].imag
@@ -120,7 +133,9 @@ def test_what_nobody_asks_for_is_not_computed_and_what_somebody_sees_is_of_the_g
     with run_robot("/seen", {}, hall, sitecustomize=TOLD.format(gap=str(gap))) as robot:
         client, node = robot.client, robot.node
         value = "/seen/planner/value"
-        (seen,) = (each for each in client.node.subscriptions if each.topic_name == value)
+        (seen,) = (
+            each for each in client.node.subscriptions if each.topic_name == value
+        )
         client.node.destroy_subscription(seen)
         for _ in range(2):
             robot.set_map(robot.stamped_map())
@@ -139,9 +154,15 @@ def test_what_nobody_asks_for_is_not_computed_and_what_somebody_sees_is_of_the_g
 
         def wait_for(goal: Cell, arrows: int = arrows) -> None:
             values.wait(lambda value: value.data[goal[1] * 20 + goal[0]] == 100)
-            found = policies.wait(lambda message: len(message.markers[0].points) == arrows)
+            found = policies.wait(
+                lambda message: len(message.markers[0].points) == arrows
+            )
             (marker,) = found.markers
-            assert (marker.header.frame_id, marker.ns, marker.id) == ("map", "policy", 0)
+            assert (marker.header.frame_id, marker.ns, marker.id) == (
+                "map",
+                "policy",
+                0,
+            )
 
         wait_for((4, 4))
         # Once a goal, not once a plan.
@@ -156,7 +177,9 @@ def test_what_nobody_asks_for_is_not_computed_and_what_somebody_sees_is_of_the_g
         robot.send_goal(robot.pose((10, 2)))
         value = values.wait(lambda value: set(value.data) == {-1})
         assert (value.info.width, value.header.frame_id) == (20, "map")
-        deleted = policies.wait(lambda message: message.markers[0].action == Marker.DELETE)
+        deleted = policies.wait(
+            lambda message: message.markers[0].action == Marker.DELETE
+        )
         (marker,) = deleted.markers
         assert (marker.ns, marker.id, len(marker.points)) == ("policy", 0, 0)
         # The map's changes are shown too.

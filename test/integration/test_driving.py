@@ -50,7 +50,9 @@ class Site(User):
         super().__init__(client, "driving", "trainer/experience_saved")
         self.folder, self.now, self.at = folder, time.monotonic(), LOWER[0]
         self.robot, self.space = f" {robot}".rstrip(), f"{robot}/".lstrip("/")
-        self.experience = client.subscribe(UInt8MultiArray, "trainer/experience", LATCHED)
+        self.experience = client.subscribe(
+            UInt8MultiArray, "trainer/experience", LATCHED
+        )
         self.slowness = client.subscribe(OccupancyGrid, "trainer/slowness", LATCHED)
 
     def begin(self, listeners: int = 1) -> None:
@@ -71,7 +73,9 @@ class Site(User):
 
     def send_goal(self, x: float, y: float) -> None:
         """Send a goal, and wait until the trainer has it: poses may overtake it."""
-        goal = PoseStamped(header=Header(frame_id="map"), pose=Pose(position=Point(x=x, y=y)))
+        goal = PoseStamped(
+            header=Header(frame_id="map"), pose=Pose(position=Point(x=x, y=y))
+        )
         self.client.publish(f"{self.space}goal_pose", goal)
         self.state(**{f"goal{self.robot}": re.escape(f"({x:.6g}, {y:.6g})")})
 
@@ -85,7 +89,9 @@ class Site(User):
                 self.now += distance / steps / speed
                 self.send(self.odometry(*there))
             self.at = point
-        self.state(**{f"robot{self.robot}": re.escape("({:.6g}, {:.6g})".format(*self.at))})
+        self.state(
+            **{f"robot{self.robot}": re.escape("({:.6g}, {:.6g})".format(*self.at))}
+        )
 
     def drive(
         self, points: list[tuple[float, float]], speed: float, then: Any = lambda: None
@@ -113,7 +119,9 @@ class Site(User):
 
     @property
     def outcomes(self) -> list[str]:
-        return [drive.outcome.value for drive in read_drives(self.folder / "episodes.csv")]
+        return [
+            drive.outcome.value for drive in read_drives(self.folder / "episodes.csv")
+        ]
 
     def learned(self) -> np.ndarray:
         return Experience.load(self.folder / "experience.npz").slowness(GRID)
@@ -122,9 +130,17 @@ class Site(User):
 @pytest.fixture(scope="module")
 def run_trainer(run_node: Any) -> Callable[..., Any]:
     def run(
-        folder: FilePath, namespace: str, exit_code: int = 0, robots: Any = ("",), **modules: str
+        folder: FilePath,
+        namespace: str,
+        exit_code: int = 0,
+        robots: Any = ("",),
+        **modules: str,
     ) -> Any:
-        given = {"learn_from": "driving", "output_folder": str(folder), "replay_period": 0.002}
+        given = {
+            "learn_from": "driving",
+            "output_folder": str(folder),
+            "replay_period": 0.002,
+        }
         modules |= {"sitecustomize": SOON}
         parameters = {**given, "robots": [*robots]}
         return run_node("trainer_node", parameters, (), namespace, exit_code, **modules)
@@ -133,7 +149,9 @@ def run_trainer(run_node: Any) -> Callable[..., Any]:
 
 
 @pytest.fixture(scope="module")
-def trainer(run_trainer: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+def trainer(
+    run_trainer: Any, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Any]:
     with run_trainer(tmp_path_factory.mktemp("first") / "drives", NAMESPACE) as node:
         yield node
 
@@ -175,7 +193,9 @@ def is_above(path: Path) -> bool:
     return len(path.poses) > 0 and all(it.pose.position.y > 4 for it in path.poses)
 
 
-def test_the_robot_goes_round_what_was_slow_until_it_forgets(planner: Any, site: Site) -> None:
+def test_the_robot_goes_round_what_was_slow_until_it_forgets(
+    planner: Any, site: Site
+) -> None:
     site.begin(listeners=2)
     plans = site.client.subscribe(Path, "plan", LATCHED)
     ends = pose(GRID, START), pose(GRID, GOAL)
@@ -210,7 +230,9 @@ def test_the_robot_goes_round_what_was_slow_until_it_forgets(planner: Any, site:
     forecast = site.diagnostics.wait(lambda array: key in values_of(array.status[0]))
     assert float(values_of(forecast.status[0])[key]) > length / 0.5 * 0.8
 
-    broken = bytes_message("experience", (site.folder / "experience.npz").read_bytes()[:-20])
+    broken = bytes_message(
+        "experience", (site.folder / "experience.npz").read_bytes()[:-20]
+    )
     site.client.publish("trainer/experience", broken, LATCHED)
     planner.wait_for_log("experience refused: no experience")
     assert not is_below(site.client.get_plan(*ends))
@@ -232,7 +254,9 @@ def test_the_robot_goes_round_what_was_slow_until_it_forgets(planner: Any, site:
     assert site.outcomes == ["arrived"] * 3
 
 
-def test_recording_stops_and_continues_unless_the_experience_is_broken(site: Site) -> None:
+def test_recording_stops_and_continues_unless_the_experience_is_broken(
+    site: Site,
+) -> None:
     assert "call ~/stop first" in site.refusal()
     site.move(LOWER[1:2], 0.1)
     assert "stopped after drive 1" in site.call("stop")
@@ -255,14 +279,18 @@ def test_recording_stops_and_continues_unless_the_experience_is_broken(site: Sit
 def test_who_gives_up_ends_the_drive_and_moves_fail_there(site: Site) -> None:
     def send(*numbers: int) -> None:
         for number in numbers:
-            message = GoalStatusArray(status_list=[GoalStatus(status=GoalStatus.STATUS_ABORTED)])
+            message = GoalStatusArray(
+                status_list=[GoalStatus(status=GoalStatus.STATUS_ABORTED)]
+            )
             message.status_list[0].goal_info.goal_id.uuid = [number] * 16
             site.client.publish(NAVIGATION, message, LATCHED)
 
     site.move(LOWER[:1], 0.5)
     send(1)  # before: nobody knows where
     site.client.wait_for_discovery("trainer")
-    site.call("save")  # what came before it is done: the goal may not overtake the status
+    site.call(
+        "save"
+    )  # what came before it is done: the goal may not overtake the status
     site.send_goal(*LOWER[3])
     site.drive(LOWER[1:3], 0.5, then=lambda: send(1, 2))
     assert site.outcomes == ["aborted"]
@@ -270,11 +298,21 @@ def test_who_gives_up_ends_the_drive_and_moves_fail_there(site: Site) -> None:
     assert slowness[14, 87] > slowness[14, 50]
 
 
-def test_malformed_odometry_is_refused_and_the_next_is_taken(site: Site, trainer: Any) -> None:
+def test_malformed_odometry_is_refused_and_the_next_is_taken(
+    site: Site, trainer: Any
+) -> None:
     for field, value, reason in (
-        ("header.frame_id", "odom", "frame is 'odom', (the map's is 'map'|and no transform leads)"),
+        (
+            "header.frame_id",
+            "odom",
+            "frame is 'odom', (the map's is 'map'|and no transform leads)",
+        ),
         ("header.stamp", Time(), "has no stamp"),
-        ("pose.pose.position.x", math.nan, r"\(nan, 1.0\).*give finite numbers|x = nan"),
+        (
+            "pose.pose.position.x",
+            math.nan,
+            r"\(nan, 1.0\).*give finite numbers|x = nan",
+        ),
         ("pose.pose.position.x", 1e300, r"\(1e\+300, 1.0\).*give finite numbers"),
     ):
         trainer.forget_log()

@@ -52,8 +52,12 @@ sys.meta_path.insert(0, Finder)
 """
 
 
-@pytest.mark.parametrize("module", ["nodes.planner_node", "grid", "planning", "nodes.nav2"])
-def test_a_signal_ends_a_planner_that_still_imports_its_modules(run_node: Any, module: str) -> None:
+@pytest.mark.parametrize(
+    "module", ["nodes.planner_node", "grid", "planning", "nodes.nav2"]
+)
+def test_a_signal_ends_a_planner_that_still_imports_its_modules(
+    run_node: Any, module: str
+) -> None:
     interrupted = INTERRUPTED.format(module=f"ddqn_planner.{module}")
     with run_node("planner_node", sitecustomize=interrupted) as node:
         assert node.process.wait(TIMEOUT) == 0
@@ -67,7 +71,9 @@ def code_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "code"
 
 
-def test_a_signal_ends_a_planner_that_compiles(run_node: Any, code_folder: Path) -> None:
+def test_a_signal_ends_a_planner_that_compiles(
+    run_node: Any, code_folder: Path
+) -> None:
     with run_node("planner_node", namespace="/compiling") as node:
         node.wait_for_log("compiles its functions")
         assert node.stop() == 0
@@ -135,10 +141,15 @@ PlannerNode._on_look = wait
 def test_a_signal_ends_a_callback_that_waits(run_node: Any, make_client: Any) -> None:
     """The node leaves the graph all the same."""
     client = make_client("/blocked")
-    with run_node("planner_node", namespace="/blocked", sitecustomize=BLOCKED_CALLBACK) as node:
+    with run_node(
+        "planner_node", namespace="/blocked", sitecustomize=BLOCKED_CALLBACK
+    ) as node:
         node.wait_for_log("a callback waits")
         deadline = time.monotonic() + TIMEOUT
-        while ("planner", "/blocked") not in client.node.get_node_names_and_namespaces():
+        while (
+            "planner",
+            "/blocked",
+        ) not in client.node.get_node_names_and_namespaces():
             assert time.monotonic() < deadline
             time.sleep(0.02)
         assert node.stop() == 0

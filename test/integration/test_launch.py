@@ -70,7 +70,9 @@ def node_names(started: dict[str, Started]) -> list[str]:
 def written(folder: Path, nodes: dict[str, Any]) -> str:
     """Return a parameter file of these nodes."""
     path = folder / "parameters.yaml"
-    document = {name: {"ros__parameters": parameters} for name, parameters in nodes.items()}
+    document = {
+        name: {"ros__parameters": parameters} for name, parameters in nodes.items()
+    }
     path.write_text(yaml.safe_dump(document))
     return str(path)
 
@@ -94,9 +96,13 @@ def test_all_of_nav2_is_started_and_the_planner_activated_before_bt_navigator(
     assert localization["map"] == ""
 
 
-def test_the_planner_takes_the_place_of_planner_servers_actions(workspace: Workspace) -> None:
+def test_the_planner_takes_the_place_of_planner_servers_actions(
+    workspace: Workspace,
+) -> None:
     started = launch(workspace)
-    moved = {f"{name}:{target}" for name, target in started["planner_server"].remaps.items()}
+    moved = {
+        f"{name}:{target}" for name, target in started["planner_server"].remaps.items()
+    }
     for action in ("compute_path_to_pose", "compute_path_through_poses"):
         for part in ("send_goal", "cancel_goal", "get_result", "feedback", "status"):
             name = f"{action}/_action/{part}"
@@ -130,7 +136,13 @@ def test_bt_navigator_waits_for_python_and_the_costmap_is_published_as_it_change
     # What is more than enough stays; what is not told is 20 ms and 1 Hz.
     files: list[tuple[int, dict[str, Any]]] = [
         (500, {"bt_navigator": {"default_server_timeout": 500}, costmap: {}}),
-        (200, {"/**": {"default_server_timeout": 20}, costmap: {"publish_frequency": 5.0}}),
+        (
+            200,
+            {
+                "/**": {"default_server_timeout": 20},
+                costmap: {"publish_frequency": 5.0},
+            },
+        ),
         (200, {"/**/bt_navigator": {"default_server_timeout": 20}}),
         (200, {"other": {"default_server_timeout": 500}}),
     ]
@@ -154,13 +166,15 @@ def test_a_namespace_holds_every_node_its_parameters_and_its_transforms(
         servers = started.keys() - {"localization_launch.py"}
         assert {started[name].namespace for name in servers} == {"/robot1"}
         assert all(
-            started[name].remaps.items() >= TRANSFORMS.items() for name in node_names(started)
+            started[name].remaps.items() >= TRANSFORMS.items()
+            for name in node_names(started)
         )
         assert started["localization_launch.py"].parameters["namespace"] == "/robot1"
         assert started["localization_launch.py"].namespace == "/robot1"
         navigator = started["bt_navigator"]
         assert (
-            navigator.parameters.items() >= {"a": 1, "b": 3, "default_server_timeout": 200}.items()
+            navigator.parameters.items()
+            >= {"a": 1, "b": 3, "default_server_timeout": 200}.items()
         )
         assert navigator.files["/robot1/amcl"] == {"c": 4}
         planner = started["ddqn_planner"]
@@ -172,14 +186,27 @@ def test_a_namespace_holds_every_node_its_parameters_and_its_transforms(
 def test_arguments_reach_the_planner_and_go_before_the_parameter_file(
     workspace: Workspace, tmp_path: Path
 ) -> None:
-    section = {"model": "car", "planner_id": "ours", "map_type": "map", "autostart": True}
+    section = {
+        "model": "car",
+        "planner_id": "ours",
+        "map_type": "map",
+        "autostart": True,
+    }
     file = written(tmp_path, {"ddqn_planner": section})
     planner = launch(workspace, params_file=file)["ddqn_planner"].parameters
-    assert planner.items() >= {**section, "autostart": False, "robot_frame": "base_link"}.items()
+    assert (
+        planner.items()
+        >= {**section, "autostart": False, "robot_frame": "base_link"}.items()
+    )
     arguments = {"model": "dilemma", "planner_id": "ddqn", "use_sim_time": "True"}
-    started = launch(workspace, params_file=file, autostart="0", log_level="debug", **arguments)
+    started = launch(
+        workspace, params_file=file, autostart="0", log_level="debug", **arguments
+    )
     planner = started["ddqn_planner"].parameters
-    assert planner.items() >= {**arguments, "use_sim_time": True, "autostart": False}.items()
+    assert (
+        planner.items()
+        >= {**arguments, "use_sim_time": True, "autostart": False}.items()
+    )
     assert started["lifecycle_manager_navigation"].parameters["autostart"] is False
     assert started["localization_launch.py"].parameters["use_sim_time"] == "True"
     for name in SERVERS.keys() & started.keys():
@@ -193,8 +220,13 @@ def test_nodes_that_a_release_or_a_robot_lacks_are_left_out(
     started = launch(workspace)
     assert velocities not in started["velocity_smoother"].remaps
     # Without a collision monitor the smoothed velocities are those that the robot drives.
-    started = launch(workspace, params_file=written(tmp_path, {"route_server": {"x": 1}}))
-    assert set(SERVERS) - set(node_names(started)) == {"collision_monitor", "docking_server"}
+    started = launch(
+        workspace, params_file=written(tmp_path, {"route_server": {"x": 1}})
+    )
+    assert set(SERVERS) - set(node_names(started)) == {
+        "collision_monitor",
+        "docking_server",
+    }
     assert started.keys() >= set(node_names(started))
     assert started["velocity_smoother"].remaps[velocities] == "cmd_vel"
     # As in Lyrical.
@@ -209,7 +241,9 @@ def test_the_map_is_served_made_or_left_to_others(
 ) -> None:
     monkeypatch.setenv("HOME", "/home/somebody")
     started = launch(workspace, map="~/map.yaml")
-    assert started["localization_launch.py"].parameters["map"] == "/home/somebody/map.yaml"
+    assert (
+        started["localization_launch.py"].parameters["map"] == "/home/somebody/map.yaml"
+    )
     started = launch(workspace, slam="true")
     assert "slam_launch.py" in started
     assert "localization_launch.py" not in started
@@ -220,11 +254,20 @@ def test_the_map_is_served_made_or_left_to_others(
     for zone, states in (("keepout", [True, False]), ("speed", [False, True])):
         workspace.add_launch_file(f"{zone}_zone_launch.py")
         started = launch(workspace, **{f"{zone}_mask": "mask.yaml"})
-        assert started[f"{zone}_zone_launch.py"].parameters[f"{zone}_mask"] == "mask.yaml"
-        filters = started["planner_server"].files["/global_costmap/global_costmap"]["filters"]
+        assert (
+            started[f"{zone}_zone_launch.py"].parameters[f"{zone}_mask"] == "mask.yaml"
+        )
+        filters = started["planner_server"].files["/global_costmap/global_costmap"][
+            "filters"
+        ]
         assert [layer["enabled"] for layer in filters] == states
-    assert launch(workspace, graph="g")["route_server"].parameters["graph_filepath"] == "g"
-    assert launch(workspace)["route_server"].parameters["graph_filepath"] == "street.geojson"
+    assert (
+        launch(workspace, graph="g")["route_server"].parameters["graph_filepath"] == "g"
+    )
+    assert (
+        launch(workspace)["route_server"].parameters["graph_filepath"]
+        == "street.geojson"
+    )
 
 
 def topics_of(value: Any) -> set[str]:
@@ -246,7 +289,9 @@ def test_rviz_shows_the_planner_of_its_namespace(workspace: Workspace) -> None:
         "-d",
         str(workspace.prefix / "share/ddqn_planner/rviz/ddqn_planner.rviz"),
     ]
-    topics = topics_of(yaml.safe_load((ROOT / "rviz" / "ddqn_planner.rviz").read_text()))
+    topics = topics_of(
+        yaml.safe_load((ROOT / "rviz" / "ddqn_planner.rviz").read_text())
+    )
     assert len(topics) == 9
     assert rviz.remaps.keys() == topics | {"/tf", "/tf_static"}
     for topic, target in rviz.remaps.items():
@@ -260,7 +305,11 @@ def test_rviz_shows_the_planner_of_its_namespace(workspace: Workspace) -> None:
     [
         ("use_sim_time", "maybe", "use_sim_time:=maybe is neither true nor false"),
         ("rviz", "", "rviz:= is neither true nor false"),
-        ("server_timeout", "0.2", "server_timeout:=0.2 is no time; give whole milliseconds"),
+        (
+            "server_timeout",
+            "0.2",
+            "server_timeout:=0.2 is no time; give whole milliseconds",
+        ),
         ("server_timeout", "0", "server_timeout:=0 is no time"),
         ("params_file", "/no/such.yaml", "params_file:=/no/such.yaml cannot be read"),
         ("params_file", "a: [", "cannot be read"),
@@ -279,7 +328,9 @@ def test_a_wrong_argument_is_named(
         launch(workspace, **{argument: value})
 
 
-def test_an_empty_parameter_file_is_enough(workspace: Workspace, tmp_path: Path) -> None:
+def test_an_empty_parameter_file_is_enough(
+    workspace: Workspace, tmp_path: Path
+) -> None:
     empty = tmp_path / "empty.yaml"
     empty.touch()
     # Of real processes each would be started again and again.

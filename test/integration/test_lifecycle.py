@@ -46,7 +46,10 @@ def wait_for_created(robot: Robot, expected: set[str]) -> None:
 
     def created() -> bool:
         entities = robot.client.entities("planner")
-        return bool(entities) and {name for _, name, _ in entities} & OF_CONFIGURED == expected
+        return (
+            bool(entities)
+            and {name for _, name, _ in entities} & OF_CONFIGURED == expected
+        )
 
     wait_for("what a planner in its state has", created)
 
@@ -112,8 +115,12 @@ def test_no_request_for_a_transition_ends_the_planner(robot: Robot) -> None:
     start(robot)
     labels = "configure", "activate", "cleanup", "no_such", "transition_error", "ü" * 99
     assert not any(map(robot.transition, labels))
-    assert not any(robot.transition(number=n) for n in (0, 1, 2, 3, 5, 6, 8, 10, 60, 62, 77, 255))
-    robot.node.wait_for_log("'configure' refused: the node has deactivate, shutdown when active")
+    assert not any(
+        robot.transition(number=n) for n in (0, 1, 2, 3, 5, 6, 8, 10, 60, 62, 77, 255)
+    )
+    robot.node.wait_for_log(
+        "'configure' refused: the node has deactivate, shutdown when active"
+    )
     robot.node.wait_for_log("transition 255 refused")
     assert robot.state == "active"
     robot.assert_works()
@@ -121,7 +128,9 @@ def test_no_request_for_a_transition_ends_the_planner(robot: Robot) -> None:
     assert robot.state == "inactive"
 
 
-def test_an_unconfigured_planner_checks_parameters(robot: Robot, tmp_path: Path) -> None:
+def test_an_unconfigured_planner_checks_parameters(
+    robot: Robot, tmp_path: Path
+) -> None:
     model = tmp_path / "model.safetensors"
     shutil.copy(robot.model, model)
     assert robot.refuse(model="no_such_model")
@@ -130,7 +139,9 @@ def test_an_unconfigured_planner_checks_parameters(robot: Robot, tmp_path: Path)
     for reason in ("no model", "cannot be read as safetensors"):
         assert not robot.transition("configure")
         assert robot.state == "unconfigured"
-        robot.node.wait_for_log(f"model refused: .*{reason}.*; or set the parameter 'model'")
+        robot.node.wait_for_log(
+            f"model refused: .*{reason}.*; or set the parameter 'model'"
+        )
         assert robot.wait_for_reason(f"model refused: .*{reason}").level == ERROR
         wait_for_created(robot, set())
         model.write_text("a model")
@@ -203,7 +214,9 @@ def test_cleanup_frees_map_model_and_fields(make_robot: Any, model: Path) -> Non
         assert robot.transition("deactivate")
         assert all(reference() for reference in freed)
         assert robot.transition("cleanup")
-        wait_for("free memory", lambda: gc.collect() >= 0 and not any(it() for it in freed))
+        wait_for(
+            "free memory", lambda: gc.collect() >= 0 and not any(it() for it in freed)
+        )
         before = len([*node.guards])
         assert all(map(robot.transition, ("configure", "cleanup")))
         assert len([*node.guards]) == before
@@ -223,11 +236,17 @@ def test_a_planner_that_plans_leaves_the_graph_at_once(robot: Robot) -> None:
     requests = [plan_request(rooms.grid, start, goal) for goal in goals[-100:]]
     before = cpu_seconds(robot.node.process.pid)
     answers = [plans.call_async(request) for request in requests]
-    wait_for("fields under way", lambda: cpu_seconds(robot.node.process.pid) > before + 0.2)
+    wait_for(
+        "fields under way", lambda: cpu_seconds(robot.node.process.pid) > before + 0.2
+    )
     assert robot.node.stop(signal.SIGTERM) == 0
     assert not re.search("ERROR|Traceback", robot.node.log)
     name, graph = ("planner", "/managed"), robot.client.node
-    wait_for("farewell", lambda: name not in graph.get_node_names_and_namespaces(), timeout=10)
+    wait_for(
+        "farewell",
+        lambda: name not in graph.get_node_names_and_namespaces(),
+        timeout=10,
+    )
     assert not all(answer.done() and answer.result().plan.poses for answer in answers)
 
 
@@ -250,7 +269,9 @@ def test_the_lifecycle_is_that_of_rclpys_own_nodes() -> None:
     events: list[list[tuple[State, State]]] = [[], []]
     for node, seen in zip(nodes, events, strict=True):
 
-        def hear(event: TransitionEvent, seen: list[tuple[State, State]] = seen) -> None:
+        def hear(
+            event: TransitionEvent, seen: list[tuple[State, State]] = seen
+        ) -> None:
             seen.append((event.start_state, event.goal_state))
 
         name = f"/{node.get_name()}/transition_event"
@@ -274,7 +295,9 @@ def test_the_lifecycle_is_that_of_rclpys_own_nodes() -> None:
     try:
         for label in ("", *LABELS):
             if label:
-                ours, example = ask("change_state", ChangeState, transition=Transition(label=label))
+                ours, example = ask(
+                    "change_state", ChangeState, transition=Transition(label=label)
+                )
                 assert ours.success
                 assert example.success
             for service, kind in SERVICES.items():
@@ -297,7 +320,9 @@ def test_the_lifecycle_is_that_of_rclpys_own_nodes() -> None:
 
 
 @pytest.mark.parametrize("state", ["unconfigured", "inactive", "active", "finalized"])
-def test_a_node_can_be_destroyed_after_the_shutdown_and_twice(state: str, model: Path) -> None:
+def test_a_node_can_be_destroyed_after_the_shutdown_and_twice(
+    state: str, model: Path
+) -> None:
     rclpy.init(args=["--ros-args", "-p", "autostart:=false", "-p", f"model:={model}"])
     node = PlannerNode()
     for label in {"inactive": LABELS[:1], "active": LABELS[:2]}.get(state, ()):
@@ -310,8 +335,16 @@ def test_a_node_can_be_destroyed_after_the_shutdown_and_twice(state: str, model:
     node.destroy_node()
 
 
-def test_a_trainer_can_be_destroyed_twice_and_if_it_cannot_start(tmp_path: Path) -> None:
-    arguments = ["--ros-args", "-p", f"output_folder:={tmp_path}", "-p", "learn_from:=driving"]
+def test_a_trainer_can_be_destroyed_twice_and_if_it_cannot_start(
+    tmp_path: Path,
+) -> None:
+    arguments = [
+        "--ros-args",
+        "-p",
+        f"output_folder:={tmp_path}",
+        "-p",
+        "learn_from:=driving",
+    ]
     rclpy.init(args=arguments)
     node = TrainerNode()
     node.destroy_node()
@@ -334,7 +367,10 @@ def test_requests_wait_for_the_first_map_and_model_and_another_one_set_meanwhile
         if case != "good":
             robot.set_map(robot.map_message())
         plan = ask_for_plan(robot)
-        assert robot.wait_for_reason("the model is being loaded", {"model": first}).level == WARN
+        assert (
+            robot.wait_for_reason("the model is being loaded", {"model": first}).level
+            == WARN
+        )
         assert robot.client.get_parameter("planner", "mode") == "greedy"
         assert not plan.done()
         assert robot.plans.messages() == []
@@ -349,7 +385,9 @@ def test_requests_wait_for_the_first_map_and_model_and_another_one_set_meanwhile
         assert bool(plan.result().plan.poses) == (case != "broken")
         if case == "broken":
             reason = "cannot be read as safetensors"
-            assert robot.wait_for_reason(f"no model is loaded: .*{reason}").level == ERROR
+            assert (
+                robot.wait_for_reason(f"no model is loaded: .*{reason}").level == ERROR
+            )
             robot.node.wait_for_log(f"model refused: .*{reason}.*set the parameter")
             return
         robot.wait_for_path(START, GOAL)

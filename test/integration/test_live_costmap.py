@@ -28,14 +28,18 @@ def robot(run_robot: Any) -> Iterator[Robot]:
     for y, x in DOORS:
         costmap[y, x - 1 : x + 2] = 90
     parameters = {"map_type": "costmap", "map_timeout": 0.0}
-    with run_robot("/live", parameters, costmap, remaps=["map:=global_costmap/costmap"]) as robot:
+    with run_robot(
+        "/live", parameters, costmap, remaps=["map:=global_costmap/costmap"]
+    ) as robot:
         robot.grid = GridMap(costmap >= 99, 0.5, (-1.0, 2.0, 0.0))
         publish_costmap(robot)
         robot.send_start(robot.pose((5, 5)))
         yield robot
 
 
-def test_a_costmap_is_planned_on_where_the_same_values_as_a_map_leave_no_path(robot: Robot) -> None:
+def test_a_costmap_is_planned_on_where_the_same_values_as_a_map_leave_no_path(
+    robot: Robot,
+) -> None:
     robot.send_goal(robot.pose((35, 5)))
     robot.wait_for_path((5, 5), (35, 5))
     robot.set(map_type="map")
@@ -44,7 +48,9 @@ def test_a_costmap_is_planned_on_where_the_same_values_as_a_map_leave_no_path(ro
     robot.clear()
     robot.wait_for_reason("^a path of")
     assert robot.get_plan(robot.pose((5, 5)), robot.pose((29, 0))).poses == []
-    robot.wait_for_reason("the goal is occupied .* nearer to an obstacle than the costmap allows")
+    robot.wait_for_reason(
+        "the goal is occupied .* nearer to an obstacle than the costmap allows"
+    )
     assert "give one of map, costmap" in robot.refuse(map_type="octree")
 
 
@@ -56,7 +62,9 @@ def publish_costmap(robot: Robot) -> None:
     robot.client.publish("global_costmap/costmap", robot.stamped_map(), LATCHED)
 
 
-def test_a_costmap_that_stops_takes_its_path_back_until_it_comes_again(robot: Robot) -> None:
+def test_a_costmap_that_stops_takes_its_path_back_until_it_comes_again(
+    robot: Robot,
+) -> None:
     # Nobody sets a parameter or asks while it is away, and it is not time to plan again.
     robot.set(map_timeout=0.05, replan_period=3600.0)
     robot.clear()
@@ -65,12 +73,19 @@ def test_a_costmap_that_stops_takes_its_path_back_until_it_comes_again(robot: Ro
     for _ in range(2):
         # As a costmap does: on a loaded machine the first may time out before it is planned on.
         with repeating(robot.client, lambda: publish_costmap(robot)):
-            path = robot.plans.wait(lambda path, at=last: path.poses and stamp(path) > at)
+            path = robot.plans.wait(
+                lambda path, at=last: path.poses and stamp(path) > at
+            )
         last = stamp(path)
-        empty = robot.plans.wait(lambda path, at=last: not path.poses and stamp(path) > at)
+        empty = robot.plans.wait(
+            lambda path, at=last: not path.poses and stamp(path) > at
+        )
         last = stamp(empty)
         assert empty.header.frame_id == "map"
-    wait_for("refusal", lambda: not robot.get_plan(robot.pose((5, 5)), robot.pose((9, 9))).poses)
+    wait_for(
+        "refusal",
+        lambda: not robot.get_plan(robot.pose((5, 5)), robot.pose((9, 9))).poses,
+    )
     silent = "nothing came on /live/global_costmap/costmap for longer than"
     assert robot.wait_for_reason(silent, {"status": "MAP_TIMEOUT"}).level == WARN
     robot.set(map_timeout=0.0, replan_period=1.0)
@@ -96,12 +111,16 @@ def test_updates_close_and_open_doors(robot: Robot) -> None:
     robot.clear()
     send(29, 4, [[99, 100, 99]])
     robot.plans.wait(is_passed(DOORS[1]))
-    robot.wait_for_reason("^a path of", {"planned on the map of (s)": "10000.000000000"})
+    robot.wait_for_reason(
+        "^a path of", {"planned on the map of (s)": "10000.000000000"}
+    )
     send(29, 12, [[99, 100, 99]])
     robot.plans.wait(lambda path: not path.poses)
     robot.clear()
     send(38, 0, [[0, 0, 0]])
-    robot.wait_for_reason("map_updates refused: .* is not inside", {"map updates refused": "1"})
+    robot.wait_for_reason(
+        "map_updates refused: .* is not inside", {"map updates refused": "1"}
+    )
     send(29, 4, [[90, 90, 90]])
     robot.plans.wait(is_passed(DOORS[0]))
     robot.clear()
@@ -121,7 +140,10 @@ def test_poses_in_other_frames_are_transformed(robot: Robot) -> None:
 
     def send_transforms() -> None:
         message = TFMessage()
-        for parent, child, x, y in (("map", "odom", 5.0, 4.0), ("odom", "base", 0.0, 0.0)):
+        for parent, child, x, y in (
+            ("map", "odom", 5.0, 4.0),
+            ("odom", "base", 0.0, 0.0),
+        ):
             of_frame = TransformStamped(child_frame_id=child)
             of_frame.header = in_frame(parent, 0.0, 0.0).header
             of_frame.transform.translation.x, of_frame.transform.translation.y = x, y

@@ -81,7 +81,9 @@ def load(slam: Slam, path: Path) -> Any:
     return answer
 
 
-def test_live_maps_beside_a_map_server(run: Any, slam: Slam, maps: dict[str, Path]) -> None:
+def test_live_maps_beside_a_map_server(
+    run: Any, slam: Slam, maps: dict[str, Path]
+) -> None:
     with run("planner_node") as planner:
         slam.publish()
         assert slam.ways() == (True, True)
@@ -89,7 +91,9 @@ def test_live_maps_beside_a_map_server(run: Any, slam: Slam, maps: dict[str, Pat
             space = slam.client.node.get_namespace()
             named = f"{space}/map has 2 publishers .{space}/client, {space}/map_server.*remap"
             planner.wait_for_log(named)
-            slam.diagnostics.wait(lambda message: "has 2 publishers" in message.status[0].message)
+            slam.diagnostics.wait(
+                lambda message: "has 2 publishers" in message.status[0].message
+            )
             for name, ways in (
                 ("free", (True, True)),
                 ("east", (True, False)),
@@ -106,7 +110,9 @@ def test_live_maps_beside_a_map_server(run: Any, slam: Slam, maps: dict[str, Pat
             assert slam.ways() == (False, True)  # the last zones stay
             server.process.returncode = 0  # as the end of `run` expects
         with run("map_server_node", yaml_filename=str(maps["free"])):
-            wait_for("the zones of the new map server", lambda: slam.ways() == (True, True))
+            wait_for(
+                "the zones of the new map server", lambda: slam.ways() == (True, True)
+            )
             slam.publish()
             assert slam.ways() == (True, True)
 
@@ -114,7 +120,9 @@ def test_live_maps_beside_a_map_server(run: Any, slam: Slam, maps: dict[str, Pat
 def test_the_planner_starts_after_the_map_server_and_live_maps(
     run: Any, slam: Slam, maps: dict[str, Path]
 ) -> None:
-    slam.client.publish("map", map_message(np.zeros(SHAPE, np.int8), GRID), LATCHED, listeners=0)
+    slam.client.publish(
+        "map", map_message(np.zeros(SHAPE, np.int8), GRID), LATCHED, listeners=0
+    )
     with (
         run("map_server_node", yaml_filename=str(maps["east"])),
         run("planner_node", require_directions=True),

@@ -39,7 +39,9 @@ def read(file: FilePath) -> dict[str, dict[str, list[Any]]]:
             batch = chunk.to_record_batch()
             for name in batch.column_names:
                 if ":" in name:  # else it is an index: a time
-                    entity.setdefault(name.split(":")[-1], []).extend(batch[name].to_pylist())
+                    entity.setdefault(name.split(":")[-1], []).extend(
+                        batch[name].to_pylist()
+                    )
     return found
 
 
@@ -63,9 +65,14 @@ def test_a_recording_holds_all(
     view = [sys.executable, live_view.__file__, "--save", str(file)]
     with running(*view, "--ros-args", "-r", "__ns:=/watched"):
         # The value first: no topic waits for another.
-        client.publish("planner/value", occupancy_message(field, 0.5, ORIGIN, HEADER), LATCHED)
+        client.publish(
+            "planner/value", occupancy_message(field, 0.5, ORIGIN, HEADER), LATCHED
+        )
         client.publish("map", message, LATCHED)
-        for topic, cells in (("plan", CELLS["plan"]), ("trainer/episode", CELLS["episode"])):
+        for topic, cells in (
+            ("plan", CELLS["plan"]),
+            ("trainer/episode", CELLS["episode"]),
+        ):
             path = path_message(*along(centres(cells, grid)), HEADER, Quaternion(w=1.0))
             client.publish(topic, path, LATCHED)
         client.publish("trainer/average_reward", Float32(data=-0.5))
@@ -75,7 +82,9 @@ def test_a_recording_holds_all(
     for name, cells in CELLS.items():
         (strip,) = found[f"map/{name}"]["strips"][-1]
         # Rows of pixels count from the top: y of a cell's centre is the map's height less y + 0.5.
-        assert np.allclose(strip, [(x + 0.5, 6 - (y + 0.5)) for x, y in cells], atol=1e-5)
+        assert np.allclose(
+            strip, [(x + 0.5, 6 - (y + 0.5)) for x, y in cells], atol=1e-5
+        )
     shades, colours = drawn(found["map/map"])[..., 0], drawn(found["map/value"])
     assert {*shades[values == 0]} == {255}
     assert {*shades[values == 100]} == {55}

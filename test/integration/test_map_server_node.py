@@ -28,7 +28,9 @@ BAD_YAML = LoadMap.Response.RESULT_INVALID_MAP_METADATA
 
 
 @pytest.fixture(scope="module")
-def map_file(tmp_path_factory: pytest.TempPathFactory, small_values: np.ndarray) -> Path:
+def map_file(
+    tmp_path_factory: pytest.TempPathFactory, small_values: np.ndarray
+) -> Path:
     path = tmp_path_factory.mktemp("maps") / "small.yaml"
     save_map(MapFile(small_values, 0.25, (-1.0, 2.0, 0.5), (0, 0), (5, 5)), path)
     return path
@@ -61,11 +63,15 @@ def served_map(client: Any, maps: Any = None) -> OccupancyGrid:
 
 
 def load_map(client: Any, url: object) -> Any:
-    return client.call(LoadMap, "map_server/load_map", LoadMap.Request(map_url=str(url)))
+    return client.call(
+        LoadMap, "map_server/load_map", LoadMap.Request(map_url=str(url))
+    )
 
 
 def values_of(message: OccupancyGrid) -> np.ndarray:
-    return np.array(message.data, dtype=np.int8).reshape(message.info.height, message.info.width)
+    return np.array(message.data, dtype=np.int8).reshape(
+        message.info.height, message.info.width
+    )
 
 
 def draws(seed: int, map_file: Path) -> Iterator[np.ndarray]:
@@ -114,7 +120,10 @@ def test_scatter_draws_by_the_seed(
         assert new.any()
         assert (values_of(message) == np.where(new, 100, small_values)).all()
         named = re.findall(r"\((\S+), (\S+)\)", said)
-        cells = {grid_from_message(message).world_to_cell(float(x), float(y)) for x, y in named}
+        cells = {
+            grid_from_message(message).world_to_cell(float(x), float(y))
+            for x, y in named
+        }
         assert cells == {(x, y) for y, x in np.argwhere(new).tolist()}
         assert re.search(rf"{len(cells)} new .*\d+ draws thrown away", said)
     maps.clear()
@@ -135,14 +144,19 @@ def test_a_failed_load_keeps_the_map(
         *((url, "", "", NO_FILE) for url in no_files),
         *((image, "", "", BAD_YAML), (bad, "(?s).*", "[1, 2", BAD_YAML)),
         *((bad, "good.pgm", name, BAD_DATA) for name in ("missing.pgm", "cut.pgm")),
-        *((bad, "good.pgm", name, BAD_YAML) for name in ("/etc/passwd", f"../{tmp_path.name}.pgm")),
+        *(
+            (bad, "good.pgm", name, BAD_YAML)
+            for name in ("/etc/passwd", f"../{tmp_path.name}.pgm")
+        ),
         # Files may have these, messages may not.
         *((bad, "resolution: .*", f"resolution: 1e{n}", BAD_YAML) for n in (-300, 300)),
     ):
         bad.write_text(re.sub(pattern, replacement, text, count=1))
         response = load_map(client, url)
         assert (response.result, len(response.map.data)) == (code, 0), url
-        server.wait_for_log(re.escape(f"cannot load {str(url)!r}, the map before it stays"))
+        server.wait_for_log(
+            re.escape(f"cannot load {str(url)!r}, the map before it stays")
+        )
         assert (values_of(served_map(client)) == small_values).all()
 
 
@@ -167,9 +181,13 @@ def test_without_a_map_the_node_lives(
     with run_node("map_server_node", parameters, namespace="/absent") as node:
         client = make_client("/absent")
         assert len(served_map(client).data) == 0
-        node.wait_for_log("cannot load 'no_such.yaml', no map is served(.|\n)*the answer is empty")
+        node.wait_for_log(
+            "cannot load 'no_such.yaml', no map is served(.|\n)*the answer is empty"
+        )
         for name in ("scatter_obstacles", "restore_map"):
-            assert "no map is loaded" in trigger(client, f"map_server/{name}", succeeds=False)
+            assert "no map is loaded" in trigger(
+                client, f"map_server/{name}", succeeds=False
+            )
         assert load_map(client, map_file).result == LoadMap.Response.RESULT_SUCCESS
         assert (values_of(served_map(client)) == small_values).all()
 
@@ -199,23 +217,37 @@ def hall_client(run_node: Any, make_client: Callable[[str], Any]) -> Iterator[An
         yield make_client("/hall")
 
 
-def test_the_directions_come_with_the_stamp_and_the_place_of_the_map(hall_client: Any) -> None:
+def test_the_directions_come_with_the_stamp_and_the_place_of_the_map(
+    hall_client: Any,
+) -> None:
     topics = "map_directions", "map"
-    directions, maps = (hall_client.subscribe(OccupancyGrid, topic, LATCHED) for topic in topics)
+    directions, maps = (
+        hall_client.subscribe(OccupancyGrid, topic, LATCHED) for topic in topics
+    )
     for _ in range(2):
         served = hall_client.call(GetMap, "map_server/map").map
         maps.wait(lambda message, served=served: message == served)
-        of_map = directions.wait(lambda message, served=served: message.header == served.header)
+        of_map = directions.wait(
+            lambda message, served=served: message.header == served.header
+        )
         assert of_map.info == served.info
         forbidden = np.frombuffer(of_map.data, np.uint8).reshape(36, 48)
-        np.testing.assert_array_equal(forbidden, read_map_file(find_map("warehouse")).forbidden)
+        np.testing.assert_array_equal(
+            forbidden, read_map_file(find_map("warehouse")).forbidden
+        )
         trigger(hall_client, "map_server/scatter_obstacles")
 
 
-def test_each_map_is_planned_on_with_its_own_directions(hall_client: Any, tmp_path: Path) -> None:
+def test_each_map_is_planned_on_with_its_own_directions(
+    hall_client: Any, tmp_path: Path
+) -> None:
     values, grid = np.zeros((3, 9), dtype=np.int8), GridMap(np.zeros((3, 9)), 0.5)
     for name, forbidden in (("east", EAST), ("west", WEST), ("free", None)):
-        full = None if forbidden is None else np.full(values.shape, forbidden, dtype=np.uint8)
+        full = (
+            None
+            if forbidden is None
+            else np.full(values.shape, forbidden, dtype=np.uint8)
+        )
         save_map(MapFile(values, 0.5, forbidden=full), tmp_path / f"{name}.yaml")
     diagnostics = hall_client.subscribe(DiagnosticArray, "/diagnostics")
     ends = pose(grid, (0, 1)), pose(grid, (8, 1))

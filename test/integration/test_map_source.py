@@ -26,7 +26,11 @@ from std_msgs.msg import Header, UInt8MultiArray
 
 from ddqn_planner import Experience, GridMap, MoveRule, Planner
 from ddqn_planner.grid import inflate
-from ddqn_planner.nodes.conversions import bytes_message, grid_from_message, occupancy_message
+from ddqn_planner.nodes.conversions import (
+    bytes_message,
+    grid_from_message,
+    occupancy_message,
+)
 from ddqn_planner.nodes.map_source import (
     BODY_PARAMETERS,
     MAP_PARAMETERS,
@@ -117,14 +121,22 @@ def published(node: BaseNode) -> Iterator[None]:
     wait_for("publisher", lambda: node.count_publishers("map_directions") > 0)
     yield
     node.destroy_publisher(publisher)
-    wait_for("end of the publisher", lambda: node.count_publishers("map_directions") == 0)
+    wait_for(
+        "end of the publisher", lambda: node.count_publishers("map_directions") == 0
+    )
 
 
 def map_of(
-    stamp: int, frame: str = "map", x: float = 0.0, resolution: float = 0.5, yaw: float = 0.0
+    stamp: int,
+    frame: str = "map",
+    x: float = 0.0,
+    resolution: float = 0.5,
+    yaw: float = 0.0,
 ) -> Any:
     header = Header(frame_id=frame, stamp=Time(sec=stamp))
-    return occupancy_message(np.zeros((4, 5), np.int8), resolution, (x, 0.0, yaw), header)
+    return occupancy_message(
+        np.zeros((4, 5), np.int8), resolution, (x, 0.0, yaw), header
+    )
 
 
 def directions_of(stamp: int, value: int | None = EAST) -> Any:
@@ -136,21 +148,33 @@ def update(**fields: Any) -> SimpleNamespace:
     """Return an update of 2 x 3 cells from (1, 0), or with other fields."""
     usual = {
         "header": Header(frame_id="map", stamp=Time(sec=6)),
-        **{"x": 1, "y": 0, "width": 2, "height": 3, "data": array.array("b", range(40, 46))},
+        **{
+            "x": 1,
+            "y": 0,
+            "width": 2,
+            "height": 3,
+            "data": array.array("b", range(40, 46)),
+        },
     }
     return SimpleNamespace(**{**usual, **fields})
 
 
 def unknown_of(grid: GridMap) -> Any:
     """Return which cells are unknown, (H, W) bool."""
-    return np.zeros(grid.occupancy.shape, np.bool_) if grid.unknown is None else grid.unknown
+    return (
+        np.zeros(grid.occupancy.shape, np.bool_)
+        if grid.unknown is None
+        else grid.unknown
+    )
 
 
 PLACES, SIZES = st.integers(-8, 8), st.integers(0, 7) | st.just(2**32 - 1)
 
 
 @given(PLACES, PLACES, SIZES, SIZES, st.integers(-1, 1))
-def test_an_update_is_taken_if_fit(x: int, y: int, width: int, height: int, surplus: int) -> None:
+def test_an_update_is_taken_if_fit(
+    x: int, y: int, width: int, height: int, surplus: int
+) -> None:
     data = array.array("b", range(max(min(width * height, 20) + surplus, 0)))
     fits = width * height > 0 and 0 <= x <= 5 - width and 0 <= y <= 4 - height
     sent = update(x=x, y=y, width=width, height=height, data=data)
@@ -158,7 +182,9 @@ def test_an_update_is_taken_if_fit(x: int, y: int, width: int, height: int, surp
         expected = np.reshape(data, (height, width))
         np.testing.assert_array_equal(updated_values(map_of(5), sent), expected)
     else:
-        reason = "is not inside the map of 5 x 4" if not fits else f"need {width * height}"
+        reason = (
+            "is not inside the map of 5 x 4" if not fits else f"need {width * height}"
+        )
         with pytest.raises(ValueError, match=reason):
             updated_values(map_of(5), sent)
 
@@ -168,11 +194,16 @@ def test_an_update_has_the_maps_frame_and_its_stamp_or_a_later_one_or_none() -> 
         sent = update(header=Header(frame_id="map", stamp=stamp))
         assert updated_values(map_of(5), sent).shape == (3, 2)
     for frame, stamp, reason in (
-        *(("odom", Time(sec=6), "'odom', the map's is 'map'"), ("", Time(sec=6), "frame is ''")),
+        *(
+            ("odom", Time(sec=6), "'odom', the map's is 'map'"),
+            ("", Time(sec=6), "frame is ''"),
+        ),
         ("map", Time(sec=4, nanosec=999), "later than the update"),
     ):
         with pytest.raises(ValueError, match=reason):
-            updated_values(map_of(5), update(header=Header(frame_id=frame, stamp=stamp)))
+            updated_values(
+                map_of(5), update(header=Header(frame_id=frame, stamp=stamp))
+            )
 
 
 RULES: list[dict[str, Any]] = [
@@ -184,7 +215,10 @@ RULES: list[dict[str, Any]] = [
 
 @pytest.mark.parametrize("parameters", RULES)
 def test_after_updates_the_map_is_as_if_it_came_whole(
-    node: BaseNode, source: Source, set_parameters: SetParameters, parameters: dict[str, Any]
+    node: BaseNode,
+    source: Source,
+    set_parameters: SetParameters,
+    parameters: dict[str, Any],
 ) -> None:
     set_parameters(**parameters)
     random, whole = np.random.default_rng(0), Source(node)
@@ -211,7 +245,9 @@ def test_after_updates_the_map_is_as_if_it_came_whole(
             np.testing.assert_array_equal(unknown_of(found), unknown_of(expected))
         assert before is None or found.patches_since(before)  # only where cells changed
         assert source.check() == header
-        set_parameters(allow_unknown=parameters.get("allow_unknown", False))  # it reads anew
+        set_parameters(
+            allow_unknown=parameters.get("allow_unknown", False)
+        )  # it reads anew
         assert source.grid().same_cells(expected)
     others = ("map", (0.5, (1.0, 2.0, 0.3))), ("map", (1.0, place[1])), ("odom", place)
     for frame, moved in others:
@@ -272,7 +308,9 @@ def test_a_costmap_is_planned_on_for_map_timeout_after_its_last_message(
     assert after(1e6) == ""  # a map
     set_parameters(map_type="costmap")
     assert after(0) == "MAP_TIMEOUT"
-    assert "nothing came on /map for longer than map_timeout, 5 s; start" in source.missing
+    assert (
+        "nothing came on /map for longer than map_timeout, 5 s; start" in source.missing
+    )
     for take, message in ((source._take, map_of(5)), (source._take_update, update())):
         take(message)
         assert [after(0), after(4.9), after(0.2)] == ["", "", "MAP_TIMEOUT"]
@@ -334,7 +372,9 @@ def test_the_map_of_another_map_server_waits_for_its_directions(
         assert not source.report.refused
     finally:
         node.destroy_publisher(publisher)
-        wait_for("end of the publisher", lambda: node.count_publishers("map_directions") == 0)
+        wait_for(
+            "end of the publisher", lambda: node.count_publishers("map_directions") == 0
+        )
     assert source.on_map(3) == (3, WEST)  # those of a map server that ended stay
 
 
@@ -346,7 +386,10 @@ def test_directions_hold_where_they_overlap_a_map_whatever_the_stamps(
     source.on_directions(1)
     assert source.on_map(7, x=1.0) == (7, [EAST] * 3 + [0] * 2)
     assert source.on_map(8, x=-1.5) == (8, [0] * 3 + [EAST] * 2)
-    assert source.on_map(8, x=-1.3) == (8, [0] * 3 + [EAST] * 2)  # by the cells' centres
+    assert source.on_map(8, x=-1.3) == (
+        8,
+        [0] * 3 + [EAST] * 2,
+    )  # by the cells' centres
     assert source.on_map(9, resolution=0.25) == (9, EAST)
     source._take(map_of(9, resolution=1.0))
     forbidden: Any = source.grid().forbidden
@@ -355,13 +398,20 @@ def test_directions_hold_where_they_overlap_a_map_whatever_the_stamps(
         assert source.on_map(9, x=x) == (9, None)
     source.on_map(10)
     source.heard = 0
-    for stamp, value in ((3, WEST), (20, None), (4, WEST), (21, 0)):  # also older than the map
+    for stamp, value in (
+        (3, WEST),
+        (20, None),
+        (4, WEST),
+        (21, 0),
+    ):  # also older than the map
         assert source.on_directions(stamp, value) == (10, value or None)
     assert source.heard == 4
     assert not source.report.refused
 
 
-def test_directions_are_required_once(source: Source, set_parameters: SetParameters) -> None:
+def test_directions_are_required_once(
+    source: Source, set_parameters: SetParameters
+) -> None:
     set_parameters(require_directions=True)
     assert source.on_map(1) == NOTHING
     assert "or set require_directions to false" in source.missing
@@ -373,7 +423,10 @@ def test_directions_are_required_once(source: Source, set_parameters: SetParamet
     assert source.on_map(3) == (3, EAST)
 
 
-OTHERS = [({"frame": "odom"}, "frame is 'map', the map's is 'odom'"), ({"yaw": 0.1}, "one yaw")]
+OTHERS = [
+    ({"frame": "odom"}, "frame is 'map', the map's is 'odom'"),
+    ({"yaw": 0.1}, "one yaw"),
+]
 
 
 def test_why_a_map_waits_for_directions_is_logged_once(
@@ -383,7 +436,9 @@ def test_why_a_map_waits_for_directions_is_logged_once(
     clock = SimpleNamespace(monotonic=lambda: now[0])
     monkeypatch.setattr("ddqn_planner.nodes.map_source.time", clock)
     logged = list[str]()
-    logger = SimpleNamespace(warning=logged.append, error=logged.append, info=lambda _: None)
+    logger = SimpleNamespace(
+        warning=logged.append, error=logged.append, info=lambda _: None
+    )
     monkeypatch.setattr(source._node, "get_logger", lambda: logger)
 
     def reasons_for(*changes: dict[str, Any]) -> list[str]:
@@ -403,7 +458,10 @@ def test_why_a_map_waits_for_directions_is_logged_once(
     assert source.on_directions(1) == (15, EAST)
     (frames,) = reasons_for({"frame": "odom"})
     assert frames.startswith("map refused: ")
-    assert "their frame is 'map', the map's is 'odom'; give both one frame, or set" in frames
+    assert (
+        "their frame is 'map', the map's is 'odom'; give both one frame, or set"
+        in frames
+    )
     (turned,) = reasons_for({"yaw": 0.1}, {"yaw": 0.2})
     assert "give both one yaw, or set require_directions to false" in turned
     assert source.on_map(20) == (20, EAST)
@@ -484,7 +542,9 @@ def test_a_worker_leaves_out_what_was_given_up_before_its_turn(node: BaseNode) -
 
 GRID = GridMap(np.zeros((40, 120), dtype=np.bool_), resolution=0.25)
 PLACE = GRID.resolution, GRID.origin
-MESSAGE = occupancy_message(np.zeros((40, 120), np.int8), *PLACE, Header(frame_id="map"))
+MESSAGE = occupancy_message(
+    np.zeros((40, 120), np.int8), *PLACE, Header(frame_id="map")
+)
 
 
 def message_of(experience: Experience) -> UInt8MultiArray:
@@ -506,7 +566,9 @@ def times(source: Source, driven: UInt8MultiArray) -> ExpectedTimes:
     return source.times
 
 
-def test_drives_are_planned_with_at_once(source: Source, driven: UInt8MultiArray) -> None:
+def test_drives_are_planned_with_at_once(
+    source: Source, driven: UInt8MultiArray
+) -> None:
     data = bytes(driven.data)
     expected: Any = Experience.from_bytes(data).apply(GRID).slowness
     source._take(MESSAGE)
@@ -529,7 +591,10 @@ def test_drives_are_planned_with_at_once(source: Source, driven: UInt8MultiArray
     for bad, reason in (
         (bytes_message("experience", data[:-9]), "no experience"),
         (bytes_message("model", data), "label 'ddqn_planner model 1"),
-        (UInt8MultiArray(layout=message_of(Experience(0.5)).layout, data=data), "sha256"),
+        (
+            UInt8MultiArray(layout=message_of(Experience(0.5)).layout, data=data),
+            "sha256",
+        ),
         (UInt8MultiArray(data=data), "label ''"),
     ):
         finished(source.times.on_sent(bad))
@@ -542,7 +607,10 @@ def test_drives_are_planned_with_at_once(source: Source, driven: UInt8MultiArray
 
 
 def test_a_file_is_planned_with_or_refused_or_none_is_set(
-    source: Source, driven: UInt8MultiArray, set_parameters: SetParameters, tmp_path: Path
+    source: Source,
+    driven: UInt8MultiArray,
+    set_parameters: SetParameters,
+    tmp_path: Path,
 ) -> None:
     file = tmp_path / "experience.npz"
     file.write_bytes(bytes(driven.data))
@@ -593,7 +661,9 @@ def test_what_no_memory_was_left_for_is_refused_or_tried_again(
         source._take(changed)
         patch.setattr(source.times, "load", fail)
         finished(source.times.on_sent())
-        assert source.report.refused == dict.fromkeys(("map", "experience"), "MemoryError()")
+        assert source.report.refused == dict.fromkeys(
+            ("map", "experience"), "MemoryError()"
+        )
     assert source.used() == (1, None)
     source._take(changed)
     assert source.used() == (2, None)
@@ -621,7 +691,9 @@ def test_the_expected_time_is_told_as_soon_as_the_worker_has_it(
     source: Source, driven: UInt8MultiArray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     threads, gate, told = set[int](), threading.Event(), {"expected time (s)": "1.0"}
-    monkeypatch.setattr(source.report, "_on_change", lambda: threads.add(threading.get_ident()))
+    monkeypatch.setattr(
+        source.report, "_on_change", lambda: threads.add(threading.get_ident())
+    )
     monkeypatch.setattr(source.times, "describe", lambda _: gate.wait() and told)
     outcome = Outcome("SUCCEEDED", "a path")
     assert source.times.told(outcome) == {}  # without drives

@@ -14,7 +14,15 @@ import pytest
 import rclpy
 from client import TIMEOUT, map_message, pose, wait_for
 from geometry_msgs.msg import PoseStamped
-from integration.robot import GOAL, NUMBERS, START, Robot, changed, check_path, points_of
+from integration.robot import (
+    GOAL,
+    NUMBERS,
+    START,
+    Robot,
+    changed,
+    check_path,
+    points_of,
+)
 from nav_msgs.msg import Path as PathMessage
 from rclpy.action.client import ActionClient
 from rclpy.action.server import CancelResponse, GoalResponse
@@ -39,7 +47,13 @@ NO_PATH = Outcome("NO_PATH", "no path leads there")
 
 ENDS = "START_OUTSIDE_MAP", "GOAL_OUTSIDE_MAP", "START_OCCUPIED", "GOAL_OCCUPIED"
 CODES = {
-    "UNKNOWN": ["FAILED", "NO_MODEL", "NOT_ACTIVE", "MAP_SIZE_UNSUPPORTED", "PREEMPTED"],
+    "UNKNOWN": [
+        "FAILED",
+        "NO_MODEL",
+        "NOT_ACTIVE",
+        "MAP_SIZE_UNSUPPORTED",
+        "PREEMPTED",
+    ],
     "INVALID_PLANNER": ["INVALID_PLANNER"],
     "TF_ERROR": ["NO_START", "TF_ERROR", "INVALID_START", "INVALID_GOAL"],
     **{name: [name] for name in ENDS},
@@ -64,13 +78,20 @@ for number, code in enumerate(CODES, 300):
 def test_codes_are_nav2s(name: str) -> None:
     result: Any = Result
     if name:
-        actions = pytest.importorskip("nav2_msgs.action", reason="nav2_msgs is not on PyPI")
+        actions = pytest.importorskip(
+            "nav2_msgs.action", reason="nav2_msgs is not on PyPI"
+        )
         result = getattr(actions, name).Result
     for number, (code, statuses) in enumerate(CODES.items()):
         if hasattr(result, code):
             assert getattr(result, code) == result.UNKNOWN + number
-            assert {error_code(status, result) for status in statuses} == {result.UNKNOWN + number}
-    assert [error_code(status, result) for status in ("SUCCEEDED", "CANCELED")] == [0, 0]
+            assert {error_code(status, result) for status in statuses} == {
+                result.UNKNOWN + number
+            }
+    assert [error_code(status, result) for status in ("SUCCEEDED", "CANCELED")] == [
+        0,
+        0,
+    ]
 
 
 def test_a_request_has_a_goal_and_names_the_planner_or_none() -> None:
@@ -91,7 +112,9 @@ class Handle:
     def __init__(self, goals: int | None = None, use_start: bool = True) -> None:
         start, goal = (PoseStamped() for _ in range(2))
         named = {"goal": goal} if goals is None else {"goals": [goal] * goals}
-        self.request = SimpleNamespace(start=start, use_start=use_start, planner_id="", **named)
+        self.request = SimpleNamespace(
+            start=start, use_start=use_start, planner_id="", **named
+        )
         self.state = "accepted"
 
     @property
@@ -143,7 +166,9 @@ class Server:
         async def planning() -> Any:
             return await self.planned
 
-        return PathMessage(), await unless(planning(), lambda: self.refusal or given_up())
+        return PathMessage(), await unless(
+            planning(), lambda: self.refusal or given_up()
+        )
 
     def begin(self, handle: Handle) -> Coroutine[Any, Any, Any]:
         """Accept a goal, and let it wait for its plan."""
@@ -163,7 +188,9 @@ def end(execution: Coroutine[Any, Any, Any]) -> Any:
 @pytest.mark.parametrize(
     ("outcome", "state", "code"), [(FOUND, "succeeded", 0), (NO_PATH, "aborted", 308)]
 )
-def test_a_goal_ends_with_the_outcome_of_its_plan(outcome: Outcome, state: str, code: int) -> None:
+def test_a_goal_ends_with_the_outcome_of_its_plan(
+    outcome: Outcome, state: str, code: int
+) -> None:
     first, second = Handle(use_start=False), Handle(goals=3)
     one, server = Server(), Server(ThroughPoses)
     one.begin(first).close()
@@ -191,15 +218,25 @@ def test_the_newest_goal_preempts_the_one_under_way() -> None:
     assert second.state == "succeeded"
 
 
-def test_a_goal_is_canceled_before_it_is_planned_meanwhile_or_once_it_is_preempted() -> None:
+def test_a_goal_is_canceled_before_it_is_planned_meanwhile_or_once_it_is_preempted() -> (
+    None
+):
     server, early, first, second = Server(), *(Handle() for _ in range(3))
     server.action.begin(early)
     early.state = "canceling"
-    executions = [server.action.execute(early), server.begin(first), server.begin(second)]
+    executions = [
+        server.action.execute(early),
+        server.begin(first),
+        server.begin(second),
+    ]
     first.state = second.state = "canceling"
     for handle, execution in zip((early, first, second), executions, strict=True):
         result = end(execution)
-        assert (handle.state, result.error_code, result.error_msg) == ("canceled", 0, "")
+        assert (handle.state, result.error_code, result.error_msg) == (
+            "canceled",
+            0,
+            "",
+        )
 
 
 class Goals(SimpleNamespace):
@@ -251,7 +288,9 @@ def test_a_path_leads_through_via_points_to_its_goal() -> None:
 
 
 @pytest.mark.parametrize("kind", [ThroughPoses, LyricalThroughPoses])
-def test_a_partial_path_says_which_goal_it_reaches_if_the_message_can(kind: Any) -> None:
+def test_a_partial_path_says_which_goal_it_reaches_if_the_message_can(
+    kind: Any,
+) -> None:
     partial_path = replace(FOUND, reason="goal 3 of 4: no path", last_reached=1)
     for outcome, last_reached, error_msg in (
         (partial_path, 1, "goal 3 of 4: no path"),
@@ -299,9 +338,12 @@ class Other:
 
 
 @pytest.mark.parametrize(
-    ("status", "state"), [(4, "succeeded"), (5, "aborted"), (6, "aborted"), (None, "aborted")]
+    ("status", "state"),
+    [(4, "succeeded"), (5, "aborted"), (6, "aborted"), (None, "aborted")],
 )
-def test_the_answer_of_another_planner_is_returned_as_it_is(status: Any, state: str) -> None:
+def test_the_answer_of_another_planner_is_returned_as_it_is(
+    status: Any, state: str
+) -> None:
     other, handle, ours = Other(), Handle(), Handle()
     server = Server(ask_other=other.ask, is_ours=lambda name: name in ("", "ddqn"))
     handle.request.planner_id, ours.request.planner_id = "GridBased", "ddqn"
@@ -336,7 +378,9 @@ def test_a_newer_goal_preempts_that_of_another_planner_there_or_here() -> None:
         assert first.state == "aborted"
 
 
-def test_goals_are_rejected_while_the_node_is_not_active_and_aborted_when_it_stops() -> None:
+def test_goals_are_rejected_while_the_node_is_not_active_and_aborted_when_it_stops() -> (
+    None
+):
     server, handle = Server(), Handle()
     execution = server.begin(handle)
     server.refusal = NOT_ACTIVE
@@ -345,26 +389,46 @@ def test_goals_are_rejected_while_the_node_is_not_active_and_aborted_when_it_sto
     assert server.action.accept(handle.request) is GoalResponse.REJECT
 
 
-def test_the_services_of_actions_have_queues_as_others(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_services_of_actions_have_queues_as_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     kind = ToPose
-    types = {"ComputePathThroughPoses": kind, "ComputePathToPose": kind, "IsPathValid": None}
+    types = {
+        "ComputePathThroughPoses": kind,
+        "ComputePathToPose": kind,
+        "IsPathValid": None,
+    }
     for module in ("nav2_msgs", "nav2_msgs.action", "nav2_msgs.srv"):
         monkeypatch.setitem(sys.modules, module, SimpleNamespace(**types))
     made: list[dict[str, Any]] = []
-    monkeypatch.setattr(nav2, "ActionServer", lambda *_, **options: made.append(options))
+    monkeypatch.setattr(
+        nav2, "ActionServer", lambda *_, **options: made.append(options)
+    )
     node = SimpleNamespace(create_service=lambda *given, **named: None)
-    planning: Any = SimpleNamespace(refusal=bool, plan=None, is_ours=bool, on_is_path_valid=print)
+    planning: Any = SimpleNamespace(
+        refusal=bool, plan=None, is_ours=bool, on_is_path_valid=print
+    )
     nav2.serve_nav2(cast("Any", node), planning)
-    services = [f"{which}_service_qos_profile" for which in ("goal", "cancel", "result")]
+    services = [
+        f"{which}_service_qos_profile" for which in ("goal", "cancel", "result")
+    ]
     depths = [options[service].depth for options in made for service in services]
     assert depths == 6 * [SERVICE_QUALITY.depth]
-    assert all(options["cancel_callback"](None) is CancelResponse.ACCEPT for options in made)
+    assert all(
+        options["cancel_callback"](None) is CancelResponse.ACCEPT for options in made
+    )
 
 
 def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() -> None:
     """The node is asked as its actions ask it, which need nav2_msgs."""
-    rclpy.init(args=["--ros-args", "-p", "use_map_costs:=true", "-p", "field_cache_bytes:=0"])
-    node, executor, values = PlannerNode(), SingleThreadedExecutor(), np.zeros((11, 30), np.int8)
+    rclpy.init(
+        args=["--ros-args", "-p", "use_map_costs:=true", "-p", "field_cache_bytes:=0"]
+    )
+    node, executor, values = (
+        PlannerNode(),
+        SingleThreadedExecutor(),
+        np.zeros((11, 30), np.int8),
+    )
     try:
         executor.add_node(node)
         values[3:8, 4:26] = 100
@@ -385,21 +449,39 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
             path, outcome = run(node._plan_for_action(task, lambda: None))
             request, validity = SimpleNamespace(path=path), SimpleNamespace()
             assert run(node._on_is_path_valid(request, validity)).is_valid
-            return max(stamped.pose.position.y for stamped in path.poses) > 8, outcome.reason
+            return max(
+                stamped.pose.position.y for stamped in path.poses
+            ) > 8, outcome.reason
 
         below, above = slice(0, 3), slice(8, 11)
-        above_kept = [(plan(below, 0.05)), plan(above, 0.05), plan(above, 0.0), plan(below, 0.05)]
-        assert [leads_above for leads_above, _ in above_kept] == [True, True, False, False]
+        above_kept = [
+            (plan(below, 0.05)),
+            plan(above, 0.05),
+            plan(above, 0.0),
+            plan(below, 0.05),
+        ]
+        assert [leads_above for leads_above, _ in above_kept] == [
+            True,
+            True,
+            False,
+            False,
+        ]
         assert "kept: its cost is +" in above_kept[1][1]
         assert node._model.planner is not None
-        assert node._model.planner.fields.nbytes == 0  # what the node was started with holds
+        assert (
+            node._model.planner.fields.nbytes == 0
+        )  # what the node was started with holds
 
         def fail(*_: Any) -> GridMap:
             raise MemoryError
 
         # A path of another form is not kept.
         node.set_parameters([Parameter("switch_threshold", value=1.0)])
-        for form, is_kept in (("straight", True), ("line_of_sight", True), ("none", False)):
+        for form, is_kept in (
+            ("straight", True),
+            ("line_of_sight", True),
+            ("none", False),
+        ):
             node.set_parameters([Parameter("path_simplification", value=form)])
             _, outcome = run(node._plan_for_action(task, lambda: None))
             assert (outcome.plan.extra_cost is not None) == is_kept
@@ -417,13 +499,18 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
 def test_a_path_leads_through_its_goals_in_order_or_as_far_as_it_can() -> None:
     """The node is asked as its actions ask it, which need nav2_msgs."""
     rclpy.init()
-    node, executor, values = PlannerNode(), SingleThreadedExecutor(), np.zeros((10, 20), np.int8)
+    node, executor, values = (
+        PlannerNode(),
+        SingleThreadedExecutor(),
+        np.zeros((10, 20), np.int8),
+    )
     try:
         executor.add_node(node)
         values[:, 12] = 100  # no path leads to the right part
         grid = GridMap(values > 0)
         start, low, high, left, cut_off, blocked = (
-            pose(grid, cell) for cell in ((0, 0), (9, 1), (9, 8), (1, 8), (15, 5), (12, 5))
+            pose(grid, cell)
+            for cell in ((0, 0), (9, 1), (9, 8), (1, 8), (15, 5), (12, 5))
         )
 
         def plan(*goals: PoseStamped, via: bool = False) -> tuple[PathMessage, Outcome]:
@@ -468,7 +555,10 @@ def test_a_path_leads_through_its_goals_in_order_or_as_far_as_it_can() -> None:
             # Via-points and the one goal are one path, whole or none.
             for goals, reason in (
                 ((high, blocked, left), "via-point 2 of 2: the goal is occupied"),
-                ((high, low, cut_off), "the goal: no path leads from the start to the goal"),
+                (
+                    (high, low, cut_off),
+                    "the goal: no path leads from the start to the goal",
+                ),
             ):
                 path, outcome = plan(*goals, via=True)
                 assert path.poses == []
@@ -492,7 +582,10 @@ class Navigator:
         self.actions = pytest.importorskip("nav2_msgs.action", reason=REASON)
         self.services = pytest.importorskip("nav2_msgs.srv", reason=REASON)
         self.robot, node = robot, robot.client.node
-        to_pose, through = self.actions.ComputePathToPose, self.actions.ComputePathThroughPoses
+        to_pose, through = (
+            self.actions.ComputePathToPose,
+            self.actions.ComputePathThroughPoses,
+        )
         self.pose = ActionClient(node, to_pose, "compute_path_to_pose")
         self.poses = ActionClient(node, through, "compute_path_through_poses")
         self.validity = node.create_client(self.services.IsPathValid, "is_path_valid")
@@ -552,7 +645,9 @@ def test_a_path_to_a_pose(navigator: Navigator) -> None:
     assert 0 < result.planning_time.sec + result.planning_time.nanosec / 1e9 < 60
     expected = robot.get_plan(robot.pose(START), robot.pose(GOAL))
     assert points_of(result.path) == points_of(expected)
-    published = robot.plans.wait(lambda path: path.header.stamp == result.path.header.stamp)
+    published = robot.plans.wait(
+        lambda path: path.header.stamp == result.path.header.stamp
+    )
     assert published == result.path
     known_start = navigator.plan(robot.pose(GOAL), planner_id="GridBased").result
     assert points_of(known_start.path) == points_of(expected)
@@ -577,11 +672,16 @@ def test_what_newer_releases_ask_for(navigator: Navigator) -> None:
     if hasattr(actions.ComputePathToPose.Goal, "viapoints"):
         answer = navigator.plan(goal, viapoints=[robot.pose((0, 5)), corner], **fields)
         assert answer.status == SUCCEEDED
-        cells = [robot.grid.world_to_cell(*point) for point in points_of(answer.result.path)]
+        cells = [
+            robot.grid.world_to_cell(*point) for point in points_of(answer.result.path)
+        ]
         assert 0 < cells.index((0, 5)) < cells.index((5, 0)) < cells.index(GOAL)
     kind = actions.ComputePathThroughPoses.Goal
     if kind.get_fields_and_field_types()["goals"] == "nav_msgs/Goals":
-        header, goals = goal.header, [PoseStamped(pose=each.pose) for each in (corner, goal)]
+        header, goals = (
+            goal.header,
+            [PoseStamped(pose=each.pose) for each in (corner, goal)],
+        )
         request = kind(goals=nav_msgs.msg.Goals(header=header, goals=goals), **fields)
         handle = done(navigator.ask(navigator.poses.send_goal_async, request))
         assert done(navigator.ask(handle.get_result_async)).status == SUCCEEDED
@@ -597,13 +697,18 @@ def test_what_newer_releases_ask_for(navigator: Navigator) -> None:
 
 def test_each_cause_has_its_code(navigator: Navigator) -> None:
     robot = navigator.robot
-    start, goal, blocked, outside = (robot.pose(at) for at in (START, GOAL, (1, 1), (99, 0)))
+    start, goal, blocked, outside = (
+        robot.pose(at) for at in (START, GOAL, (1, 1), (99, 0))
+    )
     other_frame = changed(robot.pose(GOAL), "header.frame_id", "no_such_frame")
     robot.set(start_clearing_radius=0.0)
     bad = (outside, goal), (start, outside), (blocked, goal), (start, blocked)
     for name, ends, planner_id in (
         *((name, ends, "") for name, ends in zip(ENDS, bad, strict=True)),
-        *(("TF_ERROR", ends, "") for ends in ((start, other_frame), (other_frame, goal))),
+        *(
+            ("TF_ERROR", ends, "")
+            for ends in ((start, other_frame), (other_frame, goal))
+        ),
         ("INVALID_PLANNER", (start, goal), "Smac"),
     ):
         fields = {"start": ends[0], "use_start": True, "planner_id": planner_id}
@@ -619,7 +724,9 @@ def test_each_cause_has_its_code(navigator: Navigator) -> None:
     robot.set_map(robot.map_with(np.s_[:, 3], 100))
     second = navigator.plan([robot.pose((0, 5)), goal], **fields).result
     assert second.error_code == 308
-    assert second.error_msg.startswith("goal 2 of 2: no path leads from the start to the goal")
+    assert second.error_msg.startswith(
+        "goal 2 of 2: no path leads from the start to the goal"
+    )
     robot.set(planner_id="GridBased")
 
 
@@ -649,7 +756,9 @@ def test_a_path_is_valid_while_it_is_free(navigator: Navigator) -> None:
     assert not is_valid(path)
 
 
-def test_waiting_goals_are_canceled_preempted_stopped(run_waiting: Any, load_gate: Path) -> None:
+def test_waiting_goals_are_canceled_preempted_stopped(
+    run_waiting: Any, load_gate: Path
+) -> None:
     pytest.importorskip("nav2_msgs.action", reason=REASON)
     # Plans wait for the planner's model, as they wait for a field.
     with run_waiting("/waiting") as robot:

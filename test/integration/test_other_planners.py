@@ -16,7 +16,11 @@ from nav_msgs.msg import Path
 from rclpy.action.server import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.executors import (
+    ExternalShutdownException,
+    MultiThreadedExecutor,
+    SingleThreadedExecutor,
+)
 from unique_identifier_msgs.msg import UUID
 
 from ddqn_planner.nodes import nav2, other_planners
@@ -32,7 +36,9 @@ REJECT, SUCCEED, ABORT, WAIT = range(4)
 class Server:
     """An action server in a context of its own, which can end at any time."""
 
-    def __init__(self, kind: Any, name: str, answer: Callable[[Any], Any], **options: Any) -> None:
+    def __init__(
+        self, kind: Any, name: str, answer: Callable[[Any], Any], **options: Any
+    ) -> None:
         self._context = Context()
         self._context.init(args=[])
         self.node = rclpy.create_node("planner_server", context=self._context)
@@ -63,7 +69,9 @@ class Fibonacci:
     """A server of sequences, and whoever asks it as the planner does."""
 
     def __init__(self, name: str) -> None:
-        self.kind = pytest.importorskip("test_msgs.action", reason="test_msgs is missing").Fibonacci
+        self.kind = pytest.importorskip(
+            "test_msgs.action", reason="test_msgs is missing"
+        ).Fibonacci
         self.name, self.canceled = name, threading.Event()
         self.goals: list[Any] = []
         self.servers: list[Server] = []
@@ -102,7 +110,9 @@ class Fibonacci:
         """Return the future of an answer."""
         goal, goal_id = self.kind.Goal(order=order), UUID(uuid=[number] * 16)
         return self.executor.create_task(
-            self.others.ask("GridBased", goal, goal_id, lambda: self.outcome, lambda: is_kept)
+            self.others.ask(
+                "GridBased", goal, goal_id, lambda: self.outcome, lambda: is_kept
+            )
         )
 
     def answer(self, future: Any) -> Any:
@@ -139,12 +149,20 @@ def test_an_answer_comes_back_with_its_state(fibonacci: Fibonacci) -> None:
     asking = fibonacci.ask(SUCCEED)  # it waits until the server is discovered
     fibonacci.serve()
     answer = fibonacci.answer(asking)
-    assert (answer.status, [*answer.result.sequence]) == (GoalStatus.STATUS_SUCCEEDED, [SUCCEED, 7])
+    assert (answer.status, [*answer.result.sequence]) == (
+        GoalStatus.STATUS_SUCCEEDED,
+        [SUCCEED, 7],
+    )
     answer = fibonacci.answer(fibonacci.ask(ABORT, 1))
-    assert (answer.status, [*answer.result.sequence]) == (GoalStatus.STATUS_ABORTED, [ABORT, 7])
+    assert (answer.status, [*answer.result.sequence]) == (
+        GoalStatus.STATUS_ABORTED,
+        [ABORT, 7],
+    )
     refused = fibonacci.answer(fibonacci.ask(REJECT, 2))
     assert refused.status == "INVALID_PLANNER"
-    assert refused.reason.startswith(f"the planner 'GridBased' was rejected by {fibonacci.name}; ")
+    assert refused.reason.startswith(
+        f"the planner 'GridBased' was rejected by {fibonacci.name}; "
+    )
     assert [goal.order for goal in fibonacci.goals] == [SUCCEED, ABORT, REJECT]
 
 
@@ -154,15 +172,22 @@ def test_without_a_server_the_answer_is_said_soon(
     monkeypatch.setattr(other_planners, "SERVER_WAIT", 0.1)
     outcome = fibonacci.answer(fibonacci.ask(SUCCEED))
     assert outcome.status == "INVALID_PLANNER"
-    assert f"has no server at {fibonacci.name}; start Nav2's planner_server" in outcome.reason
+    assert (
+        f"has no server at {fibonacci.name}; start Nav2's planner_server"
+        in outcome.reason
+    )
 
 
-def test_what_is_given_up_is_canceled_unless_a_newer_goal_preempts_it(fibonacci: Fibonacci) -> None:
+def test_what_is_given_up_is_canceled_unless_a_newer_goal_preempts_it(
+    fibonacci: Fibonacci,
+) -> None:
     server = fibonacci.serve()
     for number, is_kept in enumerate((False, True)):
         asking = fibonacci.ask(WAIT, number, is_kept)
         fibonacci.spin_until(lambda number=number: len(fibonacci.goals) == number + 1)
-        others = fibonacci.answer(fibonacci.ask(SUCCEED, 99 - number))  # it blocks no other
+        others = fibonacci.answer(
+            fibonacci.ask(SUCCEED, 99 - number)
+        )  # it blocks no other
         assert others.status == GoalStatus.STATUS_SUCCEEDED
         fibonacci.goals.pop()
         assert not asking.done()
@@ -176,13 +201,18 @@ def test_what_is_given_up_is_canceled_unless_a_newer_goal_preempts_it(fibonacci:
     server.stop()
 
 
-def test_what_is_given_up_before_it_is_accepted_is_canceled(fibonacci: Fibonacci) -> None:
+def test_what_is_given_up_before_it_is_accepted_is_canceled(
+    fibonacci: Fibonacci,
+) -> None:
     asking = fibonacci.ask(WAIT)
     fibonacci.outcome = nav2.PREEMPTED
     assert fibonacci.answer(asking) is nav2.PREEMPTED  # there is no server yet
     fibonacci.outcome = None
     fibonacci.serve()
-    assert fibonacci.answer(fibonacci.ask(SUCCEED, 1)).status == GoalStatus.STATUS_SUCCEEDED
+    assert (
+        fibonacci.answer(fibonacci.ask(SUCCEED, 1)).status
+        == GoalStatus.STATUS_SUCCEEDED
+    )
 
     def given_up() -> Outcome | None:
         return nav2.PREEMPTED if fibonacci.goals[1:] else None
@@ -204,14 +234,21 @@ def test_a_server_that_ends_is_said_and_the_next_one_is_asked(
         assert not asking.done()
         if is_replaced:
             fibonacci.serve()
-            fibonacci.spin_until(lambda: fibonacci.node.count_publishers(status(fibonacci)) == 2)
+            fibonacci.spin_until(
+                lambda: fibonacci.node.count_publishers(status(fibonacci)) == 2
+            )
         server.stop()
         outcome = fibonacci.answer(asking)
         assert outcome.status == "PLANNER_LOST"
-        assert outcome.reason == "the planner 'GridBased' ended before it answered; ask again"
+        assert (
+            outcome.reason
+            == "the planner 'GridBased' ended before it answered; ask again"
+        )
         fibonacci.goals.clear()
     # With the same id, as of a client that gives each goal the same.
-    assert fibonacci.answer(fibonacci.ask(SUCCEED)).status == GoalStatus.STATUS_SUCCEEDED
+    assert (
+        fibonacci.answer(fibonacci.ask(SUCCEED)).status == GoalStatus.STATUS_SUCCEEDED
+    )
 
 
 def status(fibonacci: Fibonacci) -> str:
@@ -223,10 +260,20 @@ def test_a_prefix_names_other_actions_than_the_nodes_own() -> None:
         ("/", "/", "which is this node itself"),
         ("/robot", "/robot", "which is this node itself"),
         ("/robot/", "/robot", "which is this node itself"),
-        ("a b", "/", "give the prefix to which the actions of Nav2's planner_server are remapped"),
+        (
+            "a b",
+            "/",
+            "give the prefix to which the actions of Nav2's planner_server are remapped",
+        ),
         ("9", "/", "give the prefix"),
     ):
-        arguments = ["--ros-args", "-p", f"other_planners:='{prefix}'", "-r", f"__ns:={namespace}"]
+        arguments = [
+            "--ros-args",
+            "-p",
+            f"other_planners:='{prefix}'",
+            "-r",
+            f"__ns:={namespace}",
+        ]
         rclpy.init(args=arguments)
         try:
             with pytest.raises(ValueError, match=reason):
@@ -236,14 +283,18 @@ def test_a_prefix_names_other_actions_than_the_nodes_own() -> None:
 
 
 @pytest.fixture
-def planners(run_robot: Any, make_client: Any) -> Iterator[tuple[Navigator, Server, list[Any]]]:
+def planners(
+    run_robot: Any, make_client: Any
+) -> Iterator[tuple[Navigator, Server, list[Any]]]:
     """A planner node, Nav2's server beside it, as far as goals go, and the goals that it got."""
     kinds = pytest.importorskip("nav2_msgs.action", reason="nav2_msgs is not on PyPI")
     asked: list[Any] = []
 
     def answer(handle: Any) -> Any:
         asked.append(handle.request)
-        result = kinds.ComputePathToPose.Result(path=Path(poses=[handle.request.goal] * 2))
+        result = kinds.ComputePathToPose.Result(
+            path=Path(poses=[handle.request.goal] * 2)
+        )
         result.planning_time.nanosec = 5
         if handle.request.planner_id == "slow":
             while not handle.is_cancel_requested and not server.stopped.wait(0.01):
@@ -259,16 +310,22 @@ def planners(run_robot: Any, make_client: Any) -> Iterator[tuple[Navigator, Serv
 
     parameters = {"planner_id": "ddqn", "other_planners": "nav2"}
     with run_robot("/two", parameters) as robot:
-        server = Server(kinds.ComputePathToPose, "/two/nav2/compute_path_to_pose", answer)
+        server = Server(
+            kinds.ComputePathToPose, "/two/nav2/compute_path_to_pose", answer
+        )
         yield Navigator(robot), server, asked
         server.stop()
 
 
-def test_a_tree_can_name_each_planner(planners: tuple[Navigator, Server, list[Any]]) -> None:
+def test_a_tree_can_name_each_planner(
+    planners: tuple[Navigator, Server, list[Any]],
+) -> None:
     navigator, server, asked = planners
     robot: Robot = navigator.robot
     robot.set_map(robot.stamped_map())
-    goal = PoseStamped(pose=robot.pose(GOAL).pose)  # without a frame: it is not ours to check
+    goal = PoseStamped(
+        pose=robot.pose(GOAL).pose
+    )  # without a frame: it is not ours to check
 
     def ask() -> Any:
         answer = navigator.plan(goal, planner_id="GridBased", use_start=True)
@@ -278,12 +335,20 @@ def test_a_tree_can_name_each_planner(planners: tuple[Navigator, Server, list[An
     assert answer.result.error_code == 0
     assert answer.result.path.poses == [goal, goal]
     assert answer.result.planning_time.nanosec == 5
-    assert (asked[0].goal, asked[0].planner_id, asked[0].use_start) == (goal, "GridBased", True)
+    assert (asked[0].goal, asked[0].planner_id, asked[0].use_start) == (
+        goal,
+        "GridBased",
+        True,
+    )
     answer = navigator.plan(goal, planner_id="nobody's")
     assert (answer.status, answer.result.error_code) == (ABORTED, 201)
     assert answer.result.error_msg == "unknown there"
     for planner_id in ("ddqn", ""):
-        fields = {"start": robot.pose(START), "use_start": True, "planner_id": planner_id}
+        fields = {
+            "start": robot.pose(START),
+            "use_start": True,
+            "planner_id": planner_id,
+        }
         ours = navigator.plan(robot.pose(GOAL), **fields).result
         assert len(points_of(ours.path)) > 2
     assert len(asked) == 2
@@ -300,7 +365,9 @@ def test_a_tree_can_name_each_planner(planners: tuple[Navigator, Server, list[An
     # The action through poses has no server there.
     missing = navigator.plan([goal], planner_id="GridBased")
     assert (missing.status, missing.result.error_code) == (ABORTED, 301)
-    assert "has no server at nav2/compute_path_through_poses" in missing.result.error_msg
+    assert (
+        "has no server at nav2/compute_path_through_poses" in missing.result.error_msg
+    )
 
     slow = navigator.send(goal, planner_id="slow")
     result = navigator.ask(slow.get_result_async)
@@ -311,4 +378,7 @@ def test_a_tree_can_name_each_planner(planners: tuple[Navigator, Server, list[An
     result = navigator.ask(slow.get_result_async)
     wait_for("the goal", lambda: len(asked) == 6)
     server.stop()
-    assert (done(result).status, done(result).result.error_code) in ((ABORTED, 200), (ABORTED, 201))
+    assert (done(result).status, done(result).result.error_code) in (
+        (ABORTED, 200),
+        (ABORTED, 201),
+    )

@@ -47,7 +47,9 @@ MEANT = [
 
 
 @pytest.mark.parametrize(("name", "value", "meaning"), MEANT)
-def test_a_value_in_another_form_means_the_same(name: str, value: Any, meaning: Any) -> None:
+def test_a_value_in_another_form_means_the_same(
+    name: str, value: Any, meaning: Any
+) -> None:
     read = PARAMETERS[name].read(name, value)
     assert (type(read), read) == (type(meaning), meaning)
 
@@ -81,22 +83,30 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("name", "value", "reason"), WRONG)
-def test_a_wrong_value_is_named_with_a_remedy(name: str, value: Any, reason: str) -> None:
+def test_a_wrong_value_is_named_with_a_remedy(
+    name: str, value: Any, reason: str
+) -> None:
     with pytest.raises(ValueError, match=f"^{name} {reason}"):
         PARAMETERS[name].read(name, value)
 
 
 def test_all_wrong_values_are_named_at_once() -> None:
-    with pytest.raises(ValueError, match=r"^robot_radius is -1.0; .* / mode is 'x'; give"):
+    with pytest.raises(
+        ValueError, match=r"^robot_radius is -1.0; .* / mode is 'x'; give"
+    ):
         read_all(PARAMETERS, {"robot_radius": -1, "tolerance": 1, "mode": "x"})
 
 
-SCALARS = st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.binary()
+SCALARS = (
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.binary()
+)
 VALUES = SCALARS | st.lists(st.integers()) | st.lists(st.text()) | st.lists(st.floats())
 
 
 @given(st.sampled_from(sorted(PARAMETERS)), VALUES)
-def test_any_value_is_one_of_the_type_and_range_or_refused(name: str, value: Any) -> None:
+def test_any_value_is_one_of_the_type_and_range_or_refused(
+    name: str, value: Any
+) -> None:
     declared: Declared = PARAMETERS[name]
     try:
         read = declared.read(name, value)
@@ -127,13 +137,20 @@ def test_each_default_is_what_it_says() -> None:
 )
 def test_the_nearest_name_is_found(name: str, found: str) -> None:
     assert nearest(name, PLANNER_PARAMETERS) == found
-    told = unread_names([name, "tolerance", "qos_overrides./map"], PLANNER_PARAMETERS, "/planner")
+    told = unread_names(
+        [name, "tolerance", "qos_overrides./map"], PLANNER_PARAMETERS, "/planner"
+    )
     assert told.startswith(f"/planner does not know, and does not read: {name}")
     assert (f"(the nearest is {found})" in told) == bool(found)
 
 
 RADIUS = {"ros__parameters": {"robot_radius": 0.3}}
-NAV2 = {"ros__parameters": {"planner_plugins": ["GridBased"], "GridBased": {"tolerance": 0.5}}}
+NAV2 = {
+    "ros__parameters": {
+        "planner_plugins": ["GridBased"],
+        "GridBased": {"tolerance": 0.5},
+    }
+}
 CLOCK = {"ros__parameters": {"use_sim_time": True}}
 SECTIONS: list[tuple[Any, str, str]] = [
     ({"planner": RADIUS}, "/planner", ""),
@@ -167,8 +184,16 @@ SECTIONS: list[tuple[Any, str, str]] = [
     ({"/r2/planner": RADIUS}, "/r1/planner", "it is for /r2/planner"),
     ({"plannerx": RADIUS}, "/planner", "instead of plannerx:"),
     ({"xplanner": RADIUS}, "/planner", "instead of xplanner:"),
-    ({"amcl": CLOCK}, "/planner", "it is for /amcl; add a section /planner: or /[*][*]:"),
-    ({f"n{i}": CLOCK for i in range(9)}, "/planner", "it is for /n0, /n1, /n2, /n3, /n4, ...; add"),
+    (
+        {"amcl": CLOCK},
+        "/planner",
+        "it is for /amcl; add a section /planner: or /[*][*]:",
+    ),
+    (
+        {f"n{i}": CLOCK for i in range(9)},
+        "/planner",
+        "it is for /n0, /n1, /n2, /n3, /n4, ...; add",
+    ),
     (
         {"/**": CLOCK, "planner_node": RADIUS},
         "/planner",
@@ -188,7 +213,9 @@ def test_a_file_for_other_nodes_alone_is_told(
 ) -> None:
     file = tmp_path / "parameters.yaml"
     file.write_text(yaml.safe_dump(sections, sort_keys=False))
-    told = unread_sections(["node", "--ros-args", "--params-file", str(file)], PARAMETERS, node)
+    told = unread_sections(
+        ["node", "--ros-args", "--params-file", str(file)], PARAMETERS, node
+    )
     assert len(told) == bool(warning)
     assert all(re.search(warning, each) and str(file) in each for each in told)
     # What is no argument of ROS is not read by ROS.
@@ -201,18 +228,25 @@ def test_a_file_for_other_nodes_alone_is_told(
         ("robot_radius:=0.3", ""),
         ("planner:robot_radius:=0.3", ""),
         ("model:='planner_node:x'", ""),
-        ("planner_node:robot_radius:=0.3", "-p planner_node:robot_radius:=0.3 sets nothing of /pl"),
+        (
+            "planner_node:robot_radius:=0.3",
+            "-p planner_node:robot_radius:=0.3 sets nothing of /pl",
+        ),
     ],
 )
 @pytest.mark.parametrize("option", ["-p", "--param"])
-def test_a_setting_for_another_node_is_told(option: str, rule: str, warning: str) -> None:
+def test_a_setting_for_another_node_is_told(
+    option: str, rule: str, warning: str
+) -> None:
     arguments = ["node", "--ros-args", option, rule, "-r", "__ns:=/", "--"]
     told = unread_sections(arguments, PARAMETERS, "/planner")
     assert len(told) == bool(warning)
     assert all(warning in each for each in told)
 
 
-@given(st.recursive(SCALARS, lambda tree: st.dictionaries(st.text(), tree), max_leaves=9))
+@given(
+    st.recursive(SCALARS, lambda tree: st.dictionaries(st.text(), tree), max_leaves=9)
+)
 def test_any_file_is_read_or_left_out(tmp_path_factory: Any, tree: Any) -> None:
     file = tmp_path_factory.mktemp("any") / "any.yaml"
     file.write_text(yaml.safe_dump(tree))
@@ -221,11 +255,18 @@ def test_any_file_is_read_or_left_out(tmp_path_factory: Any, tree: Any) -> None:
 
 UNREADABLE = [
     ("-p", "robot_radius=0.3", "no ':='; write -p NAME:=VALUE"),
-    ("-p", "model:=", "-p model:= has no value; give one, and for an empty text: -p \"model:=''\""),
+    (
+        "-p",
+        "model:=",
+        "-p model:= has no value; give one, and for an empty text: -p \"model:=''\"",
+    ),
     ("-p", "/planner:robot_radius:=0.3", "write -p planner:robot_radius:=0.3"),
     ("-p", "mode:=[greedy", "-p mode:=\\[greedy: the value is no YAML .line 1: "),
     ("planner:\n  ros__parameters:\n\tmode: greedy\n", "no YAML .line 3: .*correct it"),
-    ("planner:\n  ros_parameters:\n    mode: greedy\n", "no ros__parameters, but ros_parameters;"),
+    (
+        "planner:\n  ros_parameters:\n    mode: greedy\n",
+        "no ros__parameters, but ros_parameters;",
+    ),
     ("", "is empty; write NODE:"),
     (None, "cannot be read .No such file or directory.; check the path"),
 ]
@@ -246,8 +287,18 @@ def test_an_argument_that_ros_cannot_read_is_named(case: Any, tmp_path: Path) ->
 def test_arguments_that_ros_reads_are_not_wrong(tmp_path: Path) -> None:
     file = tmp_path / "parameters.yaml"
     file.write_text(yaml.safe_dump({"planner": RADIUS}))
-    settings = ["-p", "robot_radius:=0.3", "-p", "planner:mode:=greedy", "-p", "model:=''"]
-    assert wrong_argument(["node", "--ros-args", "--params-file", str(file), *settings]) == ""
+    settings = [
+        "-p",
+        "robot_radius:=0.3",
+        "-p",
+        "planner:mode:=greedy",
+        "-p",
+        "model:=''",
+    ]
+    assert (
+        wrong_argument(["node", "--ros-args", "--params-file", str(file), *settings])
+        == ""
+    )
 
 
 @pytest.mark.parametrize(
@@ -259,7 +310,11 @@ def test_arguments_that_ros_reads_are_not_wrong(tmp_path: Path) -> None:
             "qos_overrides./map.subscription.depth:=-3",
             "depth is -3; give 0 to 2147483647",
         ),
-        ("map_server_node", "topic_name:=my map", "cannot start: topic_name is 'my map' ("),
+        (
+            "map_server_node",
+            "topic_name:=my map",
+            "cannot start: topic_name is 'my map' (",
+        ),
         ("map_server_node", "topic_name:=''", "cannot start: topic_name is '' ("),
         ("map_server_node", "topic_name:='/'", "cannot start: topic_name is '/' ("),
     ],
@@ -280,9 +335,18 @@ def test_a_planner_tells_what_it_does_not_read_and_takes_what_is_meant(
     file.write_text(yaml.safe_dump({"planner_node": RADIUS}))
     quality = "qos_overrides./told/{}.subscription.durability:=volatile"
     settings = ["--params-file", str(file), "-p", "robot_raduis:=0.3"]
-    settings += ["-p", quality.format("mpa"), "-p", quality.format("map"), "--", "tolerance:=3"]
+    settings += [
+        "-p",
+        quality.format("mpa"),
+        "-p",
+        quality.format("map"),
+        "--",
+        "tolerance:=3",
+    ]
     parameters = {"robot_radius": 1, "mode": " Greedy", "use_sim_time": False}
-    with run_node("planner_node", parameters, namespace="/told", settings=settings) as node:
+    with run_node(
+        "planner_node", parameters, namespace="/told", settings=settings
+    ) as node:
         client = make_client("/told")
         client.get_parameter("planner", "mode")
         for warning in (
@@ -295,13 +359,20 @@ def test_a_planner_tells_what_it_does_not_read_and_takes_what_is_meant(
             node.wait_for_log(warning)
         assert client.get_parameter("planner", "robot_radius") == 1.0
         assert client.get_parameter("planner", "mode") == "greedy"
-        for name, value, meaning in (("robot_radius", 2, 2.0), ("occupied_threshold", 50.0, 50)):
+        for name, value, meaning in (
+            ("robot_radius", 2, 2.0),
+            ("occupied_threshold", 50.0, 50),
+        ):
             (result,) = client.set_parameters("planner", **{name: value})
             assert result.successful
             assert client.get_parameter("planner", name) == meaning
         for name, value, reason in (
             ("robot_raduis", 0.1, "robot_raduis (the nearest is robot_radius)"),
-            ("follow_trainer", True, "read-only; set it at the start, with -p follow_trainer:="),
+            (
+                "follow_trainer",
+                True,
+                "read-only; set it at the start, with -p follow_trainer:=",
+            ),
             ("robot_radius", "0.1", "a number and a truth value have no quotes"),
             ("model", 3, "with quotes"),
         ):
@@ -313,27 +384,47 @@ def test_a_planner_tells_what_it_does_not_read_and_takes_what_is_meant(
         assert len(re.findall(r"WARN.*planner\]: ", node.log)) == 4
 
 
-def test_a_map_server_without_a_map_waits_for_one(run_node: Any, make_client: Any) -> None:
+def test_a_map_server_without_a_map_waits_for_one(
+    run_node: Any, make_client: Any
+) -> None:
     with run_node("map_server_node", {"yaml_filename": ""}, namespace="/none") as node:
         client = make_client("/none")
         assert not client.call(GetMap, "map_server/map").map.data
         node.wait_for_log("yaml_filename is '': no map is loaded; call load_map first")
-        answer = client.call(LoadMap, "map_server/load_map", LoadMap.Request(map_url=""))
+        answer = client.call(
+            LoadMap, "map_server/load_map", LoadMap.Request(map_url="")
+        )
         assert answer.result == LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
-        node.wait_for_log("cannot load '', no map is served: the map is ''; give a path")
-        answer = client.call(LoadMap, "map_server/load_map", LoadMap.Request(map_url="/"))
+        node.wait_for_log(
+            "cannot load '', no map is served: the map is ''; give a path"
+        )
+        answer = client.call(
+            LoadMap, "map_server/load_map", LoadMap.Request(map_url="/")
+        )
         assert answer.result == LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
         node.wait_for_log("'/' is a folder; give the path of a map file")
-        answer = client.call(LoadMap, "map_server/load_map", LoadMap.Request(map_url="dilemma"))
+        answer = client.call(
+            LoadMap, "map_server/load_map", LoadMap.Request(map_url="dilemma")
+        )
         assert answer.result == LoadMap.Response.RESULT_SUCCESS
         assert node.log.count("ERROR") == 2
 
 
-@pytest.mark.parametrize(("robots", "spaces"), [([], [""]), (["/r1", "r2/", "r1"], ["r1/", "r2/"])])
+@pytest.mark.parametrize(
+    ("robots", "spaces"), [([], [""]), (["/r1", "r2/", "r1"], ["r1/", "r2/"])]
+)
 def test_robots_are_heard_in_their_namespaces(
-    robots: list[str], spaces: list[str], run_node: Any, make_client: Any, tmp_path: Path
+    robots: list[str],
+    spaces: list[str],
+    run_node: Any,
+    make_client: Any,
+    tmp_path: Path,
 ) -> None:
-    parameters = {"learn_from": "driving", "robots": robots, "output_folder": str(tmp_path / "d")}
+    parameters = {
+        "learn_from": "driving",
+        "robots": robots,
+        "output_folder": str(tmp_path / "d"),
+    }
     space = f"/fleet_of_{len(robots)}"
     with run_node("trainer_node", parameters, namespace=space):
         client = make_client(space)

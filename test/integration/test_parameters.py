@@ -26,8 +26,20 @@ DOCS = (ROOT / "docs" / "nodes.md").read_text(encoding="utf-8")
 NODES = ["map_server", "planner", "trainer"]
 NAMES = ["", "no_such", "a.b", "/", "ü" * 300]
 TYPES = {1: "bool", 2: "integer", 3: "double", 4: "string", 9: "string_array"}
-OF_EVERY_NODE = {"/rosout", "/parameter_events", "use_sim_time", "start_type_description_service"}
-OF_DRIVING = {"~/experience", "~/experience_saved", "~/slowness", "~/forget", "odom", NAVIGATION}
+OF_EVERY_NODE = {
+    "/rosout",
+    "/parameter_events",
+    "use_sim_time",
+    "start_type_description_service",
+}
+OF_DRIVING = {
+    "~/experience",
+    "~/experience_saved",
+    "~/slowness",
+    "~/forget",
+    "odom",
+    NAVIGATION,
+}
 """What the trainer has only where it learns from driving."""
 
 
@@ -41,21 +53,27 @@ class Running:
 
     def call(self, kind: str, **request: Any) -> Any:
         service = getattr(srv, kind.title().replace("_", ""))
-        return self.client.call(service, f"{self.name}/{kind}", service.Request(**request))
+        return self.client.call(
+            service, f"{self.name}/{kind}", service.Request(**request)
+        )
 
     def topics(self) -> set[tuple[str, str, str]]:
         """What the client has discovered of the node."""
         return {
             (kind, re.sub(f"^{self.name}/", "~/", name), message)
             for kind, name, message in self.client.entities(self.name)
-            if name not in OF_EVERY_NODE and "parameter" not in name and "type_desc" not in name
+            if name not in OF_EVERY_NODE
+            and "parameter" not in name
+            and "type_desc" not in name
             # An action's parts have no rows of their own.
             if kind == "subscribes" or "/_action/" not in name
         }
 
 
 @pytest.fixture(scope="module", params=NODES)
-def running(request: pytest.FixtureRequest, run_node: Any, make_client: Any) -> Iterator[Running]:
+def running(
+    request: pytest.FixtureRequest, run_node: Any, make_client: Any
+) -> Iterator[Running]:
     name, namespace = request.param, f"/described/{request.param}"
     parameters = {"follow_trainer": True} if name == "planner" else {}
     with run_node(f"{name}_node", parameters, namespace=namespace) as node:
@@ -64,7 +82,9 @@ def running(request: pytest.FixtureRequest, run_node: Any, make_client: Any) -> 
 
 def rows_of(node: str) -> list[list[str]]:
     """The cells of the tables below a node's heading."""
-    (section,) = (part for part in DOCS.split("\n## ") if part.startswith(f"{node}_node"))
+    (section,) = (
+        part for part in DOCS.split("\n## ") if part.startswith(f"{node}_node")
+    )
     rows = (line for line in section.splitlines() if line.startswith("| "))
     return [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
 
@@ -100,13 +120,19 @@ def range_of(entry: ParameterDescriptor) -> str:
 
 def test_each_parameter_is_documented_as_it_is(running: Running) -> None:
     names = running.call("list_parameters").result.names
-    names = [name for name in names if name not in OF_EVERY_NODE and "qos_over" not in name]
+    names = [
+        name for name in names if name not in OF_EVERY_NODE and "qos_over" not in name
+    ]
     described = running.call("describe_parameters", names=names)
     found = {}
     for entry in described.descriptors:
         assert entry.description
         value = running.client.get_parameter(running.name, entry.name)
-        text = repr(value).replace("''", "") if isinstance(value, str) else json.dumps(value)
+        text = (
+            repr(value).replace("''", "")
+            if isinstance(value, str)
+            else json.dumps(value)
+        )
         found[entry.name] = [TYPES[entry.type], f"`{text}`", range_of(entry)]
     if running.name == "planner":
         found["follow_trainer"][1] = "`false`"
@@ -114,11 +140,17 @@ def test_each_parameter_is_documented_as_it_is(running: Running) -> None:
 
 
 def test_topics_are_as_documented(
-    running: Running, run_node: Any, make_client: Callable[[str], Client], tmp_path: Path
+    running: Running,
+    run_node: Any,
+    make_client: Callable[[str], Client],
+    tmp_path: Path,
 ) -> None:
     documented, more = documented_topics(running.name), set()
     if running.name == "trainer":
-        parameters = {"learn_from": "driving", "output_folder": str(tmp_path / "drives")}
+        parameters = {
+            "learn_from": "driving",
+            "output_folder": str(tmp_path / "drives"),
+        }
         with run_node("trainer_node", parameters, namespace="/driving") as node:
             driving = Running("trainer", make_client("/driving"), node)
             driving.call("list_parameters")
@@ -137,10 +169,16 @@ def test_no_request_for_parameters_ends_a_node(running: Running) -> None:
         (unknown_type, "77.*ParameterType"),
         (Parameter(value=ParameterValue(type=1, bool_value=True)), "no name; give one"),
         (Parameter(name="use_sim_time"), "."),
-        (Parameter(name="no_such", value=ParameterValue(type=1)), "does not know.*no_such"),
+        (
+            Parameter(name="no_such", value=ParameterValue(type=1)),
+            "does not know.*no_such",
+        ),
     ):
         (result,) = running.call("set_parameters", parameters=[bad]).results
-        for refused in (result, running.call("set_parameters_atomically", parameters=[bad]).result):
+        for refused in (
+            result,
+            running.call("set_parameters_atomically", parameters=[bad]).result,
+        ):
             assert not refused.successful
             assert re.search(reason, refused.reason)
     good = Parameter(name="use_sim_time", value=ParameterValue(type=1))
@@ -162,7 +200,14 @@ def test_help_says_of_each_parameter_what_the_docs_say_and_starts_no_node(
     name: str, option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Any
 ) -> None:
     # With such a domain, such parameters and in such a folder no node starts.
-    arguments = [option, "--ros-args", "-p", "model:=no_such", "-p", "map_file:=no_such"]
+    arguments = [
+        option,
+        "--ros-args",
+        "-p",
+        "model:=no_such",
+        "-p",
+        "map_file:=no_such",
+    ]
     monkeypatch.setenv("ROS_DOMAIN_ID", "abc")
     monkeypatch.setattr(sys, "argv", [f"{name}_node", *arguments])
     monkeypatch.chdir(tmp_path)
@@ -192,19 +237,61 @@ NEEDS_TF = "is 'tf', which needs tf2_ros, and that is not installed: apt install
         ("map_server", {}, ["-p", "model"], {}, "model"),
         ("map_server", {}, ["--params-file", "/no/such.yaml"], {}, "such.yaml"),
         ("map_server", {}, [], {"ROS_DOMAIN_ID": "abc"}, "ROS_DOMAIN_ID"),
-        ("map_server", {}, ["--enclave", "/a"], SECURITY, "SECURITY|security|keystore|enclave"),
+        (
+            "map_server",
+            {},
+            ["--enclave", "/a"],
+            SECURITY,
+            "SECURITY|security|keystore|enclave",
+        ),
         ("map_server", {"frame_id": ""}, [], {}, "name the map's frame"),
         ("map_server", {"topic_name": "a b"}, [], {}, "topic name"),
-        ("map_server", {"seed": -1}, [], {}, "seed is -1; give 0 to 9223372036854775807"),
+        (
+            "map_server",
+            {"seed": -1},
+            [],
+            {},
+            "seed is -1; give 0 to 9223372036854775807",
+        ),
         ("planner", FLIGHTY, [], {}, r"cannot subscribe to /map \(.*`flighty`"),
         ("planner", {"start_source": "tf"}, [], {}, NEEDS_TF),
         ("trainer", BY_TF, [], {}, NEEDS_TF),
-        ("trainer", {"network": "perceptron"}, [], {}, "'perceptron'; give one of paper, prop"),
-        ("trainer", {"environments": 8, "replay_capacity": 4}, [], {}, "is 8; .* at most .* 4"),
+        (
+            "trainer",
+            {"network": "perceptron"},
+            [],
+            {},
+            "'perceptron'; give one of paper, prop",
+        ),
+        (
+            "trainer",
+            {"environments": 8, "replay_capacity": 4},
+            [],
+            {},
+            "is 8; .* at most .* 4",
+        ),
         ("trainer", {"map_file": "no_such_map.yaml"}, [], {}, "no_such_map"),
-        ("trainer", {"robots": ["r 1"]}, [], {}, "robots holds 'r 1', which is no namespace; give"),
-        ("trainer", {"output_folder": "~nobody_there/x"}, [], {}, "no home folder of a user 'nob"),
-        ("planner", {"robot_radius": "0.3", "mode": 1}, [], {}, "is '0.3', a text .* / mode is 1,"),
+        (
+            "trainer",
+            {"robots": ["r 1"]},
+            [],
+            {},
+            "robots holds 'r 1', which is no namespace; give",
+        ),
+        (
+            "trainer",
+            {"output_folder": "~nobody_there/x"},
+            [],
+            {},
+            "no home folder of a user 'nob",
+        ),
+        (
+            "planner",
+            {"robot_radius": "0.3", "mode": 1},
+            [],
+            {},
+            "is '0.3', a text .* / mode is 1,",
+        ),
         ("planner", {"use_sim_time": "true"}, [], {}, "use_sim_time"),
     ],
 )
@@ -246,7 +333,9 @@ def test_each_display_and_tool_has_a_topic_of_the_nodes() -> None:
     text = (ROOT / "rviz" / "ddqn_planner.rviz").read_text()
     manager: dict[str, Any] = yaml.safe_load(text)["Visualization Manager"]
     displays = {display["Topic"]["Value"]: display for display in manager["Displays"]}
-    tools = {tool["Topic"]["Value"]: tool for tool in manager["Tools"] if "Topic" in tool}
+    tools = {
+        tool["Topic"]["Value"]: tool for tool in manager["Tools"] if "Topic" in tool
+    }
     assert (set(displays), set(tools)) == (SHOWN, SET)
     for name, entry in (displays | tools).items():
         way = "publishes" if name in displays else "subscribes"
@@ -259,6 +348,10 @@ def test_each_display_and_tool_has_a_topic_of_the_nodes() -> None:
     assert all(display["Enabled"] for display in displays.values())
     assert displays["/map"]["Draw Behind"]
     value = displays["/planner/value"]
-    assert (value["Color Scheme"], value["Draw Behind"], value["Alpha"] < 1) == ("costmap", 0, True)
+    assert (value["Color Scheme"], value["Draw Behind"], value["Alpha"] < 1) == (
+        "costmap",
+        0,
+        True,
+    )
     assert manager["Global Options"]["Fixed Frame"] == "map"
     assert manager["Views"]["Current"]["Class"] == "rviz_default_plugins/TopDownOrtho"

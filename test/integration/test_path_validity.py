@@ -132,15 +132,32 @@ def test_newer_requests_name_all_poses_a_footprint_and_a_distance(asked: Asked) 
     # A body may pass what is only inscribed, and touches the obstacle from afar.
     long = "[[0.9, 0.1], [-0.9, 0.1], [-0.9, -0.1], [0.9, -0.1]]"
     for stamped in path.poses:
-        stamped.pose.orientation.w, stamped.pose.orientation.z = math.cos(0.2), math.sin(0.2)
+        stamped.pose.orientation.w, stamped.pose.orientation.z = (
+            math.cos(0.2),
+            math.sin(0.2),
+        )
     ahead = asked.check(path, footprint=long, **every)
-    assert ahead.invalid_pose_indices == [6, 7, 8, 9, 10, 28, 29]  # the last leave the map
+    assert ahead.invalid_pose_indices == [
+        6,
+        7,
+        8,
+        9,
+        10,
+        28,
+        29,
+    ]  # the last leave the map
     for wrong in ({"footprint": "[[0.1]]"}, {"layer_name": "static_layer"}):
         answer = asked.check(path, **wrong)
-        assert (answer.success, answer.is_valid, answer.invalid_pose_indices) == (False, False, [])
+        assert (answer.success, answer.is_valid, answer.invalid_pose_indices) == (
+            False,
+            False,
+            [],
+        )
 
 
-def test_what_people_send_is_judged_by_where_it_lies_and_else_refused(asked: Asked) -> None:
+def test_what_people_send_is_judged_by_where_it_lies_and_else_refused(
+    asked: Asked,
+) -> None:
     asked.set_map(np.zeros((12, 30), np.int8))
     asked.stand(pose(GRID, (3, 6)))
     for path in (path_at(ROW), path_at(ROW, ""), path_at(ROW[4:5]), path_at(ROW[::2])):
@@ -169,7 +186,10 @@ def test_a_path_begins_at_the_start_and_ends_at_the_goal_and_stays_valid(
     random = np.random.default_rng(5)
     for _ in range(20):
         cells = random.integers((30, 12), size=(2, 2)).tolist()
-        ends = [pose(GRID, (x, y), yaw) for (x, y), yaw in zip(cells, (0.5, 2.0), strict=True)]
+        ends = [
+            pose(GRID, (x, y), yaw)
+            for (x, y), yaw in zip(cells, (0.5, 2.0), strict=True)
+        ]
         for end in ends:
             end.pose.position.x += random.uniform(-0.15, 0.15)
             end.pose.position.y += random.uniform(-0.15, 0.15)

@@ -48,7 +48,9 @@ def test_any_map_is_taken_or_refused(robot: Robot, message: OccupancyGrid) -> No
     except ValueError as error:
         reason = str(error).split(";")[0]
         assert reason
-        robot.diagnostics.wait(lambda m: f"map refused: {reason}" in m.status[0].message)
+        robot.diagnostics.wait(
+            lambda m: f"map refused: {reason}" in m.status[0].message
+        )
         robot.assert_works()
     else:
         robot.wait_for_map(message)
@@ -74,7 +76,9 @@ def test_any_request_is_answered(
 
 @fuzz
 @given(message=STAMPED_POSES, topic=TOPICS)
-def test_any_pose_is_taken_or_refused(robot: Robot, message: PoseStamped, topic: str) -> None:
+def test_any_pose_is_taken_or_refused(
+    robot: Robot, message: PoseStamped, topic: str
+) -> None:
     pose_message: Any = message
     if topic == "goal_poses":
         good = robot.pose(GOAL).pose
@@ -94,10 +98,14 @@ NAMES = [*PLANNER_PARAMETERS, "use_sim_time"]
 
 @fuzz
 @given(parameters=some_parameters(NAMES), together=st.booleans())
-def test_any_parameters_are_answered(robot: Robot, parameters: list[Any], together: bool) -> None:
+def test_any_parameters_are_answered(
+    robot: Robot, parameters: list[Any], together: bool
+) -> None:
     def read() -> dict[str, Any]:
         request = GetParameters.Request(names=NAMES)
-        values = robot.client.call(GetParameters, "planner/get_parameters", request).values
+        values = robot.client.call(
+            GetParameters, "planner/get_parameters", request
+        ).values
         return dict(zip(NAMES, values, strict=True))
 
     expected = read()
@@ -108,7 +116,9 @@ def test_any_parameters_are_answered(robot: Robot, parameters: list[Any], togeth
         results = [one] * len(parameters)
     else:
         request = SetParameters.Request(parameters=parameters)
-        results = robot.client.call(SetParameters, "planner/set_parameters", request).results
+        results = robot.client.call(
+            SetParameters, "planner/set_parameters", request
+        ).results
     assert all(result.successful or result.reason for result in results)
     for parameter, result in zip(parameters, results, strict=True):
         if result.successful:

@@ -103,7 +103,9 @@ def whole_model(robot: Robot) -> Iterator[FilePath]:
     robot.set(model=str(robot.model))
 
 
-def test_reload_plans_again_with_what_the_file_holds(robot: Robot, whole_model: FilePath) -> None:
+def test_reload_plans_again_with_what_the_file_holds(
+    robot: Robot, whole_model: FilePath
+) -> None:
     constant_model(whole_model, 6, 7)
     response = robot.client.call(Trigger, "planner/reload_model")
     assert response.success, response.message
@@ -125,7 +127,9 @@ def test_reload_plans_again_with_what_the_file_holds(robot: Robot, whole_model: 
     robot.wait_for_path(START, GOAL)
 
 
-def test_follows_the_trainer(robot: Robot, whole_model: FilePath, tmp_path: FilePath) -> None:
+def test_follows_the_trainer(
+    robot: Robot, whole_model: FilePath, tmp_path: FilePath
+) -> None:
     path = tmp_path / "saved.safetensors"
     constant_model(path, 6, 11)
     sent = bytes_message("model", path.read_bytes())
@@ -137,8 +141,14 @@ def test_follows_the_trainer(robot: Robot, whole_model: FilePath, tmp_path: File
     unnamed = UInt8MultiArray(data=sent.data)
     for bad, reason in (
         (broken, "cannot be read as safetensors"),
-        (other, f"{len(sent.data)} bytes with the label 'ddqn_planner model 1 .* save there again"),
-        (bytes_message("experience", path.read_bytes()), "label 'ddqn_planner experience 1 "),
+        (
+            other,
+            f"{len(sent.data)} bytes with the label 'ddqn_planner model 1 .* save there again",
+        ),
+        (
+            bytes_message("experience", path.read_bytes()),
+            "label 'ddqn_planner experience 1 ",
+        ),
         (unnamed, "label ''.* have one version"),
     ):
         robot.clear()
@@ -175,10 +185,14 @@ def test_a_trapped_or_unfit_model_says_so(
     robot.node.wait_for_log(said)
     # Of the two moves that the model knows one leads there.
     robot.get_plan(robot.pose((2, 0)), robot.pose((0, 0)))
-    robot.wait_for_reason("^a path of 2.00 cells, by greedy steps", {"method": "greedy"})
+    robot.wait_for_reason(
+        "^a path of 2.00 cells, by greedy steps", {"method": "greedy"}
+    )
 
 
-def test_a_bad_parameter_is_refused_and_a_good_one_holds(robot: Robot, tmp_path: FilePath) -> None:
+def test_a_bad_parameter_is_refused_and_a_good_one_holds(
+    robot: Robot, tmp_path: FilePath
+) -> None:
     broken, missing = tmp_path / "broken.safetensors", tmp_path / "missing.safetensors"
     broken.write_bytes(b"a model")
     pipe = tmp_path / "pipe.npz"
@@ -189,7 +203,10 @@ def test_a_bad_parameter_is_refused_and_a_good_one_holds(robot: Robot, tmp_path:
         ("robot_radius", "0.3", "robot_radius is '0.3', a text (a number"),
         ("mode", "best", "mode is 'best'; give one of greedy, astar_fallback"),
         ("start_source", "gps", "start_source is 'gps'; give one of"),
-        *(("robot_frame", "", "robot_frame is ''; name"), ("follow_trainer", False, "read-only")),
+        *(
+            ("robot_frame", "", "robot_frame is ''; name"),
+            ("follow_trainer", False, "read-only"),
+        ),
         ("model", "no_such_model", "there is no shipped model 'no_such_model'"),
         ("model", str(missing), "there is no model file"),
         ("model", str(broken), "cannot be read as safetensors"),
@@ -203,10 +220,14 @@ def test_a_bad_parameter_is_refused_and_a_good_one_holds(robot: Robot, tmp_path:
         assert robot.client.get_parameter("planner", name) == before
     robot.assert_works()
     robot.set(move_rule="corner_cutting")
-    robot.wait_for_reason(".", {"move rule": "corner_cutting", "model move rule": "robot_safe"})
+    robot.wait_for_reason(
+        ".", {"move rule": "corner_cutting", "model move rule": "robot_safe"}
+    )
 
 
-def test_a_malformed_map_or_start_is_refused_and_a_goal_has_an_empty_plan(robot: Robot) -> None:
+def test_a_malformed_map_or_start_is_refused_and_a_goal_has_an_empty_plan(
+    robot: Robot,
+) -> None:
     robot.send_map(changed(robot.map_message(), "info.width", 0))
     robot.send_start(changed(robot.pose((3, 3)), "pose.orientation", Quaternion(w=0.0)))
     for reason in (
@@ -233,14 +254,17 @@ def test_a_malformed_map_or_start_is_refused_and_a_goal_has_an_empty_plan(robot:
     assert all(path.poses == [] for path in robot.plans.messages())
 
 
-def test_quaternions_of_three_decimals_are_taken_and_sent_on_with_the_norm_1(robot: Robot) -> None:
+def test_quaternions_of_three_decimals_are_taken_and_sent_on_with_the_norm_1(
+    robot: Robot,
+) -> None:
     rounded = Quaternion(z=0.707, w=0.707)
     message = changed(robot.map_message(), "info.origin.orientation", rounded)
     grid = robot.grid_of(robot.values, (*ORIGIN[:2], math.pi / 2))
     robot.clear()
     robot.send_map(message)
     start, goal = (
-        changed(robot.pose(cell, 0.0, grid), "pose.orientation", rounded) for cell in (START, GOAL)
+        changed(robot.pose(cell, 0.0, grid), "pose.orientation", rounded)
+        for cell in (START, GOAL)
     )
     robot.send_start(start)
     robot.send_goal(goal)
@@ -262,7 +286,11 @@ def test_a_bad_request_has_an_empty_plan_and_a_reason(robot: Robot, name: str) -
         ("pose.position.x", 50.0, r"lies outside the map .*\(50, .*\) m.*6 x 6 cells"),
         ("pose.position.x", -1e300, r"lies outside the map .*\(-1e\+300, .*\) m"),
         ("pose.position.x", 1.7e308, "x = 1.7e[+]308.*too far"),
-        ("pose", robot.pose((2, 1)).pose, rf"is occupied .*{name}: .* m in cell \(2, 1\)"),
+        (
+            "pose",
+            robot.pose((2, 1)).pose,
+            rf"is occupied .*{name}: .* m in cell \(2, 1\)",
+        ),
     ):
         poses = {"start": robot.pose(START), "goal": robot.pose(GOAL)}
         changed(poses[name], field, value)
@@ -307,7 +335,9 @@ def test_the_log_says_once_what_stays_the_same(robot: Robot) -> None:
     robot.node.wait_for_log("no plan: the goal's frame is 'map', .*'upstairs'")
     plan = robot.client.subscribe(Path, "plan", LATCHED).wait()
     assert (plan.poses, plan.header.frame_id) == ([], "upstairs")
-    assert "map of 6 x 6 cells of 0.5 m in frame 'map'" not in robot.node.log  # it was known
+    assert (
+        "map of 6 x 6 cells of 0.5 m in frame 'map'" not in robot.node.log
+    )  # it was known
     for line in (
         *("map of 6 x 6 cells of 0.5 m in frame 'upstairs'", "a path of "),
         *("no plan: the goal is occupied", "no plan: the goal's frame"),
@@ -394,13 +424,20 @@ def test_what_comes_while_a_plan_takes_long_has_the_last_plan(slow_robot: Any) -
     assert robot.last_plan().poses == []
 
 
-def test_says_what_it_waits_for(run_robot: Any, model: FilePath, tmp_path: FilePath) -> None:
-    path, remaps = tmp_path / "model.safetensors", ["map:=plant", "plan:=route", "__node:=router"]
+def test_says_what_it_waits_for(
+    run_robot: Any, model: FilePath, tmp_path: FilePath
+) -> None:
+    path, remaps = (
+        tmp_path / "model.safetensors",
+        ["map:=plant", "plan:=route", "__node:=router"],
+    )
     with run_robot("", {"model": str(path)}, remaps=remaps) as robot:
         client, node, robot.name = robot.client, robot.node, "/router"
         plans = client.subscribe(Path, "route", LATCHED)
         node.wait_for_log("waiting for a map on /plant")
-        unheard = client.node.create_publisher(OccupancyGrid, "plant", QoSProfile(depth=1))
+        unheard = client.node.create_publisher(
+            OccupancyGrid, "plant", QoSProfile(depth=1)
+        )
         name = client.node.get_fully_qualified_name()
         unfit = "its durability is volatile, and transient_local is asked for; let it publish so"
         remedy = "start .* the parameter qos_overrides./plant.subscription.durability:=volatile"
@@ -408,7 +445,9 @@ def test_says_what_it_waits_for(run_robot: Any, model: FilePath, tmp_path: FileP
         robot.wait_for_reason(f"no map was received .*; {heard}: {unfit}, or {remedy}")
         # A publisher may be discovered before its node, and named as unknown until then.
         assert node.log.count(f"nothing of {name} ") == 1
-        assert "New publisher discovered" not in node.log  # rclpy's words, without the remedy
+        assert (
+            "New publisher discovered" not in node.log
+        )  # rclpy's words, without the remedy
         client.node.destroy_publisher(unheard)
         missing = "no map was received on /plant yet; start a map server"
         assert values_of(robot.wait_for_reason(f"{missing}$"))["status"] == "NO_REQUEST"

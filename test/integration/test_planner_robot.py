@@ -11,7 +11,12 @@ import pytest
 from builtin_interfaces.msg import Time
 from client import cells_of, wait_for
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped, TransformStamped
+from geometry_msgs.msg import (
+    PoseArray,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    TransformStamped,
+)
 from integration.robot import (
     GOAL,
     GOAL_YAW,
@@ -57,45 +62,84 @@ SAME: list[tuple[dict[str, Any], ...]] = [
     ({"allow_unknown": True}, {"allow_unknown": True}, {}, {}),
     ({"use_map_costs": True}, {"use_map_costs": True}, {}, {}),
     (RADIUS, {}, RADIUS, {}),
-    ({"clearance_weight": 1.0000005}, {}, {"clearance_weight": 1}, {}),  # its range lets it pass
+    (
+        {"clearance_weight": 1.0000005},
+        {},
+        {"clearance_weight": 1},
+        {},
+    ),  # its range lets it pass
     ({"move_rule": "corner_cutting"}, {}, {}, {"move_rule": "corner_cutting"}),
     ({"path_simplification": "line_of_sight"}, {}, {}, {}),
     ({"path_simplification": "none"}, {}, {}, {"simplified": False}),
     ({}, {}, {}, {"goal": (26, 29), "tolerance": 2}),
     ({}, {}, {}, FROM_OBSTACLE),
-    ({"start_clearing_radius": 0.0}, {}, {}, FROM_OBSTACLE | {"start_clearing_radius": 0}),
+    (
+        {"start_clearing_radius": 0.0},
+        {},
+        {},
+        FROM_OBSTACLE | {"start_clearing_radius": 0},
+    ),
 ]
 
 
 def test_a_path_is_the_librarys_with_the_same_parameters(robot: Robot) -> None:
     random, library, seen = np.random.default_rng(13), Planner.load("any_map"), set()
-    values = random.choice([0, 60, -1, 100], (30, 30), p=[0.84, 0.08, 0.05, 0.03]).astype(np.int8)
+    values = random.choice(
+        [0, 60, -1, 100], (30, 30), p=[0.84, 0.08, 0.05, 0.03]
+    ).astype(np.int8)
     values[0, 0], values[-1, -1], values[0, 5], values[-2:, -5:-2] = 0, 0, 100, 100
     robot.set_map(robot.stamped_map(values))
     for parameters, rules, body, options in SAME:
         robot.reset(**parameters)
-        asked = {"start": (0, 0), "goal": (29, 29), "tolerance": 0, "simplified": True, **options}
-        grid = GridMap.from_occupancy_values(values, RESOLUTION, robot.grid.origin, **rules)
+        asked = {
+            "start": (0, 0),
+            "goal": (29, 29),
+            "tolerance": 0,
+            "simplified": True,
+            **options,
+        }
+        grid = GridMap.from_occupancy_values(
+            values, RESOLUTION, robot.grid.origin, **rules
+        )
         plan = library.plan(inflate(grid, **{"robot_radius": 0, **body}), **asked)
         request = GetPlan.Request(tolerance=asked["tolerance"] * RESOLUTION)
-        request.start, request.goal = robot.pose(asked["start"]), robot.pose(asked["goal"])
+        request.start, request.goal = (
+            robot.pose(asked["start"]),
+            robot.pose(asked["goal"]),
+        )
         path = robot.client.call(GetPlan, "planner/get_plan", request).plan
         how = parameters.get("path_simplification", "straight")
         points = corners_of(path) if how == "straight" else points_of(path)
         cells = [grid.world_to_cell(*point) for point in points]
         # Beside an obstacle the centre of an end's cell stays.
-        assert [cell for cell, after in pairwise([*cells, None]) if cell != after] == [*plan.cells]
+        assert [cell for cell, after in pairwise([*cells, None]) if cell != after] == [
+            *plan.cells
+        ]
         seen.add((how, plan.cells))
     assert len(seen) == len(SAME)  # each parameter counts
 
 
-def test_a_start_on_an_obstacle_or_deep_in_one_is_told(robot: Robot, hall: np.ndarray) -> None:
+def test_a_start_on_an_obstacle_or_deep_in_one_is_told(
+    robot: Robot, hall: np.ndarray
+) -> None:
     thick = hall.copy()
     thick[:, 8:13] = 100
     for values, parameters, reason in (
-        (hall, {"robot_radius": 1.2}, "; the start is occupied: obstacles within 1.2 m of it"),
-        (hall, {"start_clearing_radius": 0.0}, r"occupied \(.*\); set .* start_clearing_radius"),
-        (thick, {}, "deeper than the start_clearing_radius, 0.5 m; set the start on a free"),
+        (
+            hall,
+            {"robot_radius": 1.2},
+            "; the start is occupied: obstacles within 1.2 m of it",
+        ),
+        (
+            hall,
+            {"start_clearing_radius": 0.0},
+            r"occupied \(.*\); set .* start_clearing_radius",
+        ),
+        (
+            thick,
+            {},
+            "deeper than the start_clearing_radius, 0.5 m; set the start on a free",
+        ),
     ):
         robot.reset(**parameters)
         robot.set_map(robot.stamped_map(values))
@@ -105,15 +149,27 @@ def test_a_start_on_an_obstacle_or_deep_in_one_is_told(robot: Robot, hall: np.nd
         robot.wait_for_reason(reason)
 
 
-def test_unknown_space_is_named_where_it_is_the_reason(robot: Robot, hall: np.ndarray) -> None:
+def test_unknown_space_is_named_where_it_is_the_reason(
+    robot: Robot, hall: np.ndarray
+) -> None:
     across, around = hall.copy(), hall.copy()
     across[9:, 10] = -1
     around[2, 15] = -1
     remedy = "; set allow_unknown, or map it$"
     for values, goal, radius, reason in (
         (around, (15, 2), 0.0, r"the goal lies in unknown space \(.*\)"),
-        (around, (15, 3), 0.6, r"the goal is nearer to unknown space than .* allows \(.*\)"),
-        (across, (15, 2), 0.0, r"no path leads .*, but a path leads through unknown space \(.*\)"),
+        (
+            around,
+            (15, 3),
+            0.6,
+            r"the goal is nearer to unknown space than .* allows \(.*\)",
+        ),
+        (
+            across,
+            (15, 2),
+            0.0,
+            r"no path leads .*, but a path leads through unknown space \(.*\)",
+        ),
     ):
         robot.reset(robot_radius=radius)
         robot.set_map(robot.stamped_map(values))
@@ -133,14 +189,18 @@ def test_a_goal_moves_within_the_tolerance_of_the_request(robot: Robot) -> None:
         return cells_of(robot.grid, path)[-1:]
 
     assert get_cells(0.0) == []
-    robot.wait_for_reason("the goal is occupied.*greater tolerance", {"status": "GOAL_OCCUPIED"})
+    robot.wait_for_reason(
+        "the goal is occupied.*greater tolerance", {"status": "GOAL_OCCUPIED"}
+    )
     assert get_cells(0.5) == [(9, 2)]
     robot.wait_for_reason("a path of .*; the goal is occupied and moved 0.5 m")
     assert get_cells(math.nan) == []
     robot.wait_for_reason("the tolerance is nan", {"status": "INVALID_TOLERANCE"})
     robot.change(robot_radius=0.9)
     assert get_cells(0.0, (9, 2)) == []
-    robot.wait_for_reason("the goal is occupied .*nearer to an obstacle than robot_radius, 0.9")
+    robot.wait_for_reason(
+        "the goal is occupied .*nearer to an obstacle than robot_radius, 0.9"
+    )
     robot.change(robot_radius=0.0, tolerance=0.6)
     robot.send_start(robot.pose((0, 2)))
     robot.send_goal(robot.pose((10, 2)))
@@ -159,7 +219,9 @@ def test_the_start_comes_from_odometry(robot: Robot) -> None:
     robot.send_goal(robot.pose((19, 14)))
     robot.client.publish("initialpose", PoseWithCovarianceStamped(header=Header()))
     robot.wait_for_reason("initialpose refused")
-    robot.change(start_source="odometry", replan_period=3600.0, transform_tolerance=1000.0)
+    robot.change(
+        start_source="odometry", replan_period=3600.0, transform_tolerance=1000.0
+    )
     robot.clear()
     wait_until_unknown("initialpose", "nothing came on /robot/odom in the map's frame")
     robot.client.publisher(Odometry, "odom")
@@ -185,7 +247,9 @@ def test_the_start_comes_from_odometry(robot: Robot) -> None:
 
 @pytest.mark.skipif(has_tf(), reason="tf2_ros is installed")
 def test_without_tf2_it_says_so_and_the_other_sources_work(robot: Robot) -> None:
-    assert "start_source is 'tf', which needs tf2_ros" in robot.refuse(start_source="tf")
+    assert "start_source is 'tf', which needs tf2_ros" in robot.refuse(
+        start_source="tf"
+    )
     robot.send_start(robot.pose((5, 5)))
     robot.send_goal(robot.pose((6, 6)))
     robot.wait_for_path((5, 5), (6, 6))
@@ -238,7 +302,9 @@ def transformed(run_robot: Any, hall: np.ndarray) -> Iterator[Robot]:
         yield robot
 
 
-def transform(robot: Robot, cell: Cell, age: float | None = None, child: str = "base_link") -> Any:
+def transform(
+    robot: Robot, cell: Cell, age: float | None = None, child: str = "base_link"
+) -> Any:
     """Return where the robot was so many seconds ago; None for a static transform."""
     message = TransformStamped(header=Header(frame_id="map"), child_frame_id=child)
     if age is not None:
@@ -249,12 +315,16 @@ def transform(robot: Robot, cell: Cell, age: float | None = None, child: str = "
     return message
 
 
-def test_a_goal_waits_for_the_first_transform_that_is_not_too_old(transformed: Robot) -> None:
+def test_a_goal_waits_for_the_first_transform_that_is_not_too_old(
+    transformed: Robot,
+) -> None:
     robot, client = transformed, transformed.client
     robot.send_goal(robot.pose((19, 14)))
     none = "no transform leads from 'base_link' to 'map' "
     robot.wait_for_reason(none + ".*publish one, or set")
-    assert all(plan.poses == [] for plan in [robot.plans.wait(), *robot.plans.messages()])
+    assert all(
+        plan.poses == [] for plan in [robot.plans.wait(), *robot.plans.messages()]
+    )
     client.publish("tf", transform(robot, (4, 7), age=6.0))
     late = r"\(the newest is ([6-9]|\d\d)[.\d]* s old, more than transform_tolerance, 0.3 s\); publ"
     robot.wait_for_reason(none + late, {"status": "NO_START"})
@@ -264,7 +334,9 @@ def test_a_goal_waits_for_the_first_transform_that_is_not_too_old(transformed: R
     assert robot.get_plan(PoseStamped(), robot.pose((0, 0))).poses
 
 
-def test_docks_in_another_frame_stay_where_they_are_when_it_moves(transformed: Robot) -> None:
+def test_docks_in_another_frame_stay_where_they_are_when_it_moves(
+    transformed: Robot,
+) -> None:
     robot, client = transformed, transformed.client
     odom = transform(robot, (3, 2), child="odom")
     x, y = robot.grid.cell_to_world((3, 2))
@@ -316,7 +388,9 @@ def test_odometry_counts_while_it_comes(run_robot: Any, model: Path) -> None:
         client, node = robot.client, robot.node
         client.publisher(OccupancyGrid, "map", QoSProfile(depth=1))
         robot.set_map(robot.stamped_map())
-        client.publisher(Odometry, "odom", qos_profile_sensor_data)  # as many drivers publish it
+        client.publisher(
+            Odometry, "odom", qos_profile_sensor_data
+        )  # as many drivers publish it
         client.publisher(Clock, "/clock")
         client.wait_for_discovery("planner")
         for began in (1000, 500):
@@ -328,17 +402,25 @@ def test_odometry_counts_while_it_comes(run_robot: Any, model: Path) -> None:
             assert plans()
             set_clock(began + 3)
             assert not plans()
-            robot.wait_for_reason(r"nothing came on /\w+/odom for 3 s; publish it more often")
+            robot.wait_for_reason(
+                r"nothing came on /\w+/odom for 3 s; publish it more often"
+            )
             client.publish("odom", odometry(robot, START))
             wait_for("plan", plans)
         assert node.log.count("the clock jumped by -503 s") == 1
 
-        (heard,) = (it for it in client.node.subscriptions if it.topic_name == "/diagnostics")
+        (heard,) = (
+            it for it in client.node.subscriptions if it.topic_name == "/diagnostics"
+        )
         client.run(client.node.destroy_subscription, heard)  # its thread may hold it
         second = client.node.create_publisher(Odometry, "odom", 10)
         name = client.node.get_fully_qualified_name()
-        expected = rf"/odom has 2 publishers \({name}, {name}\), so the robot's place may jump"
-        node.wait_for_log("odom has 2 publishers")  # though nobody reads the diagnostics
+        expected = (
+            rf"/odom has 2 publishers \({name}, {name}\), so the robot's place may jump"
+        )
+        node.wait_for_log(
+            "odom has 2 publishers"
+        )  # though nobody reads the diagnostics
         robot.diagnostics = client.subscribe(DiagnosticArray, "/diagnostics")
         assert robot.wait_for_reason(expected).level == WARN
         assert node.log.count("has 2 publishers") == 1

@@ -87,7 +87,9 @@ class Asked:
         )
         assert all(result.successful for result in results)
 
-    def ask(self, goal: tuple[int, int] = GOAL, given_up: Callable[[], Any] = lambda: None) -> Any:
+    def ask(
+        self, goal: tuple[int, int] = GOAL, given_up: Callable[[], Any] = lambda: None
+    ) -> Any:
         """Return the future of an answer, asked for as an action asks."""
         task = Task(pose(GRID, START), [pose(GRID, goal)], "")
         return self.executor.create_task(self.node._plan_for_action, task, given_up)
@@ -107,7 +109,9 @@ class Asked:
 
 @pytest.fixture
 def asked() -> Iterator[Asked]:
-    rclpy.init(args=["--ros-args", "-p", "map_type:=costmap", "-p", "map_timeout:=3600.0"])
+    rclpy.init(
+        args=["--ros-args", "-p", "map_type:=costmap", "-p", "map_timeout:=3600.0"]
+    )
     asked = Asked()
     yield asked
     asked.node.destroy_node()
@@ -122,7 +126,9 @@ def failed_before(asked: Asked) -> None:
     assert asked.answer(asked.ask()) == "NO_PATH"
 
 
-def test_a_retry_waits_for_the_cleared_costmap_and_no_other_request_does(asked: Asked) -> None:
+def test_a_retry_waits_for_the_cleared_costmap_and_no_other_request_does(
+    asked: Asked,
+) -> None:
     failed_before(asked)
     retry = asked.ask()
     assert asked.is_waiting(retry)
@@ -149,7 +155,9 @@ def test_a_retry_waits_whatever_the_stamps_of_costmaps(
     for shift in (None, -100.0, -1.0, -0.1, 0.0, 0.1, 1.0, 100.0):
         retry = asked.ask()
         assert asked.is_waiting(retry)
-        asked.send(RING, seconds_ahead=shift)  # from before the clear, or from a clear in vain
+        asked.send(
+            RING, seconds_ahead=shift
+        )  # from before the clear, or from a clear in vain
         asked.set_period(1000.0)
         assert asked.is_waiting(retry)
         late[0] += 2001.0
@@ -185,7 +193,9 @@ def test_the_last_costmap_in_time_counts_though_it_is_planned_on_later(
     assert asked.answer(asked.ask()) == "SUCCEEDED"
 
 
-def test_a_retry_that_waits_is_canceled_or_answered_when_the_node_stops(asked: Asked) -> None:
+def test_a_retry_that_waits_is_canceled_or_answered_when_the_node_stops(
+    asked: Asked,
+) -> None:
     failed_before(asked)
     reasons = list[Outcome]()
     retry = asked.ask(given_up=lambda: reasons[0] if reasons else None)
@@ -239,7 +249,9 @@ def test_how_long_a_retry_waits(asked: Asked) -> None:
     assert [asked.answer(asked.ask()) for _ in range(2)] == ["NO_PATH", "NO_PATH"]
 
 
-def test_the_period_is_that_of_the_last_arrivals(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_period_is_that_of_the_last_arrivals(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     now = [0.0]
     clock = SimpleNamespace(monotonic=lambda: now[0])
     monkeypatch.setattr("ddqn_planner.nodes.map_source.time", clock)
@@ -254,7 +266,9 @@ def test_the_period_is_that_of_the_last_arrivals(monkeypatch: pytest.MonkeyPatch
     assert arrivals.number == 14
 
 
-def test_a_retry_has_the_goal_of_a_recent_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_retry_has_the_goal_of_a_recent_failure(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     now = [100.0]
     clock = SimpleNamespace(monotonic=lambda: now[0])
     monkeypatch.setattr("ddqn_planner.nodes.retries.time", clock)

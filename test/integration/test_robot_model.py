@@ -26,7 +26,11 @@ from ddqn_planner.nodes.planner_node import PlannerNode
 from ddqn_planner.nodes.runtime import LATCHED
 
 CELL, ORIGIN = 0.1, (-1.0, 2.0, 0.5)
-START, BESIDE, BEYOND = (10, 10), (20, 30), (50, 30)  # cells: before the wall, and behind its door
+START, BESIDE, BEYOND = (
+    (10, 10),
+    (20, 30),
+    (50, 30),
+)  # cells: before the wall, and behind its door
 DOOR = slice(22, 30)
 
 
@@ -93,10 +97,14 @@ def ends_at(path: Path, grid: GridMap, goal: Cell, yaw: float) -> bool:
     return is_there and math.cos(poses[-1, 2] - yaw) > math.cos(0.25)
 
 
-def path_to(robot: Robot, goal: Cell, yaw: float, grid: GridMap | None = None) -> np.ndarray:
+def path_to(
+    robot: Robot, goal: Cell, yaw: float, grid: GridMap | None = None
+) -> np.ndarray:
     """Wait for a plan to a pose, and check it."""
     grid = grid or robot.grid
-    return check(robot.plans.wait(lambda path: ends_at(path, grid, goal, yaw)), grid, goal, yaw)
+    return check(
+        robot.plans.wait(lambda path: ends_at(path, grid, goal, yaw)), grid, goal, yaw
+    )
 
 
 def drive_to(robot: Robot, goal: Cell, yaw: float) -> np.ndarray:
@@ -105,7 +113,9 @@ def drive_to(robot: Robot, goal: Cell, yaw: float) -> np.ndarray:
     return path_to(robot, goal, yaw)
 
 
-def test_a_path_through_a_door_has_the_goals_heading_and_gets_better(robot: Robot) -> None:
+def test_a_path_through_a_door_has_the_goals_heading_and_gets_better(
+    robot: Robot,
+) -> None:
     robot.set(path_bound=4.0, switch_threshold=0.0)
     first = drive_to(robot, BEYOND, 2.1)
     assert robot.grid.world_to_cell(*first[0, :2]) == START
@@ -119,7 +129,9 @@ def test_a_path_through_a_door_has_the_goals_heading_and_gets_better(robot: Robo
 
 def test_the_nearest_pose_counts_and_services_are_answered(robot: Robot) -> None:
     goals = [at(robot, *goal).pose for goal in ((BEYOND, 0.5), (BESIDE, 0.5))]
-    robot.client.publish("goal_poses", PoseArray(header=Header(frame_id="map"), poses=goals))
+    robot.client.publish(
+        "goal_poses", PoseArray(header=Header(frame_id="map"), poses=goals)
+    )
     path_to(robot, BESIDE, 0.5)
     robot.wait_for_reason("to goal 2 of 2")
     answer = robot.get_plan(at(robot, BEYOND, 0.0), at(robot, START, 3.0))
@@ -129,14 +141,20 @@ def test_the_nearest_pose_counts_and_services_are_answered(robot: Robot) -> None
     robot.wait_for_reason(f"{why}; set the start where the robot's body has room$")
 
 
-def test_a_path_to_one_of_several_goals_is_kept_on_a_map_with_other_cells(robot: Robot) -> None:
+def test_a_path_to_one_of_several_goals_is_kept_on_a_map_with_other_cells(
+    robot: Robot,
+) -> None:
     robot.set(switch_threshold=1.0)
     goals = [pose(robot.grid, cell, 0.5, offset=0.04).pose for cell in (BEYOND, BESIDE)]
-    robot.client.publish("goal_poses", PoseArray(header=Header(frame_id="map"), poses=goals))
+    robot.client.publish(
+        "goal_poses", PoseArray(header=Header(frame_id="map"), poses=goals)
+    )
     robot.wait_for_reason("to goal 2 of 2")
     x, y, yaw = ORIGIN
     for share in (0.2, 0.4, 0.6, 0.8):
-        moved = GridMap(robot.values > 0, CELL, (x - share * CELL, y - share * CELL, yaw))
+        moved = GridMap(
+            robot.values > 0, CELL, (x - share * CELL, y - share * CELL, yaw)
+        )
         message = map_message(robot.values, moved, next(NUMBERS))
         assert "to goal 2 of 2" in robot.plan_on(message, reason="").message
     robot.send_map()
@@ -171,14 +189,21 @@ def test_bodies_along_the_path_are_shown_to_who_asks(robot: Robot) -> None:
 
     def is_of_a_plan(message: MarkerArray) -> bool:
         (marker,) = message.markers
-        points = np.array([(point.x, point.y) for point in marker.points]).reshape(-1, 8, 2)
+        points = np.array([(point.x, point.y) for point in marker.points]).reshape(
+            -1, 8, 2
+        )
         is_of = []
         for path in robot.plans.messages():
             x, y, yaw = array_of(path).T.reshape(3, -1)
-            bodies = np.sort((x + 1j * y)[:, None] + np.exp(1j * yaw)[:, None] * corners)
+            bodies = np.sort(
+                (x + 1j * y)[:, None] + np.exp(1j * yaw)[:, None] * corners
+            )
             outlines = np.sort(points @ [1, 1j])[:, ::2]
             is_of += [
-                all(np.abs(bodies - outline).max(axis=1).min() < 1e-6 for outline in outlines)
+                all(
+                    np.abs(bodies - outline).max(axis=1).min() < 1e-6
+                    for outline in outlines
+                )
             ]
         return len(points) > 3 and marker.type == Marker.LINE_LIST and any(is_of)
 
@@ -193,9 +218,14 @@ def test_actions_lead_through_poses_and_paths_are_checked(
 ) -> None:
     """The node is asked as its actions ask it, which need nav2_msgs."""
     rclpy.init(args=["--ros-args", "-p", f"model:={model}"])
-    node, executor, grid = PlannerNode(), SingleThreadedExecutor(), GridMap(rooms > 0, CELL, ORIGIN)
+    node, executor, grid = (
+        PlannerNode(),
+        SingleThreadedExecutor(),
+        GridMap(rooms > 0, CELL, ORIGIN),
+    )
     start, middle, goal = (
-        pose(grid, cell, yaw, 0.01) for cell, yaw in ((START, 0.5), (BESIDE, 2.0), (BEYOND, 1.0))
+        pose(grid, cell, yaw, 0.01)
+        for cell, yaw in ((START, 0.5), (BESIDE, 2.0), (BEYOND, 1.0))
     )
 
     def run(task: Any) -> Any:
@@ -204,20 +234,28 @@ def test_actions_lead_through_poses_and_paths_are_checked(
         return future.result()
 
     def is_valid(path: Path) -> bool:
-        answer = run(node._on_is_path_valid(SimpleNamespace(path=path), SimpleNamespace()))
+        answer = run(
+            node._on_is_path_valid(SimpleNamespace(path=path), SimpleNamespace())
+        )
         return bool(answer.is_valid)
 
     try:
         executor.add_node(node)
         node._map._take(map_message(rooms, grid, next(NUMBERS)))
-        path, outcome = run(node._plan_for_action(Task(start, [middle, goal], ""), lambda: None))
+        path, outcome = run(
+            node._plan_for_action(Task(start, [middle, goal], ""), lambda: None)
+        )
         poses = check(path, grid, BEYOND, 1.0)
         assert outcome.status == "SUCCEEDED"
-        np.testing.assert_allclose(np.exp(1j * poses), np.exp(1j * outcome.plan.poses), atol=1e-6)
+        np.testing.assert_allclose(
+            np.exp(1j * poses), np.exp(1j * outcome.plan.poses), atol=1e-6
+        )
         assert np.abs(np.diff(poses, axis=0)).max(axis=1).min() > 1e-6
         assert any(ends_at(Path(poses=[it]), grid, BESIDE, 2.0) for it in path.poses)
         first, _ = run(node._plan_for_action(Task(start, [goal], ""), lambda: None))
-        again, outcome = run(node._plan_for_action(Task(first.poses[9], [goal], ""), lambda: None))
+        again, outcome = run(
+            node._plan_for_action(Task(first.poses[9], [goal], ""), lambda: None)
+        )
         assert outcome.plan.extra_cost is not None  # kept
         assert np.array_equal(array_of(again), array_of(first)[9:])
         assert is_valid(path)
@@ -228,14 +266,21 @@ def test_actions_lead_through_poses_and_paths_are_checked(
         node._map._take(map_message(narrow, grid, next(NUMBERS)))
         through, _ = run(node._plan_for_action(Task(start, [goal], ""), lambda: None))
         poses_through = array_of(through)
-        from_door = np.abs(poses_through[:, :2] - grid.cell_to_world((30, 26))).sum(axis=1)
+        from_door = np.abs(poses_through[:, :2] - grid.cell_to_world((30, 26))).sum(
+            axis=1
+        )
         number = int(from_door.argmin())
         aside = through.poses[number]
         aside.pose.position.x -= 0.06 * math.sin(ORIGIN[2])
         aside.pose.position.y += 0.06 * math.cos(ORIGIN[2])
-        rest, outcome = run(node._plan_for_action(Task(aside, [goal], ""), lambda: None))
+        rest, outcome = run(
+            node._plan_for_action(Task(aside, [goal], ""), lambda: None)
+        )
         assert np.array_equal(array_of(rest), poses_through[number:])
-        assert "cells, kept, as there is none from the cell and heading nearest" in outcome.reason
+        assert (
+            "cells, kept, as there is none from the cell and heading nearest"
+            in outcome.reason
+        )
         node._map._take(map_message(rooms, grid, next(NUMBERS)))
         blocked = rooms.copy()
         x, y = grid.world_to_cell(*poses[len(poses) // 2, :2])

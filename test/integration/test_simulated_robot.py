@@ -40,7 +40,9 @@ def test_a_robot_drives_round_obstacles_and_never_into_one(seed: int) -> None:
         robot.follow(metres(robot, path))
         while robot.is_driving:
             robot.step()
-            assert robot.world.grid.is_free(robot.world.grid.world_to_cell(robot.x, robot.y))
+            assert robot.world.grid.is_free(
+                robot.world.grid.world_to_cell(robot.x, robot.y)
+            )
         end = robot.world.grid.cell_to_world(goal)
         assert (robot.x, robot.y) == pytest.approx(end)
         at, drives = goal, drives + 1
@@ -57,7 +59,9 @@ def test_a_robot_stands_rather_than_to_follow_a_path_beyond_a_wall() -> None:
         assert robot.is_driving is is_followed
 
 
-def test_a_robot_without_a_path_asks_again(make_client: Callable[[str], Client]) -> None:
+def test_a_robot_without_a_path_asks_again(
+    make_client: Callable[[str], Client],
+) -> None:
     client = make_client("/stranded")
     goals = client.subscribe(PoseStamped, "goal_pose")
     odometry = client.subscribe(Odometry, "odom", keep=1)

@@ -86,7 +86,9 @@ def message_of(name: str, value: Any) -> Any:
 
 
 @pytest.fixture(scope="module")
-def shared_user(run_node: Any, make_client: Any, small_values: np.ndarray) -> Iterator[Trainee]:
+def shared_user(
+    run_node: Any, make_client: Any, small_values: np.ndarray
+) -> Iterator[Trainee]:
     """The user of a trainer that most tests share: to start one takes seconds."""
     with run_node("trainer_node", {}, namespace=NAMESPACE, sitecustomize=SOON) as node:
         user = Trainee(make_client(NAMESPACE), node, small_values)
@@ -105,7 +107,9 @@ def user(shared_user: Trainee, tmp_path: FilePath) -> Iterator[Trainee]:
     shared_user.stop()
 
 
-def test_a_training_is_seen_saved_resumed_and_replayed(user: Trainee, tmp_path: FilePath) -> None:
+def test_a_training_is_seen_saved_resumed_and_replayed(
+    user: Trainee, tmp_path: FilePath
+) -> None:
     options = {"replay_period": 0.02, "episode_interval": 1, "move_rule": "robot_safe"}
     user.configure(tmp_path, **ENDLESS, **options)
     assert user.call("stop") == "no training was running"
@@ -141,7 +145,9 @@ def test_a_training_is_seen_saved_resumed_and_replayed(user: Trainee, tmp_path: 
     user.stop()
     user.episodes.clear()
     user.call("replay")
-    wait_for("an episode step by step", lambda: (1, 2) in itertools.pairwise(user.lengths()))
+    wait_for(
+        "an episode step by step", lambda: (1, 2) in itertools.pairwise(user.lengths())
+    )
     assert user.call("stop") == "no training was running; the replay was stopped"
     assert user.call("stop") == "no training was running"
 
@@ -155,7 +161,9 @@ def test_episodes_are_drawn_on_their_own_map(user: Trainee, tmp_path: FilePath) 
         for episode in user.episodes.messages():
             places = [(p.pose.position.x, p.pose.position.y) for p in episode.poses]
             assert episode.header.frame_id == "map"
-            assert {round(c % 1.0, 3) for xy in places for c in xy} == {0.5}  # within a cell
+            assert {round(c % 1.0, 3) for xy in places for c in xy} == {
+                0.5
+            }  # within a cell
 
     user.call("start")
     assert_drawn_on_its_own_map()
@@ -173,7 +181,9 @@ def test_episodes_are_drawn_on_their_own_map(user: Trainee, tmp_path: FilePath) 
     user.episodes.wait(lambda episode: episode.header.frame_id == "site")
 
 
-def test_a_planner_follows_what_is_saved(user: Trainee, run_node: Any, tmp_path: FilePath) -> None:
+def test_a_planner_follows_what_is_saved(
+    user: Trainee, run_node: Any, tmp_path: FilePath
+) -> None:
     folder = tmp_path / "run"
     user.configure(folder, steps=300, filters=4)
     user.call("start")
@@ -184,7 +194,9 @@ def test_a_planner_follows_what_is_saved(user: Trainee, run_node: Any, tmp_path:
     shutil.rmtree(folder)  # another computer's planner cannot read it
     with run_node("planner_node", {"follow_trainer": True}, namespace=NAMESPACE):
         its = {"model file": "trainer/model", "model training steps": "300"}
-        user.diagnostics.wait(lambda array: its.items() <= values_of(array.status[0]).items())
+        user.diagnostics.wait(
+            lambda array: its.items() <= values_of(array.status[0]).items()
+        )
 
 
 def test_bad_input_is_refused_by_name(user: Trainee, tmp_path: FilePath) -> None:
@@ -202,17 +214,23 @@ def test_bad_input_is_refused_by_name(user: Trainee, tmp_path: FilePath) -> None
     user.train_on(state="training", message="the map's")
 
 
-def test_a_goal_that_no_path_reaches_is_refused(user: Trainee, tmp_path: FilePath) -> None:
+def test_a_goal_that_no_path_reaches_is_refused(
+    user: Trainee, tmp_path: FilePath
+) -> None:
     walled = user.values.copy()
     walled[:, 3] = 100
     user.client.publish("map", map_message(walled, user.grid), LATCHED)
-    wait_for("refusal", lambda: re.search(r"no path .* \(0, 0\) .* \(5, 5\)", user.refusal()))
+    wait_for(
+        "refusal", lambda: re.search(r"no path .* \(0, 0\) .* \(5, 5\)", user.refusal())
+    )
     assert not (tmp_path / "run").exists()
     user.client.publish("goal_pose", pose(user.grid, START))
     wait_for("refusal", lambda: "start and goal are both (0, 0)" in user.refusal())
 
 
-def test_an_invalid_value_is_refused_with_its_reason_and_nothing_is_half_set(user: Trainee) -> None:
+def test_an_invalid_value_is_refused_with_its_reason_and_nothing_is_half_set(
+    user: Trainee,
+) -> None:
     good = message_of("replay_capacity", 3000), message_of("epsilon_end", 0.2)
     assert user.try_to_set(*good).successful
     for name, value, reason in (
@@ -224,7 +242,11 @@ def test_an_invalid_value_is_refused_with_its_reason_and_nothing_is_half_set(use
         ("environments", 4000, "at most replay_capacity, 3000"),
     ):
         bad = message_of(name, value)
-        for parameters in ([message_of("epsilon_end", 0.3), bad], [bad, good[1]], [bad]):
+        for parameters in (
+            [message_of("epsilon_end", 0.3), bad],
+            [bad, good[1]],
+            [bad],
+        ):
             result = user.try_to_set(*parameters)
             assert not result.successful
             assert re.search(reason, result.reason), result.reason
@@ -249,7 +271,9 @@ def test_a_full_disk_is_logged_once(user: Trainee, tmp_path: FilePath) -> None:
     user.saved.clear()
     user.call("save")
     user.node.wait_for_log("saved again")
-    assert load_model(user.saved.wait().data)[1].steps > int(failing["steps"].split()[0])
+    assert load_model(user.saved.wait().data)[1].steps > int(
+        failing["steps"].split()[0]
+    )
     user.state(state="training", message="training")
     assert user.node.log.count("cannot save") == 1
     assert user.node.log.count("saved again") == 1
@@ -263,7 +287,11 @@ def test_what_cannot_be_started_has_a_remedy(user: Trainee, tmp_path: FilePath) 
     file.touch()
     for folder, reason, of_replay in (
         (broken, "remove it to train anew", "no episode"),
-        (file, "set output_folder to a folder that can be written", "call ~/start first"),
+        (
+            file,
+            "set output_folder to a folder that can be written",
+            "call ~/start first",
+        ),
         (tmp_path, "no training; give a new or empty folder", "call ~/start first"),
     ):
         user.configure(folder)
@@ -273,7 +301,9 @@ def test_what_cannot_be_started_has_a_remedy(user: Trainee, tmp_path: FilePath) 
     user.configure(tmp_path / "run", replay_capacity=10**7)
     pages = int(FilePath(f"/proc/{user.node.process.pid}/statm").read_text().split()[0])
     with limited(user.node.process, resource.RLIMIT_AS, pages * 4096 + 10**8):
-        assert re.search("the memory; take .* smaller .* replay_capacity", user.refusal())
+        assert re.search(
+            "the memory; take .* smaller .* replay_capacity", user.refusal()
+        )
     user.configure(tmp_path / "run", replay_capacity=1000)
     user.call("start")
 
@@ -284,9 +314,14 @@ def test_without_its_libraries_a_start_is_refused_and_the_node_lives(
     missing = "No module named 'torch'"
     torch = f'raise ModuleNotFoundError("{missing}", name="torch")'
     parameters = {"map_file": "dilemma", "output_folder": str(tmp_path / "run")}
-    with run_node("trainer_node", parameters, namespace="/without", torch=torch) as node:
+    with run_node(
+        "trainer_node", parameters, namespace="/without", torch=torch
+    ) as node:
         user = Trainee(make_client("/without"), node, np.zeros((1, 1), np.int8))
-        assert f"needs another library: {missing}; pip install torch gymnasium" in user.refusal()
+        assert (
+            f"needs another library: {missing}; pip install torch gymnasium"
+            in user.refusal()
+        )
         assert "call ~/start first" in user.call("replay", succeeds=False)
     assert "Traceback" not in node.log
 
@@ -303,9 +338,13 @@ def test_nothing_that_comes_in_ends_the_node(user: Trainee, tmp_path: FilePath) 
         user.client.publish("initialpose", initial_pose(stamped))
         user.client.publish("goal_pose", stamped)
         request = SetParameters.Request(parameters=some)
-        results = user.client.call(SetParameters, "trainer/set_parameters", request).results
+        results = user.client.call(
+            SetParameters, "trainer/set_parameters", request
+        ).results
         assert len(results) == len(some)
-        assert all(one.successful or one.reason for one in [*results, user.try_to_set(*some)])
+        assert all(
+            one.successful or one.reason for one in [*results, user.try_to_set(*some)]
+        )
         user.call("save")
 
     fuzz()

@@ -47,7 +47,10 @@ def limited(process: Any, kind: int, size: int) -> Iterator[None]:
 
 class User:
     def __init__(self, client: Client, what: str, saved: str) -> None:
-        self.client, self._name = client, f"{client.node.get_namespace()}/trainer: {what}"
+        self.client, self._name = (
+            client,
+            f"{client.node.get_namespace()}/trainer: {what}",
+        )
         self.episodes = client.subscribe(Path, "trainer/episode", 1000)
         self.saved = client.subscribe(String, saved, LATCHED)
         self.diagnostics = client.subscribe(DiagnosticArray, "/diagnostics")
@@ -65,7 +68,9 @@ class User:
             (status,) = array.status
             found = values_of(status) | {"message": status.message}
             is_it = status.name == self._name  # those of all nodes come on one topic
-            is_it &= all(re.search(text, found.get(key, "")) for key, text in patterns.items())
+            is_it &= all(
+                re.search(text, found.get(key, "")) for key, text in patterns.items()
+            )
             return found if is_it else None
 
         self.diagnostics.clear()

@@ -16,7 +16,13 @@ from ddqn_planner import MoveRule
 from ddqn_planner.grid import MAX_COST_MULTIPLIER, OCCUPIED, UNKNOWN
 from ddqn_planner.grid.moves import MOVES, shortest_distances
 from ddqn_planner.model import ModelMetadata, PropagationQNetwork, load_model
-from ddqn_planner.model.certificate import MAX_FILTERS, MOVE_RULES, Certificate, _margins, certify
+from ddqn_planner.model.certificate import (
+    MAX_FILTERS,
+    MOVE_RULES,
+    Certificate,
+    _margins,
+    certify,
+)
 from ddqn_planner.model.move_costs import every_patch, legal_in_patches
 from ddqn_planner.planning import Planner
 from ddqn_planner.planning.segments import cost_along
@@ -77,20 +83,30 @@ CERTIFICATE = certify(any_map())
 
 
 @given(patches(), st.sampled_from(MoveRule))
-def test_decisions_and_costs_are_as_certified(patch_B9: np.ndarray, rule: MoveRule) -> None:
+def test_decisions_and_costs_are_as_certified(
+    patch_B9: np.ndarray, rule: MoveRule
+) -> None:
     network, certificate = any_map(), CERTIFICATE
-    feature_BI, legal_BA = network.features(patch_B9, rule), legal_in_patches(patch_B9, rule)
+    feature_BI, legal_BA = (
+        network.features(patch_B9, rule),
+        legal_in_patches(patch_B9, rule),
+    )
     np.testing.assert_array_equal(network.success(feature_BI) > 0.5, legal_BA)
     distance_BA = np.where(legal_BA, 1, -1) * logits(network, feature_BI)
     assert distance_BA.min() >= certificate.margin
     share_B9 = np.where(patch_B9 == UNKNOWN, 1, patch_B9 / 100)
     multiplier_B9 = 1 + (MAX_COST_MULTIPLIER - 1) * share_B9
-    true_BA = (multiplier_B9[:, [4]] + multiplier_B9[:, CELLS]) / 2  # the mean of both cells
+    true_BA = (
+        multiplier_B9[:, [4]] + multiplier_B9[:, CELLS]
+    ) / 2  # the mean of both cells
     error_BA = np.abs(network.multiplier(feature_BI) - true_BA) / true_BA
     assert error_BA[legal_BA].max(initial=0) <= certificate.multiplier_error
 
 
-NAMES, SCALES = st.sampled_from(["propagation", "any_map"]), st.sampled_from([0.1, 0.5, 3.0])
+NAMES, SCALES = (
+    st.sampled_from(["propagation", "any_map"]),
+    st.sampled_from([0.1, 0.5, 3.0]),
+)
 
 
 @given(patches(), st.sampled_from(MOVE_RULES), NAMES, st.integers(0, 99), SCALES)
@@ -102,20 +118,29 @@ def test_no_margin_of_any_network_is_above_a_sampled_one(
     plain_B9 = np.where(patch_B9 == OCCUPIED, OCCUPIED, 0).astype(np.int8)
     legal_BA = legal_in_patches(patch_B9, rule)
     margin_BA, _ = _margins(network, network.features(plain_B9, rule), legal_BA)
-    sampled_BA = np.where(legal_BA, 1, -1) * logits(network, network.features(patch_B9, rule))
+    sampled_BA = np.where(legal_BA, 1, -1) * logits(
+        network, network.features(patch_B9, rule)
+    )
     assert (margin_BA <= sampled_BA).all()
 
 
 @cache
-def unsure_and_noisy(share: float, noise: float) -> tuple[PropagationQNetwork, Certificate]:
+def unsure_and_noisy(
+    share: float, noise: float
+) -> tuple[PropagationQNetwork, Certificate]:
     network = any_map()
     for name in ("moves.weight", "moves.bias"):
         network.tensors[name][::2] *= share  # the logits of straight moves
-    network.tensors["prices.weight"] += np.random.default_rng(0).normal(0, noise, (8, 28))
+    network.tensors["prices.weight"] += np.random.default_rng(0).normal(
+        0, noise, (8, 28)
+    )
     return network, certify(network)
 
 
-GRIDS, NOISES = grids_with_costs() | grids_with_free_cell(), st.sampled_from([0.0, 0.02])
+GRIDS, NOISES = (
+    grids_with_costs() | grids_with_free_cell(),
+    st.sampled_from([0.0, 0.02]),
+)
 SHARES = st.sampled_from([1.0, 0.3, 0.1, 0.01])
 
 
@@ -126,7 +151,9 @@ def test_no_path_exceeds_the_certificate(
     grid, goal = place
     if timed:
         slowness = np.linspace(1, 9, grid.occupancy.size, dtype=np.float32)
-        grid = replace(grid, slowness=slowness.reshape(grid.occupancy.shape), seconds_per_cell=1.0)
+        grid = replace(
+            grid, slowness=slowness.reshape(grid.occupancy.shape), seconds_per_cell=1.0
+        )
     network, certificate = unsure_and_noisy(share, noise)
     assert certificate.proved
     assert (noise > 0.0 or share < 1) == (certificate.path_error > 0.03)
@@ -149,7 +176,9 @@ def test_a_decision_that_only_costs_make_wrong_is_found() -> None:
     certificate = certify(network)
     # Action 0 seems impossible where the cost beside its target is high.
     assert (certificate.undecided, certificate.wrong) == (0, 2 * 64)
-    assert str(certificate) == "not proved: 0 of 4,096 decisions are open, 128 are wrong"
+    assert (
+        str(certificate) == "not proved: 0 of 4,096 decisions are open, 128 are wrong"
+    )
 
 
 def test_bounds_that_are_too_loose_leave_decisions_open() -> None:
@@ -190,7 +219,9 @@ def test_a_network_without_costs_is_certified_exactly_under_its_rule() -> None:
     assert certificate.proved
     assert certificate.decisions == 2048
     assert certificate.margin == pytest.approx(5, abs=1e-3)
-    differing = legal_in_patches(PATCHES, MOVE_RULES[0]) != legal_in_patches(PATCHES, MOVE_RULES[1])
+    differing = legal_in_patches(PATCHES, MOVE_RULES[0]) != legal_in_patches(
+        PATCHES, MOVE_RULES[1]
+    )
     both = certify(network)
     assert (both.decisions, both.undecided, both.wrong) == (4096, 0, differing.sum())
     of_rules = [network.certificate(rule) for rule in MOVE_RULES]
@@ -205,13 +236,17 @@ def test_the_error_of_the_costs_is_the_greatest_one() -> None:
     assert 0 < exact.multiplier_error < 1e-4
     network.tensors["prices.bias"][3] = 0.1
     assert certify(network).multiplier_error == pytest.approx(0.1, abs=1e-4)
-    network.tensors["prices.bias"][3] = -0.1  # the learned multiplier is at least 1 all the same
+    network.tensors["prices.bias"][
+        3
+    ] = -0.1  # the learned multiplier is at least 1 all the same
     network.tensors["prices.weight"][3, 0] = -0.2
     certificate = certify(network)
     # 0.3 too little, where the true one is 1.3: beside an occupied cell, and with costs of 15.
     error = 0.3 / 1.3
     assert certificate.multiplier_error == pytest.approx(error, abs=1e-4)
-    assert certificate.path_error == pytest.approx((1 + error) / (1 - error) - 1, abs=1e-3)
+    assert certificate.path_error == pytest.approx(
+        (1 + error) / (1 - error) - 1, abs=1e-3
+    )
 
 
 VALUES = np.array([*range(OCCUPIED), UNKNOWN], np.int8)
@@ -219,7 +254,9 @@ VALUES = np.array([*range(OCCUPIED), UNKNOWN], np.int8)
 
 
 @pytest.mark.parametrize("rule", MOVE_RULES)
-def test_the_error_of_the_costs_is_that_of_the_worst_of_all_pairs_of_cells(rule: MoveRule) -> None:
+def test_the_error_of_the_costs_is_that_of_the_worst_of_all_pairs_of_cells(
+    rule: MoveRule,
+) -> None:
     network = any_map()
     before, after = (values.ravel() for values in np.meshgrid(VALUES, VALUES))
     errors = []

@@ -17,12 +17,20 @@ from networks import random_network
 from strategies import RULES, Place, grids_with_costs, json_values
 
 from ddqn_planner.grid import MoveRule
-from ddqn_planner.model import ModelFileError, ModelMetadata, QNetwork, load_model, save_model
+from ddqn_planner.model import (
+    ModelFileError,
+    ModelMetadata,
+    QNetwork,
+    load_model,
+    save_model,
+)
 from ddqn_planner.model.move_costs import MAX_MULTIPLIER
 from ddqn_planner.planning.field import network_field
 
 SIZED = {"height": 4, "width": 5, "filters": 2, "hidden_units": 0}
-METADATA = ModelMetadata("paper", SIZED, MoveRule.ROBOT_SAFE, 0.95, "0123456789", 7, 3, "0.1.0")
+METADATA = ModelMetadata(
+    "paper", SIZED, MoveRule.ROBOT_SAFE, 0.95, "0123456789", 7, 3, "0.1.0"
+)
 
 # Every example writes the same file anew.
 same_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -46,8 +54,13 @@ KINDS += [(kind, {"filters": 3}) for kind in ("propagation", "any_map")]
 
 
 @pytest.mark.parametrize(("kind", "sizes"), KINDS)
-def test_a_saved_model_comes_back(tmp_path: Path, kind: str, sizes: dict[str, int]) -> None:
-    path, units = tmp_path / "model.safetensors", {"hidden_units": 0} if kind == "paper" else {}
+def test_a_saved_model_comes_back(
+    tmp_path: Path, kind: str, sizes: dict[str, int]
+) -> None:
+    path, units = (
+        tmp_path / "model.safetensors",
+        {"hidden_units": 0} if kind == "paper" else {},
+    )
     network = random_network(kind, **(units | sizes))
     description = replace(METADATA, network=kind, sizes=sizes)
     save_model(path, network, description)
@@ -59,7 +72,9 @@ def test_a_saved_model_comes_back(tmp_path: Path, kind: str, sizes: dict[str, in
         np.testing.assert_array_equal(loaded.tensors[key], tensor)
 
 
-def test_a_file_with_a_wrong_byte_or_cut_off_is_a_model_or_refused(model_path: Path) -> None:
+def test_a_file_with_a_wrong_byte_or_cut_off_is_a_model_or_refused(
+    model_path: Path,
+) -> None:
     content = model_path.read_bytes()
     for length in np.linspace(0, len(content) - 1, 50).astype(int):
         model_path.write_bytes(content[:length])
@@ -69,7 +84,10 @@ def test_a_file_with_a_wrong_byte_or_cut_off_is_a_model_or_refused(model_path: P
     header = 8 + int.from_bytes(content[:8], "little")
     refused = 0
     places = [*range(8), *(chance.randrange(header) for _ in range(200))]
-    for place in [*places, *(chance.randrange(header, len(content)) for _ in range(50))]:
+    for place in [
+        *places,
+        *(chance.randrange(header, len(content)) for _ in range(50)),
+    ]:
         changed = bytearray(content)
         changed[place] ^= chance.randrange(1, 256)
         model_path.write_bytes(changed)
@@ -87,8 +105,12 @@ MISSING = object()
 
 def save_as(path: Path, weights: QNetwork, /, **changes: object) -> None:
     description = {**asdict(METADATA), **changes}
-    description = {key: value for key, value in description.items() if value is not MISSING}
-    content = safetensors.numpy.save(weights.tensors, {"ddqn_planner": json.dumps(description)})
+    description = {
+        key: value for key, value in description.items() if value is not MISSING
+    }
+    content = safetensors.numpy.save(
+        weights.tensors, {"ddqn_planner": json.dumps(description)}
+    )
     path.write_bytes(content)
 
 
@@ -99,7 +121,10 @@ def test_wrong_metadata_is_refused_by_name(tmp_path: Path, network: QNetwork) ->
         *(("extra", 1, "extra"), ("sizes", {**OLD, "depth": 1}, "depth")),
         *(("sizes", {**OLD, "filters": n}, f"filters is {n}") for n in (10**9, 0)),
         ("sizes", {**OLD, "hidden_units": -1}, "hidden_units is -1"),
-        *(("sizes", {**OLD, key: 6}, "holds tensors") for key in ("hidden_units", "height")),
+        *(
+            ("sizes", {**OLD, key: 6}, "holds tensors")
+            for key in ("hidden_units", "height")
+        ),
         ("sizes", [], r"sizes is \[\]; it must be dict"),
         ("gamma", "high", "gamma is 'high'; it must be float or int"),
         *(("gamma", float("nan"), "gamma is nan"), ("steps", 1.5, r"steps is 1\.5")),
@@ -112,12 +137,16 @@ def test_wrong_metadata_is_refused_by_name(tmp_path: Path, network: QNetwork) ->
 
 JSON = json_values(st.none() | st.booleans() | st.integers() | st.floats() | st.text())
 SIZES = st.dictionaries(st.sampled_from(["height", "width", "filters"]), JSON)
-CHANGES = st.dictionaries(st.sampled_from([*asdict(METADATA)]) | st.text(), JSON, min_size=1)
+CHANGES = st.dictionaries(
+    st.sampled_from([*asdict(METADATA)]) | st.text(), JSON, min_size=1
+)
 
 
 @same_folder
 @given(CHANGES | st.fixed_dictionaries({"sizes": SIZES}))
-def test_any_metadata_is_a_models_or_refused(tmp_path: Path, changes: dict[str, Any]) -> None:
+def test_any_metadata_is_a_models_or_refused(
+    tmp_path: Path, changes: dict[str, Any]
+) -> None:
     path = tmp_path / "model.safetensors"
     save_as(path, random_network("paper", **METADATA.sizes), **changes)
     try:
@@ -130,7 +159,9 @@ def test_any_metadata_is_a_models_or_refused(tmp_path: Path, changes: dict[str, 
 def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
     path, tensors = tmp_path / "model.safetensors", {"x": np.zeros(1)}
     texts = ("", "null", "[1, 2", "[" * 10**5, "7", "{}", "1" * 5000)
-    contents = [safetensors.numpy.save(tensors, {"ddqn_planner": text}) for text in texts]
+    contents = [
+        safetensors.numpy.save(tensors, {"ddqn_planner": text}) for text in texts
+    ]
     for content, refusal in (
         (pickle.dumps(tensors), "another kind"),
         (safetensors.numpy.save(tensors), "no model of"),
@@ -141,15 +172,26 @@ def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
             load_model(path)
 
 
-def test_wrong_tensors_and_weights_are_refused(model_path: Path, network: QNetwork) -> None:
+def test_wrong_tensors_and_weights_are_refused(
+    model_path: Path, network: QNetwork
+) -> None:
     right, bias = network.tensors, "convolution.bias"
-    others: list[dict[str, Any]] = [{"more": right[bias]}, dict.fromkeys(right), {bias: None}]
-    others += [{bias: np.zeros(2)}, *({bias: np.zeros(n, np.float32)} for n in (3, (1, 2)))]
+    others: list[dict[str, Any]] = [
+        {"more": right[bias]},
+        dict.fromkeys(right),
+        {bias: None},
+    ]
+    others += [
+        {bias: np.zeros(2)},
+        *({bias: np.zeros(n, np.float32)} for n in (3, (1, 2))),
+    ]
     broken = [{bias: np.float32([0, n])} for n in (np.nan, np.inf, -np.inf)]
     for refusal, changes in (("holds tensors", others), ("not all finite", broken)):
         for change in changes:
             tensors = {**right, **change}
-            network.tensors = {key: tensor for key, tensor in tensors.items() if tensor is not None}
+            network.tensors = {
+                key: tensor for key, tensor in tensors.items() if tensor is not None
+            }
             save_model(model_path, network, METADATA)
             with pytest.raises(ModelFileError, match=refusal):
                 load_model(model_path)
@@ -166,7 +208,9 @@ def test_whatever_finite_weights_say_each_q_is_a_length_or_no_way(
     path, network = tmp_path / "model.safetensors", random_network(kind, filters=3)
     generator = np.random.default_rng(seed)
     for weights in network.tensors.values():
-        weights[:] = np.clip(generator.normal(size=weights.shape) * 10**exponent, -3e38, 3e38)
+        weights[:] = np.clip(
+            generator.normal(size=weights.shape) * 10**exponent, -3e38, 3e38
+        )
     save_model(path, network, replace(METADATA, network=kind, sizes={"filters": 3}))
     grid, goal = place
     loaded, _ = load_model(path)
@@ -178,7 +222,9 @@ def test_whatever_finite_weights_say_each_q_is_a_length_or_no_way(
 def test_a_file_that_claims_or_is_gigabytes_takes_no_memory(tmp_path: Path) -> None:
     sizes = {"height": 4096, "width": 4096, "filters": 4096}
     text = json.dumps({**asdict(METADATA), "sizes": sizes})
-    tensors = {"x": {"dtype": "F32", "shape": [5 * 2**29], "data_offsets": [0, 10 * 2**30]}}
+    tensors = {
+        "x": {"dtype": "F32", "shape": [5 * 2**29], "data_offsets": [0, 10 * 2**30]}
+    }
     header = json.dumps({"__metadata__": {"ddqn_planner": text}, **tensors}).encode()
     claim, path = (10 * 2**30).to_bytes(8, "little"), tmp_path / "huge.safetensors"
     with memory_grows_less_than(20):
@@ -195,8 +241,19 @@ def test_what_is_no_regular_file_is_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.safetensors")
     (tmp_path / "zero.safetensors").symlink_to("/dev/zero")
     (tmp_path / "loop.safetensors").symlink_to(tmp_path / "loop.safetensors")
-    for name in ("folder", "pipe", "zero", "loop", "nul\0", "lone\ud800", "long" * 2000, "none"):
-        with pytest.raises(ModelFileError, match=r"no model file|is a |NUL|half a char|too long"):
+    for name in (
+        "folder",
+        "pipe",
+        "zero",
+        "loop",
+        "nul\0",
+        "lone\ud800",
+        "long" * 2000,
+        "none",
+    ):
+        with pytest.raises(
+            ModelFileError, match=r"no model file|is a |NUL|half a char|too long"
+        ):
             load_model(tmp_path / f"{name}.safetensors")
     for name in ("no_such_model", "no/such.safetensors", "/etc/passwd", "x" * 99):
         with pytest.raises(ModelFileError, match=name):
@@ -211,7 +268,10 @@ def test_an_unreadable_file_is_refused(plain_folder: Path, network: QNetwork) ->
         load_model(path)
 
 
-@given(st.text() | st.sampled_from(["..", ".", "/", "~", "any_map\0", "../any_map", "any_map/"]))
+@given(
+    st.text()
+    | st.sampled_from(["..", ".", "/", "~", "any_map\0", "../any_map", "any_map/"])
+)
 def test_a_model_of_any_name_is_shipped_or_refused(name: str) -> None:
     with suppress(ModelFileError):
         load_model(name)

@@ -12,36 +12,63 @@ from torch_layers import in_torch, papers_layers, propagation_layers
 
 from ddqn_planner.grid import OCCUPIED, UNKNOWN, Cell, GridMap, MoveRule
 from ddqn_planner.model import AnyMapQNetwork, PropagationQNetwork, networks
-from ddqn_planner.model.move_costs import every_patch, patches, read_cells, unique_patches
-from ddqn_planner.model.networks import FREE, GOAL, OBSTACLE, ROBOT, observation_background
+from ddqn_planner.model.move_costs import (
+    every_patch,
+    patches,
+    read_cells,
+    unique_patches,
+)
+from ddqn_planner.model.networks import (
+    FREE,
+    GOAL,
+    OBSTACLE,
+    ROBOT,
+    observation_background,
+)
 from ddqn_planner.planning import Planner
 from ddqn_planner.planning.field import network_field
 
 
 @given(grids_with_free_cell(), st.sampled_from([0, 1, 6]), st.integers(0, 99))
-def test_the_papers_network_is_its_layers(place: Place, hidden_units: int, seed: int) -> None:
+def test_the_papers_network_is_its_layers(
+    place: Place, hidden_units: int, seed: int
+) -> None:
     grid, goal = place
-    sizes = {"height": grid.height, "width": grid.width, "filters": 3, "hidden_units": hidden_units}
+    sizes = {
+        "height": grid.height,
+        "width": grid.width,
+        "filters": 3,
+        "hidden_units": hidden_units,
+    }
     network = random_network("paper", seed, **sizes)
     q = network.q_values(grid, goal, MoveRule.ROBOT_SAFE)
     assert q.shape == (8, grid.height, grid.width)
     assert q.dtype == np.float32
-    background, cells = observation_background(grid.occupancy, goal), grid.occupancy.size
+    background, cells = (
+        observation_background(grid.occupancy, goal),
+        grid.occupancy.size,
+    )
     observations = np.tile(background, (cells, 1))
     np.fill_diagonal(observations, ROBOT)
     shown = torch.from_numpy(observations.reshape(cells, *grid.occupancy.shape))
     answer = papers_layers(in_torch(network.tensors), shown)
-    np.testing.assert_allclose(q, answer.T.reshape(q.shape).numpy(), rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(
+        q, answer.T.reshape(q.shape).numpy(), rtol=1e-5, atol=1e-5
+    )
 
 
 @given(grids_with_costs(), st.sampled_from(MoveRule), st.integers(0, 99))
-def test_propagation_networks_are_their_layers(place: Place, rule: MoveRule, seed: int) -> None:
+def test_propagation_networks_are_their_layers(
+    place: Place, rule: MoveRule, seed: int
+) -> None:
     grid, _ = place
     features = AnyMapQNetwork.features(patches(grid.occupancy, grid.cost), rule)
     for name, inputs in (("any_map", features), ("propagation", features[:, :9])):
         network = random_network(name, seed, filters=5)
         assert isinstance(network, PropagationQNetwork)
-        answers = propagation_layers(in_torch(network.tensors), torch.from_numpy(inputs))
+        answers = propagation_layers(
+            in_torch(network.tensors), torch.from_numpy(inputs)
+        )
         for method, expected in zip(("success", "multiplier"), answers, strict=False):
             answer = getattr(network, method)(inputs)
             np.testing.assert_allclose(answer, expected, rtol=1e-5, atol=1e-5)
@@ -65,7 +92,9 @@ def test_a_patch_is_the_3x3_cells_and_outside_is_occupied(place: Place) -> None:
         padded = np.pad(cells, 1, constant_values=OCCUPIED)
         found = patches(grid.occupancy, cost)
         for (y, x), patch in zip(np.ndindex(cells.shape), found, strict=True):
-            np.testing.assert_array_equal(patch.reshape(3, 3), padded[y : y + 3, x : x + 3])
+            np.testing.assert_array_equal(
+                patch.reshape(3, 3), padded[y : y + 3, x : x + 3]
+            )
         patch_C, unique = read_cells(grid.occupancy, None)[0], every_patch()
         if cost is not None:
             patch_C, unique = unique_patches(grid.occupancy, cost)
@@ -86,7 +115,9 @@ def test_the_features_tell_obstacles_costs_unknown_cells_and_the_rule_apart() ->
     assert AnyMapQNetwork.features(patch, MoveRule.CORNER_CUTTING)[0, 27] == 1
 
 
-def answering(name: str, success: float, multiplier: float = 1.0) -> PropagationQNetwork:
+def answering(
+    name: str, success: float, multiplier: float = 1.0
+) -> PropagationQNetwork:
     """A network that answers with one p and one cost multiplier for every move and patch."""
     network = random_network(name, filters=4)
     assert isinstance(network, PropagationQNetwork)
@@ -102,9 +133,14 @@ def q_values(network: PropagationQNetwork, grid: GridMap, goal: Cell) -> np.ndar
     return network_field(network, grid, goal, MoveRule.ROBOT_SAFE).q
 
 
-def test_many_unique_patches_are_evaluated_in_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_unique_patches_are_evaluated_in_batches(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     cost = np.random.default_rng(0).integers(0, 99, (8, 9)).astype(np.int8)
-    grid, network = GridMap(np.zeros((8, 9)), cost=cost), random_network("any_map", filters=4)
+    grid, network = (
+        GridMap(np.zeros((8, 9)), cost=cost),
+        random_network("any_map", filters=4),
+    )
     at_once = q_values(network, grid, (3, 3))
     assert np.isfinite(at_once).any()
     monkeypatch.setattr(networks, "BATCH", 7)
@@ -113,7 +149,9 @@ def test_many_unique_patches_are_evaluated_in_batches(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("name", ["propagation", "any_map"])
-def test_a_move_is_tried_until_it_succeeds_if_it_does_more_often_than_not(name: str) -> None:
+def test_a_move_is_tried_until_it_succeeds_if_it_does_more_often_than_not(
+    name: str,
+) -> None:
     for success, cost in ((0.995, 1), (0.9, 1 / 0.9), (0.55, 1 / 0.55), (0.45, np.inf)):
         network = answering(name, success)
         for grid, multiplier in (
@@ -122,8 +160,13 @@ def test_a_move_is_tried_until_it_succeeds_if_it_does_more_often_than_not(name: 
         ):
             q = q_values(network, grid, (1, 0))
             assert q[0, 0, 0] == pytest.approx(-cost * multiplier)
-    for multiplier, used in ((99.0, 99.0), (1e4, 100.0)):  # no more than the upper bound
-        q = q_values(answering("any_map", 0.9, multiplier), GridMap(np.zeros((1, 2))), (1, 0))
+    for multiplier, used in (
+        (99.0, 99.0),
+        (1e4, 100.0),
+    ):  # no more than the upper bound
+        q = q_values(
+            answering("any_map", 0.9, multiplier), GridMap(np.zeros((1, 2))), (1, 0)
+        )
         assert q[0, 0, 0] == pytest.approx(-used / 0.9)
 
 
@@ -136,7 +179,9 @@ def test_a_move_whose_cost_or_p_is_nan_is_not_possible(tensor: str) -> None:
     assert not np.isnan(costs.table).any()  # with NaN the field would never end
     q = q_values(network, grid, (1, 0))
     assert q[0, 0, 0] == -np.inf
-    assert q[2, 0, 0] == pytest.approx(-(1 + 2**0.5) / 0.9)  # up, and then down to the right
+    assert q[2, 0, 0] == pytest.approx(
+        -(1 + 2**0.5) / 0.9
+    )  # up, and then down to the right
 
 
 def priced(part: str, place: Any, change: Callable[[Any], Any]) -> Planner:
@@ -168,7 +213,9 @@ def test_a_price_below_that_of_free_cells_is_no_sum_of_two_cells() -> None:
     certificate = planner.network.certificate(MoveRule.ROBOT_SAFE)
     assert certificate is not None
     assert certificate.proved
-    assert planner.network.move_costs(grid, MoveRule.ROBOT_SAFE) is None  # of 1 + max(0, sum)
+    assert (
+        planner.network.move_costs(grid, MoveRule.ROBOT_SAFE) is None
+    )  # of 1 + max(0, sum)
     assert planner.q_field(grid, (2, 1)).q[0, 1, 1] == pytest.approx(-1)
 
 

@@ -29,7 +29,9 @@ from ddqn_planner.model import (
 @cache
 def body_and_motions(motion: str = "differential") -> tuple[np.ndarray, Motions]:
     """A body of 0.88 x 0.48 m, on cells of 0.25 m."""
-    footprint = read_footprint("[[0.59, 0.24], [-0.29, 0.24], [-0.29, -0.24], [0.59, -0.24]]")
+    footprint = read_footprint(
+        "[[0.59, 0.24], [-0.29, 0.24], [-0.29, -0.24], [0.59, -0.24]]"
+    )
     return footprint, make_motions(motion, 1.0, 0.25)
 
 
@@ -47,17 +49,28 @@ def exact(motion: str = "differential") -> RobotNetwork:
 
 
 def metadata_of(network: RobotNetwork) -> ModelMetadata:
-    return ModelMetadata("robot", network.sizes, MoveRule.ROBOT_SAFE, 0.5, "", 7, 3, "1.0.0")
+    return ModelMetadata(
+        "robot", network.sizes, MoveRule.ROBOT_SAFE, 0.5, "", 7, 3, "1.0.0"
+    )
 
 
 def is_right(network: RobotNetwork) -> bool:
     """Whether no pattern of a swept cell, and of cells that are not swept, is decided wrongly."""
-    weights, swept = network.of_primitives(network.tensors["weight"]), network.swept_by_unit
+    weights, swept = (
+        network.of_primitives(network.tensors["weight"]),
+        network.swept_by_unit,
+    )
     rng = np.random.default_rng(0)
-    for weight, body, unit in zip(weights, network.of_primitives(swept), network.unit, strict=True):
+    for weight, body, unit in zip(
+        weights, network.of_primitives(swept), network.unit, strict=True
+    ):
         threshold, weight = network.tensors["threshold"][unit], np.maximum(weight, 0)
         others = weight[~body]
-        patterns = [others, others[:0], *(rng.permutation(others)[:n] for n in (1, 5, 50))]
+        patterns = [
+            others,
+            others[:0],
+            *(rng.permutation(others)[:n] for n in (1, 5, 50)),
+        ]
         if not all(pattern.sum(dtype="f4") < threshold for pattern in patterns):
             return False
         if not (weight[body] > threshold).all():
@@ -71,7 +84,9 @@ def test_one_unit_serves_the_quarter_turns_of_a_primitive(motion: str) -> None:
     network = exact(motion)
     assert len(network.unit) == 4 * network.sizes["units"]
     np.testing.assert_array_equal(network.swept(), swept_cells(footprint, motions))
-    assert str(network.certificate()).startswith(f"proved: all {network.swept().sum():,} cells")
+    assert str(network.certificate()).startswith(
+        f"proved: all {network.swept().sum():,} cells"
+    )
     # Primitives that are no quarter turns of each other have units of their own.
     bent = tuple(
         np.vstack([p[:1], p[1:-1] + np.array([0, 0.3 * (i < 9), 0]), p[-1:]])
@@ -85,9 +100,15 @@ def test_one_unit_serves_the_quarter_turns_of_a_primitive(motion: str) -> None:
     np.testing.assert_array_equal(other.swept(), expected)
 
 
-@given(st.integers(0, 2**32 - 1), st.floats(-3, 1), st.sampled_from(["weight", "threshold"]))
+@given(
+    st.integers(0, 2**32 - 1),
+    st.floats(-3, 1),
+    st.sampled_from(["weight", "threshold"]),
+)
 @example(0, -6e-8, "weight")
-def test_a_damaged_robot_is_refused_or_right(seed: int, exponent: float, name: str) -> None:
+def test_a_damaged_robot_is_refused_or_right(
+    seed: int, exponent: float, name: str
+) -> None:
     network, random = exact(), np.random.default_rng(seed)
     network.tensors[name].flat[random.integers(network.tensors[name].size)] += (
         random.choice([-1, 1]) * 10**exponent
@@ -115,17 +136,25 @@ def test_the_proof_is_that_of_all_patterns_of_a_small_body() -> None:
     for _ in range(40):
         # Only nine cells have weights, so that all their patterns can be tried.
         cells = random.choice(network.tensors["weight"][0].size, 9, replace=False)
-        weight, body = np.zeros(network.tensors["weight"][0].size, "f4"), np.zeros(9, np.bool_)
+        weight, body = (
+            np.zeros(network.tensors["weight"][0].size, "f4"),
+            np.zeros(9, np.bool_),
+        )
         body[: random.integers(1, 9)] = True
-        weight[cells] = np.where(body, random.uniform(0.9, 2, 9), random.uniform(0, 0.25, 9))
+        weight[cells] = np.where(
+            body, random.uniform(0.9, 2, 9), random.uniform(0, 0.25, 9)
+        )
         patterns = [list(p) for n in range(10) for p in combinations(range(9), n)]
         possible = [1 - weight[cells[p]].sum() > 0 for p in patterns]
         right = possible == [not body[p].any() for p in patterns]
-        network.tensors["weight"][:] = weight.reshape(network.tensors["weight"][0].shape)
+        network.tensors["weight"][:] = weight.reshape(
+            network.tensors["weight"][0].shape
+        )
         swept = np.zeros(weight.size, np.bool_)
         swept[cells[body]] = True
         network.swept_by_unit = np.broadcast_to(
-            swept.reshape(network.tensors["weight"].shape[1:]), network.tensors["weight"].shape
+            swept.reshape(network.tensors["weight"].shape[1:]),
+            network.tensors["weight"].shape,
         )
         assert network.certificate().proved == right
         seen.add(right)
@@ -149,7 +178,9 @@ def test_a_robots_file_comes_back(tmp_path: Path) -> None:
     assert model_bytes(loaded, metadata) == path.read_bytes()
 
 
-DAMAGED = [("primitive", n, value) for n, value in ((0, 16), (0, 0.5), (1, -1), (2, 9), (5, 0))]
+DAMAGED = [
+    ("primitive", n, value) for n, value in ((0, 16), (0, 0.5), (1, -1), (2, 9), (5, 0))
+]
 DAMAGED += [("primitive", 4, -1), ("resolution", 0, -1), ("resolution", 0, 0.1)]
 DAMAGED += [("pose", 0, 2), ("pose", 2, 1), ("footprint", 0, -9), ("angle", 3, 0)]
 

@@ -57,7 +57,11 @@ def planner(request: pytest.FixtureRequest, tmp_path: Path) -> Planner:
 
 
 def map_for(planner: Planner) -> GridMap:
-    return walls() if planner.network.supports((30, 40)) or planner.pose_planner else paper_map()
+    return (
+        walls()
+        if planner.network.supports((30, 40)) or planner.pose_planner
+        else paper_map()
+    )
 
 
 def paper_map() -> GridMap:
@@ -89,7 +93,9 @@ def test_a_process_pool_plans_for_cells_and_for_bodies(tmp_path: Path) -> None:
     assert poses.path.size
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         planned = pool.submit(of_cells.plan, grid, (5, 5), (34, 5))
-        of_poses = pool.submit(of_body.plan_poses, grid, (0.55, 0.55, 0.0), (3.45, 0.55, 0.0))
+        of_poses = pool.submit(
+            of_body.plan_poses, grid, (0.55, 0.55, 0.0), (3.45, 0.55, 0.0)
+        )
         assert planned.result() == plan
         assert of_poses.result() == poses
 
@@ -126,7 +132,9 @@ def test_copies_of_requests_experience_and_fields_answer_alike(
     assert [*planner.steps(request)][-1] == plan_of(planner, grid)
     experience = Experience(0.5)
     seconds = np.arange(0, 30, 0.2)
-    experience.record(seconds, np.column_stack([0.5 + 0.1 * seconds, np.full(seconds.size, 0.5)]))
+    experience.record(
+        seconds, np.column_stack([0.5 + 0.1 * seconds, np.full(seconds.size, 0.5)])
+    )
     timed, its = experience.apply(grid), make_copy(experience).apply(grid)
     assert timed.same_cells(its)
     assert plan_of(planner, make_copy(timed)) == plan_of(planner, timed)  # it explores
@@ -140,7 +148,10 @@ def test_a_copy_of_a_field_has_its_values_and_paths(
     make_copy: Callable[[Any], Any], name: str
 ) -> None:
     planner, grid = Planner.load(name), paper_map()
-    for field in (planner.q_field(grid, (15, 5)), planner.q_field(grid, (15, 5)).unmasked()):
+    for field in (
+        planner.q_field(grid, (15, 5)),
+        planner.q_field(grid, (15, 5)).unmasked(),
+    ):
         _ = field.rollout((2, 2)), field.policy
         copied: QField = make_copy(field)
         assert copied.rollout((3, 17)) == field.rollout((3, 17))
@@ -165,7 +176,9 @@ def test_a_copied_map_is_never_taken_for_its_original_with_a_patch(
     # Copied together, they stay a map and its patch.
     before, after = make_copy((grid, patched))
     assert after.patches_since(before) == patched.patches_since(grid)
-    assert np.array_equal(np.flatnonzero(before.occupancy != after.occupancy), [y * grid.width + x])
+    assert np.array_equal(
+        np.flatnonzero(before.occupancy != after.occupancy), [y * grid.width + x]
+    )
 
 
 @pytest.fixture
@@ -178,7 +191,9 @@ def uncollected() -> Iterator[None]:
 
 @pytest.mark.usefixtures("uncollected")
 @pytest.mark.parametrize("has_planned", [False, True])
-def test_a_dropped_planner_is_freed_at_once(planner: Planner, has_planned: bool) -> None:
+def test_a_dropped_planner_is_freed_at_once(
+    planner: Planner, has_planned: bool
+) -> None:
     dropped = copy.deepcopy(planner)  # the fixture keeps the other
     grid = map_for(dropped)
     _ = str(dropped.network.certificate(dropped.metadata.move_rule))

@@ -35,7 +35,9 @@ def metres(point: Exact) -> tuple[float, float]:
 
 def in_cells(point: np.ndarray) -> Exact:
     x, y = map(Fraction, point.tolist())
-    return (x - LEFT) / RESOLUTION - Fraction(1, 2), (y - BOTTOM) / RESOLUTION - Fraction(1, 2)
+    return (x - LEFT) / RESOLUTION - Fraction(1, 2), (
+        y - BOTTOM
+    ) / RESOLUTION - Fraction(1, 2)
 
 
 def cell_at(point: Exact) -> Cell:
@@ -60,24 +62,33 @@ def touches(cell: Cell, first: Exact, last: Exact) -> bool:
 def is_clear(first: Exact, last: Exact, grid: GridMap) -> bool:
     """Say whether a piece touches free cells alone, but for those of its ends, and may pass."""
     cells = [
-        range(math.floor(min(e)), math.ceil(max(e)) + 1) for e in zip(first, last, strict=True)
+        range(math.floor(min(e)), math.ceil(max(e)) + 1)
+        for e in zip(first, last, strict=True)
     ]
     step = [float(b - a) for a, b in zip(first, last, strict=True)]
     angle = math.atan2(step[1], step[0]) / (math.pi / 4)
     actions = {math.floor(angle + 1e-9) % 8, math.ceil(angle - 1e-9) % 8}
     ends = cell_at(first), cell_at(last)
-    forbidden = np.zeros(grid.occupancy.shape, int) if grid.forbidden is None else grid.forbidden
+    forbidden = (
+        np.zeros(grid.occupancy.shape, int)
+        if grid.forbidden is None
+        else grid.forbidden
+    )
     for x, y in product(*cells):
         if not grid.contains((x, y)) or not touches((x, y), first, last):
             continue
         if grid.occupancy[y, x] and (x, y) not in ends:
             return False
-        if (x, y) != ends[1] and any(forbidden[y, x] >> action & 1 for action in actions):
+        if (x, y) != ends[1] and any(
+            forbidden[y, x] >> action & 1 for action in actions
+        ):
             return False
     return True
 
 
-def expected_leg(path: list[Cell], begin: Exact, end: Exact, grid: GridMap) -> list[list[Exact]]:
+def expected_leg(
+    path: list[Cell], begin: Exact, end: Exact, grid: GridMap
+) -> list[list[Exact]]:
     """Return the shortest ways along a leg's centres that are clear: as few centres as can be."""
     centres = [(Fraction(x), Fraction(y)) for x, y in path]
     middle = centres[1:-1]
@@ -91,7 +102,9 @@ def expected_leg(path: list[Cell], begin: Exact, end: Exact, grid: GridMap) -> l
             if not {*piece} <= {*centres} and len({*map(cell_at, piece)}) > 1
         ]
         if all(is_clear(*piece, grid) for piece in pieces):
-            ways.append([point for n, point in enumerate(way) if not n or point != way[n - 1]])
+            ways.append(
+                [point for n, point in enumerate(way) if not n or point != way[n - 1]]
+            )
     least = min(map(len, ways))
     return [way for way in ways if len(way) == least]
 
@@ -106,9 +119,13 @@ def test_ends_are_exact_and_centres_stay_only_where_a_piece_is_not_clear(
 ) -> None:
     plain, goal = place
     origin = float(LEFT), float(BOTTOM), 0.0
-    grid = GridMap(plain.occupancy, float(RESOLUTION), origin, forbidden=plain.forbidden)
+    grid = GridMap(
+        plain.occupancy, float(RESOLUTION), origin, forbidden=plain.forbidden
+    )
     start, via = (data.draw(st.sampled_from(grid.free_cells())) for _ in range(2))
-    legs = [list(shortest_path(grid, *ends, rule)) for ends in ((start, via), (via, goal))]
+    legs = [
+        list(shortest_path(grid, *ends, rule)) for ends in ((start, via), (via, goal))
+    ]
     assume(all(legs))
     if is_simplified:
         legs = [[*simplify(leg, grid, rule)] for leg in legs]
@@ -117,11 +134,16 @@ def test_ends_are_exact_and_centres_stay_only_where_a_piece_is_not_clear(
     path = exact_path(cells, grid, rule, [metres(point) for point in points])
     found = [in_cells(point) for point in path.points]
     first, second = (
-        expected_leg(leg, *ends, grid) for leg, ends in zip(legs, pairwise(points), strict=True)
+        expected_leg(leg, *ends, grid)
+        for leg, ends in zip(legs, pairwise(points), strict=True)
     )
     assert found in [[*a, *(b[1:])] for a, b in product(first, second)]
-    steps = [[float(b - a) for a, b in zip(*pair, strict=True)] for pair in pairwise(found)]
-    lengths = [max(map(abs, s)) if rule is MoveRule.UNIT else math.hypot(*s) for s in steps]
+    steps = [
+        [float(b - a) for a, b in zip(*pair, strict=True)] for pair in pairwise(found)
+    ]
+    lengths = [
+        max(map(abs, s)) if rule is MoveRule.UNIT else math.hypot(*s) for s in steps
+    ]
     assert path.length == pytest.approx(sum(lengths))
 
 
@@ -140,7 +162,10 @@ def test_a_path_between_centres_is_the_plans_own(yaw: float) -> None:
 def test_a_goal_in_the_robots_cell_is_reached_directly_and_one_that_moved_at_its_cells_centre() -> (
     None
 ):
-    grid, cell = GridMap(np.zeros((4, 4)), 0.5, (1.0, 2.0, 0.5)), np.array([(1, 2)], np.int32)
+    grid, cell = (
+        GridMap(np.zeros((4, 4)), 0.5, (1.0, 2.0, 0.5)),
+        np.array([(1, 2)], np.int32),
+    )
     x, y = grid.cell_to_world((1, 2))
     for ends, expected in (
         ([(x - 0.1, y), (x, y + 0.1)], [(x - 0.1, y), (x, y + 0.1)]),
@@ -174,7 +199,9 @@ def test_a_robot_leaves_an_obstacle_directly_unless_another_is_in_the_way() -> N
 def test_a_dense_path_passes_all_points_with_as_few_others_as_can_be(
     corners: list[tuple[float, float]], spacing: float
 ) -> None:
-    corners = [corner for corner, after in pairwise([*corners, None]) if corner != after]
+    corners = [
+        corner for corner, after in pairwise([*corners, None]) if corner != after
+    ]
     points, piece = dense(np.array(corners), spacing)
     assert len(points) == len(piece) + 1
     number = 0

@@ -50,14 +50,20 @@ def fresh_field(grid: GridMap, goal: Cell, rule: MoveRule) -> DistanceField:
 def assert_same(field: Any, fresh: Any) -> None:
     for name in ("value", "policy", "q"):
         np.testing.assert_array_equal(getattr(field, name), getattr(fresh, name))
-    np.testing.assert_array_equal(field.known.distance, fresh.known.distance)  # bit for bit
+    np.testing.assert_array_equal(
+        field.known.distance, fresh.known.distance
+    )  # bit for bit
 
 
 @given(st.integers(2, 40), st.integers(2, 40), st.data())
-def test_a_straight_rollout_keeps_to_the_line(width: int, height: int, data: Data) -> None:
+def test_a_straight_rollout_keeps_to_the_line(
+    width: int, height: int, data: Data
+) -> None:
     grid = GridMap(np.zeros((height, width), np.bool_))
     start, goal = data.draw(cells_of(grid)), data.draw(cells_of(grid))
-    path = fresh_field(grid, goal, MoveRule.ROBOT_SAFE).rollout(start, straight=True).path
+    path = (
+        fresh_field(grid, goal, MoveRule.ROBOT_SAFE).rollout(start, straight=True).path
+    )
     (x, y), (dx, dy) = (path - start).T, np.subtract(goal, start)
     assert np.abs(x * dy - y * dx).max() <= np.hypot(dx, dy)
 
@@ -68,10 +74,14 @@ def test_no_path_depends_on_the_past(place: Place, rule: MoveRule, data: Data) -
     grown, whole = fresh_field(grid, goal, rule), fresh_field(grid, goal, rule)
     _ = whole.value
     exact = shortest_distances(grid, goal, rule)
-    for start in data.draw(st.lists(st.sampled_from(grid.free_cells()), min_size=1, max_size=5)):
+    for start in data.draw(
+        st.lists(st.sampled_from(grid.free_cells()), min_size=1, max_size=5)
+    ):
         limit, straight = data.draw(st.integers(0, 30)), data.draw(st.booleans())
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(kernels, "CAPACITY", data.draw(st.sampled_from((0.0, kernels.CAPACITY))))
+            patch.setattr(
+                kernels, "CAPACITY", data.draw(st.sampled_from((0.0, kernels.CAPACITY)))
+            )
             while not grown.grow(start, limit):  # each call visits more cells
                 pass
         plan = grown.rollout(start, straight)
@@ -87,9 +97,14 @@ def test_no_path_depends_on_the_past(place: Place, rule: MoveRule, data: Data) -
 @given(GRIDS, RULES)
 def test_the_whole_field_is_that_of_the_network(place: Place, rule: MoveRule) -> None:
     grid, goal = place
-    field, of_q = fresh_field(grid, goal, rule), network_field(ANY_MAP.network, grid, goal, rule)
+    field, of_q = (
+        fresh_field(grid, goal, rule),
+        network_field(ANY_MAP.network, grid, goal, rule),
+    )
     np.testing.assert_array_equal(field.legal, grid.legal_moves(rule))
-    np.testing.assert_allclose(field.q, np.where(field.legal, of_q.q, -np.inf), rtol=1e-5)
+    np.testing.assert_allclose(
+        field.q, np.where(field.legal, of_q.q, -np.inf), rtol=1e-5
+    )
     np.testing.assert_allclose(field.value, of_q.value, rtol=1e-5)
 
 
@@ -108,7 +123,9 @@ LENGTHS = st.floats(1, 20, width=32) | st.just(float("inf"))
 COSTS = numpy_st.arrays(np.float32, (4, 8), elements=LENGTHS)
 
 
-def propagate_values(patch_id: np.ndarray, cost_PA: np.ndarray, goal: Cell) -> np.ndarray:
+def propagate_values(
+    patch_id: np.ndarray, cost_PA: np.ndarray, goal: Cell
+) -> np.ndarray:
     """Return Q(s, a) toward a goal, given the costs of each patch: (8, H, W)."""
     grid = GridMap(np.zeros(patch_id.shape))
     patch_C = np.pad(patch_id, 1, constant_values=len(cost_PA)).ravel()
@@ -117,7 +134,9 @@ def propagate_values(patch_id: np.ndarray, cost_PA: np.ndarray, goal: Cell) -> n
 
 
 @given(PATCH_IDS, COSTS, st.data())
-def test_q_meets_bellmans_equation(patch_id: np.ndarray, cost: np.ndarray, data: Data) -> None:
+def test_q_meets_bellmans_equation(
+    patch_id: np.ndarray, cost: np.ndarray, data: Data
+) -> None:
     height, width = patch_id.shape
     goal = data.draw(cells_of(GridMap(np.zeros(patch_id.shape))))
     q = propagate_values(patch_id, cost, goal)
@@ -129,7 +148,9 @@ def test_q_meets_bellmans_equation(patch_id: np.ndarray, cost: np.ndarray, data:
         np.testing.assert_allclose(q[action], after - cost[patch_id, action], rtol=1e-5)
 
 
-def test_no_cell_is_lost_where_many_are_at_one_distance(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_cell_is_lost_where_many_are_at_one_distance(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     grid = GridMap(np.zeros((60, 60)), cost=np.zeros((60, 60)))
     whole = fresh_field(grid, (30, 30), MoveRule.ROBOT_SAFE)
     _ = whole.value
@@ -152,7 +173,9 @@ def test_values_keep_their_sense_at_any_distance() -> None:
     # In a corridor each cell but the ends has one best neighbour, and the values tell which.
     free = ~occupancy
     free[500, 0] = False
-    assert (np.sort(q[:, free], axis=0)[-1] > np.sort(q[:, free], axis=0)[-2] + 0.5).all()
+    assert (
+        np.sort(q[:, free], axis=0)[-1] > np.sort(q[:, free], axis=0)[-2] + 0.5
+    ).all()
 
 
 @pytest.mark.parametrize("classes", [1, 100, 256])
@@ -173,7 +196,11 @@ def any_share(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fields, "CHANGED_SHARE", 1.0)
     monkeypatch.setattr(fields, "REPAIRED_SHARE", 1.0)
     monkeypatch.setattr(fields, "REPAIRED", fields.REPAIRED)  # tests change it
-    for name, value in {"SMALL": 0, "BOX": 1, "LARGE": 1}.items():  # copies share memory
+    for name, value in {
+        "SMALL": 0,
+        "BOX": 1,
+        "LARGE": 1,
+    }.items():  # copies share memory
         monkeypatch.setattr(copies, name, value)
     monkeypatch.setattr(grid_map, "MAX_PATCHES", 3)
 
@@ -189,7 +216,9 @@ def changed_maps(draw: st.DrawFn, grid: GridMap) -> GridMap:
     rows = slice(3 - below, 3 + grid.height + above)
     columns = slice(3 - left, 3 + grid.width + right)
     layers = (grid.occupancy, grid.cost, grid.forbidden)
-    cut = [None if array is None else np.pad(array, 3)[rows, columns] for array in layers]
+    cut = [
+        None if array is None else np.pad(array, 3)[rows, columns] for array in layers
+    ]
     moved = np.subtract(grid.cell_to_world((-left, -below)), grid.cell_to_world((0, 0)))
     origin = (*(grid.origin[:2] + moved).tolist(), grid.origin[2])
     return GridMap(cut[0], grid.resolution, origin, cut[1], None, cut[2])
@@ -201,7 +230,10 @@ def test_a_repaired_field_is_a_fresh_one(
     place: Place, rule: MoveRule, yaw: float, changes: int, data: Data
 ) -> None:
     plain, goal = place
-    goals = [goal, *data.draw(st.lists(st.sampled_from(plain.free_cells()), max_size=2))]
+    goals = [
+        goal,
+        *data.draw(st.lists(st.sampled_from(plain.free_cells()), max_size=2)),
+    ]
     grid = replace(plain, resolution=0.05, origin=(1.25, -3.0, yaw))
     fields.REPAIRED = data.draw(st.sampled_from([1, 3, 300]), label="limit of a repair")
     planner = new_planner()
@@ -216,15 +248,22 @@ def test_a_repaired_field_is_a_fresh_one(
         if not grid.is_free(goal):
             return
         start = data.draw(st.sampled_from(grid.free_cells()))
-        plans = [one.plan_nearest(grid, start, goals, rule) for one in (planner, new_planner())]
+        plans = [
+            one.plan_nearest(grid, start, goals, rule)
+            for one in (planner, new_planner())
+        ]
         assert plans[0] == plans[1]
         if data.draw(st.booleans(), label="compare"):
-            assert_same(planner.q_field(grid, goal, rule), fresh_field(grid, goal, rule))
+            assert_same(
+                planner.q_field(grid, goal, rule), fresh_field(grid, goal, rule)
+            )
 
 
 @settings(max_examples=150)
 @given(GRIDS, RULES, st.data())
-def test_a_map_made_of_others_is_as_new(place: Place, rule: MoveRule, data: Data) -> None:
+def test_a_map_made_of_others_is_as_new(
+    place: Place, rule: MoveRule, data: Data
+) -> None:
     maps, planner = [place[0]], new_planner()
     for seed in range(data.draw(st.integers(1, 8))):
         grid = data.draw(st.sampled_from(maps))
@@ -235,7 +274,9 @@ def test_a_map_made_of_others_is_as_new(place: Place, rule: MoveRule, data: Data
             grid = grid.with_patch([[not grid.occupancy[y, x]]], x, y, cost)
         elif data.draw(st.booleans()):
             slowness = (1 + random.random(grid.occupancy.shape)).astype(np.float32)
-            uphill = random.integers(0, 96, slowness.shape, np.uint8) if seed % 2 else None
+            uphill = (
+                random.integers(0, 96, slowness.shape, np.uint8) if seed % 2 else None
+            )
             kept = grid.slowness if seed % 3 and grid.slowness is not None else slowness
             grid = grid.with_layers(slowness=kept, seconds_per_cell=1.0, uphill=uphill)
         else:
@@ -246,15 +287,21 @@ def test_a_map_made_of_others_is_as_new(place: Place, rule: MoveRule, data: Data
         copied = {name: copy.copy(getattr(grid, name)) for name in LAYERS}
         fresh = GridMap(resolution=grid.resolution, origin=grid.origin, **copied)
         fresh = replace(fresh, seconds_per_cell=grid.seconds_per_cell)
-        start, goal = (data.draw(st.sampled_from(grid.free_cells()[::7])) for _ in range(2))
-        assert planner.plan(grid, start, goal, rule) == new_planner().plan(fresh, start, goal, rule)
+        start, goal = (
+            data.draw(st.sampled_from(grid.free_cells()[::7])) for _ in range(2)
+        )
+        assert planner.plan(grid, start, goal, rule) == new_planner().plan(
+            fresh, start, goal, rule
+        )
         costs, new = (one.fields.costs(grid, rule) for one in (planner, new_planner()))
         assert costs is not None
         assert new is not None
         for layer in ("patch", "value", "multiplier", "uphill"):
             np.testing.assert_array_equal(getattr(costs, layer), getattr(new, layer))
         if data.draw(st.booleans(), label="compare"):
-            assert_same(planner.q_field(grid, goal, rule), fresh_field(fresh, goal, rule))
+            assert_same(
+                planner.q_field(grid, goal, rule), fresh_field(fresh, goal, rule)
+            )
 
 
 def test_a_changed_map_uses_what_is_known_of_the_one_before() -> None:
@@ -265,13 +312,18 @@ def test_a_changed_map_uses_what_is_known_of_the_one_before() -> None:
     before = planner.plan(grid, start, goal)
     x, y = before.cells[3]
     changed = grid.with_patch(np.ones((1, 1)), x, y)
-    older, field = planner.q_field(grid, goal), fresh_field(changed, goal, MoveRule.ROBOT_SAFE)
+    older, field = (
+        planner.q_field(grid, goal),
+        fresh_field(changed, goal, MoveRule.ROBOT_SAFE),
+    )
     assert isinstance(older, DistanceField)
     known = np.count_nonzero(older.known.distance)
     assert field.take_over(older)
     assert np.count_nonzero(field.known.distance) > 0.9 * known
     assert np.count_nonzero(older.known.distance) == 1  # it handed over its memory
-    assert field.rollout(start) == fresh_field(changed, goal, MoveRule.ROBOT_SAFE).rollout(start)
+    assert field.rollout(start) == fresh_field(
+        changed, goal, MoveRule.ROBOT_SAFE
+    ).rollout(start)
     assert older.rollout(start).cells == before.cells  # and begins anew
 
 
@@ -291,7 +343,9 @@ def test_no_move_costs_more_than_the_highest_or_less_than_the_least(
 
 
 @pytest.mark.parametrize("slowness", [None, np.full((31, 31), 3)])
-def test_the_least_cost_on_a_map_is_that_of_its_patches_too(slowness: np.ndarray | None) -> None:
+def test_the_least_cost_on_a_map_is_that_of_its_patches_too(
+    slowness: np.ndarray | None,
+) -> None:
     # Straight ahead each cell costs as much; around, three patches cost nothing.
     grid = GridMap(np.zeros((31, 31)), cost=np.full((31, 31), 33), slowness=slowness)
     planner, ends = new_planner(), ((0, 15), (30, 15))
@@ -312,18 +366,29 @@ def test_a_repair_that_takes_too_long_leaves_the_older_field_as_it_was() -> None
     before = older.rollout((0, 0))
     changed = grid.with_patch(np.ones((1, 12)), 20, 29)  # a wall beside the goal
     start = (30, 32)
-    assert planner.plan(changed, start, goal) == new_planner().plan(changed, start, goal)
-    assert planner.fields.find(grid, (goal,), MoveRule.ROBOT_SAFE) is None  # the place has changed
+    assert planner.plan(changed, start, goal) == new_planner().plan(
+        changed, start, goal
+    )
+    assert (
+        planner.fields.find(grid, (goal,), MoveRule.ROBOT_SAFE) is None
+    )  # the place has changed
     assert older.is_known((0, 0))
     assert older.rollout((0, 0)) == before
     assert_same(older, fresh_field(grid, goal, MoveRule.ROBOT_SAFE))
 
 
-@pytest.mark.filterwarnings("ignore:overflow encountered in scalar subtract")  # not where compiled
+@pytest.mark.filterwarnings(
+    "ignore:overflow encountered in scalar subtract"
+)  # not where compiled
 @settings(max_examples=150)
 @given(GRIDS, RULES, st.booleans(), st.integers(0, 2), st.integers(1, 1500), st.data())
 def test_a_field_that_is_interrupted_anywhere_is_as_a_new_one(
-    place: Place, rule: MoveRule, whole: bool, interrupted_step: int, line: int, data: Data
+    place: Place,
+    rule: MoveRule,
+    whole: bool,
+    interrupted_step: int,
+    line: int,
+    data: Data,
 ) -> None:
     grid, goal = place
     planner, start = new_planner(), data.draw(st.sampled_from(grid.free_cells()))
@@ -341,7 +406,9 @@ def test_a_field_that_is_interrupted_anywhere_is_as_a_new_one(
             run_until(line, step)
         step()
     for each in (grid, changed):
-        assert planner.plan(each, start, goal, rule) == new_planner().plan(each, start, goal, rule)
+        assert planner.plan(each, start, goal, rule) == new_planner().plan(
+            each, start, goal, rule
+        )
     fresh = fresh_field(grid, goal, rule)
     assert older.rollout(start) == fresh.rollout(start)
     assert_same(older, fresh)
@@ -375,9 +442,13 @@ def run_until(line: int, step: Callable[[], object]) -> None:
             sys.settrace(before)
 
 
-def test_after_too_many_changes_both_fields_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_after_too_many_changes_both_fields_are_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.undo()
-    first, second = (GridMap(np.random.default_rng(n).random((60, 60)) < 0.2) for n in (0, 1))
+    first, second = (
+        GridMap(np.random.default_rng(n).random((60, 60)) < 0.2) for n in (0, 1)
+    )
     assert fields.changed_cells(first, second) is None
     goal = next(cell for cell in first.free_cells() if second.is_free(cell))
     planner = new_planner()
@@ -410,7 +481,10 @@ def test_threads_share_a_planner_while_the_map_changes() -> None:
         x, y = random.integers(0, 58, 2).tolist()
         maps.append(maps[-1].with_patch(random.random((2, 2)) < 0.5, x, y))
     asked = [(changed, *request) for changed in maps for request in requests]
-    expected, planner = [new_planner().plan(*request) for request in asked], new_planner()
+    expected, planner = (
+        [new_planner().plan(*request) for request in asked],
+        new_planner(),
+    )
 
     def count_wrong(seed: int) -> int:
         order = np.random.default_rng(seed).integers(len(asked), size=100).tolist()
@@ -426,13 +500,17 @@ def test_threads_ask_a_field_for_what_others_compute() -> None:
     kept = [QField((0, 0), q, legal) for _ in range(5000)]
 
     def ask(_: int) -> bool:
-        return all(field.nbytes and field.value.size and field.policy.size for field in kept)
+        return all(
+            field.nbytes and field.value.size and field.policy.size for field in kept
+        )
 
     with ThreadPoolExecutor(4) as threads:
         assert all(threads.map(ask, range(4)))
 
 
-def grown_by_rows(planner: Planner, grid: GridMap, start: Cell, goal: Cell, rule: MoveRule) -> Plan:
+def grown_by_rows(
+    planner: Planner, grid: GridMap, start: Cell, goal: Cell, rule: MoveRule
+) -> Plan:
     """A plan for which patches are read row by row, as on a large map."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(move_costs_module, "LARGE", 0)
@@ -530,7 +608,9 @@ def test_few_rows_of_a_large_map_are_read(monkeypatch: pytest.MonkeyPatch) -> No
 def new_maps(side: int, kind: str) -> Iterator[GridMap]:
     """Maps of a side: each with other obstacles, other expected times, or one more patch."""
     random = np.random.default_rng(0)
-    grid = GridMap(random.random((side, side)) < 0.1, cost=random.integers(0, 100, (side, side)))
+    grid = GridMap(
+        random.random((side, side)) < 0.1, cost=random.integers(0, 100, (side, side))
+    )
     grid = grid.with_patch([[False]], 0, 0).with_patch([[False]], side - 1, side - 1)
     while True:
         if kind == "maps":
@@ -615,7 +695,11 @@ def test_the_last_64_fields_are_kept_and_3_whatever_their_size() -> None:
     planner.q_field(grid, goals[-5])  # used last by now
     planner.fields.nbytes = 0
     planner.q_field(grid, last)
-    assert [field.goal for field in planner.fields._kept] == [goals[-1], goals[-5], last]
+    assert [field.goal for field in planner.fields._kept] == [
+        goals[-1],
+        goals[-5],
+        last,
+    ]
 
 
 def test_fields_toward_other_goals_or_by_other_rules_are_not_repaired() -> None:
@@ -624,7 +708,9 @@ def test_fields_toward_other_goals_or_by_other_rules_are_not_repaired() -> None:
         planner = new_planner()
         _ = planner.q_field(grid, (0, 0), MoveRule.ROBOT_SAFE).value
         for changed in (grid, grid.with_patch([[True]], 4, 4)):
-            assert_same(planner.q_field(changed, goal, rule), fresh_field(changed, goal, rule))
+            assert_same(
+                planner.q_field(changed, goal, rule), fresh_field(changed, goal, rule)
+            )
 
 
 def test_arrays_that_fields_share_count_once() -> None:

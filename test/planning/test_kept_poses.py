@@ -16,7 +16,10 @@ from ddqn_planner.planning.pose_paths import cost_of_poses
 from ddqn_planner.planning.pose_planner import PoseRequest
 
 CELL = 0.1
-START, GOAL = (0.55, 1.05, 0.0), (3.45, 1.05, 0.0)  # in a corridor as wide as the body is at most
+START, GOAL = (
+    (0.55, 1.05, 0.0),
+    (3.45, 1.05, 0.0),
+)  # in a corridor as wide as the body is at most
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +30,9 @@ def planner(tmp_path_factory: pytest.TempPathFactory) -> Planner:
 
 
 def plan(planner: Planner, grid: GridMap, start: Any, **how: Any) -> Any:
-    return last_step(planner.pose_steps(PoseRequest(grid, tuple(start), (GOAL,), **how)))
+    return last_step(
+        planner.pose_steps(PoseRequest(grid, tuple(start), (GOAL,), **how))
+    )
 
 
 @pytest.fixture
@@ -50,7 +55,9 @@ def test_a_robot_a_little_beside_its_path_keeps_it(
     assert (kept.extra_cost, kept.bound) == (0.0, math.inf)
     for farther in ((0, 0.11, 0), (0, 0.06, 0.5)):
         start = path.poses[20] + farther
-        assert plan(planner, grid, start, **under_way).status is PlanStatus.START_OCCUPIED
+        assert (
+            plan(planner, grid, start, **under_way).status is PlanStatus.START_OCCUPIED
+        )
 
 
 @pytest.mark.parametrize("past", [(0.1, 0, 0), (0.2, 0.1, 0.1), (0, 0.1, 0)])
@@ -68,7 +75,9 @@ def test_a_kept_path_is_proved_as_far_as_the_new_one(planner: Planner) -> None:
     occupancy[6:15, :12] = occupancy[6:15, 28:42] = False  # around both ends
     hall = GridMap(occupancy, CELL)
     path = plan(planner, hall, START, bound=1.5)
-    kept = plan(planner, hall, START, under_way=path.poses, switch_threshold=0.5, bound=1.5)
+    kept = plan(
+        planner, hall, START, under_way=path.poses, switch_threshold=0.5, bound=1.5
+    )
     new = plan(planner, hall, START, bound=1.5)
     assert min(new.bound, path.bound) > 1
     assert kept.bound == pytest.approx(new.bound * (1 + kept.extra_cost))
@@ -79,7 +88,9 @@ def test_a_body_explores_within_the_share_alone(planner: Planner) -> None:
     slowness = random.uniform(4, 8, (3, 20, 40)).astype(np.float32)
     slowness[0] *= 1.1
     hall = GridMap(np.zeros((20, 40)), CELL)
-    expected, bold, safe = (replace(hall, slowness=each, seconds_per_cell=1.0) for each in slowness)
+    expected, bold, safe = (
+        replace(hall, slowness=each, seconds_per_cell=1.0) for each in slowness
+    )
     timed = expected.with_layers(exploration=Exploration(0.1, bold, safe))
     paths = [plan(planner, grid, START, bound=1.0) for grid in (timed, safe, bold)]
     assert np.array_equal(paths[0].poses, paths[1].poses)
@@ -89,7 +100,9 @@ def test_a_body_explores_within_the_share_alone(planner: Planner) -> None:
     assert costs[0] > 1.05 * costs[1]
 
 
-def test_a_body_pays_for_driving_uphill_alone(planner: Planner, corridor: GridMap) -> None:
+def test_a_body_pays_for_driving_uphill_alone(
+    planner: Planner, corridor: GridMap
+) -> None:
     slope = corridor.with_layers(slowness=np.ones((20, 40), np.float32))
     for code, factor in ((8 * 10, math.exp(1.5)), (8 * 10 + 4, 1.0)):
         grid = slope.with_layers(uphill=np.full((20, 40), code, np.uint8))
@@ -104,7 +117,9 @@ def test_it_keeps_no_path_that_is_blocked_or_leads_elsewhere(
     poses = plan(planner, corridor, START, bound=1.0).poses
     aside = poses[20] + (0, 0.06, 0)
     box = corridor.with_patch([[True]], 30, 10)
-    assert plan(planner, box, aside, under_way=poses).status is PlanStatus.START_OCCUPIED
+    assert (
+        plan(planner, box, aside, under_way=poses).status is PlanStatus.START_OCCUPIED
+    )
     elsewhere = plan(planner, corridor, aside, under_way=poses[:-10])
     assert elsewhere.status is PlanStatus.START_OCCUPIED
 
@@ -114,7 +129,9 @@ def test_a_robot_that_cannot_leave_its_own_cell_keeps_its_path(
 ) -> None:
     path = plan(planner, corridor, START, bound=1.0)
     column, line = corridor.world_to_cell(*path.poses[20, :2])
-    grid = corridor.with_patch(np.zeros((1, 6)), column - 2, line + 3)  # a niche beside it
+    grid = corridor.with_patch(
+        np.zeros((1, 6)), column - 2, line + 3
+    )  # a niche beside it
     aside = path.poses[20] + (0, 0.06, 0)
     assert plan(planner, grid, aside).status is PlanStatus.NO_PATH
     kept = plan(planner, grid, aside, under_way=path.poses)

@@ -34,8 +34,13 @@ def test_a_pose_is_valid_whose_cell_is_free_from_the_one_nearest_to_the_robot_on
     grid, _ = place
     poses = data.draw(st.lists(st.sampled_from(poses), min_size=1))  # some twice
     cell = data.draw(st.sampled_from(grid.free_cells()))
-    robot = cell[0] + data.draw(st.floats(0, 0.99)), cell[1] + data.draw(st.floats(0, 0.99))
-    assert invalid_poses(np.array(poses), grid, robot=robot).tolist() == judged(poses, robot, grid)
+    robot = (
+        cell[0] + data.draw(st.floats(0, 0.99)),
+        cell[1] + data.draw(st.floats(0, 0.99)),
+    )
+    assert invalid_poses(np.array(poses), grid, robot=robot).tolist() == judged(
+        poses, robot, grid
+    )
     every = invalid_poses(np.array(poses), grid).tolist()
     assert every == judged(poses, poses[0][:2], grid)
 
@@ -102,7 +107,9 @@ def test_costs_count_as_in_nav2(max_cost: int) -> None:
     costs = [0, 1, 101.9, 205.4, 252, 253, 254, 0]
     grid = grid_from_costmap(values, allow_unknown=True)
     path = line([0.5, 1.5, 2.5, 3.5, 4.5, 5.5, 6.5, 7.5], y=0.5)
-    expected = [n for n, cost in enumerate(costs) if cost >= min(max_cost, 253) or cost >= 253]
+    expected = [
+        n for n, cost in enumerate(costs) if cost >= min(max_cost, 253) or cost >= 253
+    ]
     found = invalid_poses(path, grid, max_cost=max_cost).tolist()
     if max_cost == 1:
         expected.remove(1)  # so little is no cost of a `GridMap`
@@ -110,7 +117,9 @@ def test_costs_count_as_in_nav2(max_cost: int) -> None:
     assert 7 in invalid_poses(path, grid, max_cost=max_cost, unknown=values < 0)
     assert 7 in invalid_poses(path, grid_from_costmap(values), max_cost=max_cost)
     # A body may pass inscribed cells.
-    body = points_of(np.array([(-0.2, -0.2), (0.2, -0.2), (0.2, 0.2), (-0.2, 0.2)]), 1.0)
+    body = points_of(
+        np.array([(-0.2, -0.2), (0.2, -0.2), (0.2, 0.2), (-0.2, 0.2)]), 1.0
+    )
     found = invalid_poses(path, grid, body=body, max_cost=max_cost).tolist()
     assert (5 in found) == (max_cost <= 253)
     assert 6 in found
@@ -120,8 +129,12 @@ def test_no_cell_of_a_body_may_be_occupied() -> None:
     occupancy = np.zeros((60, 80), dtype=bool)
     occupancy[30, 40] = True
     grid = inflate(GridMap(occupancy, 0.05), 0.2)
-    body = points_of(np.array([(-0.5, -0.2), (0.5, -0.2), (0.5, 0.2), (-0.5, 0.2)]), 0.05)
-    poses = np.array([(2.025, 1.525, 0.0), (2.025, 1.8, 0.0), (2.025, 1.8, math.pi / 2)])
+    body = points_of(
+        np.array([(-0.5, -0.2), (0.5, -0.2), (0.5, 0.2), (-0.5, 0.2)]), 0.05
+    )
+    poses = np.array(
+        [(2.025, 1.525, 0.0), (2.025, 1.8, 0.0), (2.025, 1.8, math.pi / 2)]
+    )
     assert invalid_poses(poses, grid, body=body).tolist() == [0, 2]
     assert invalid_poses(poses, grid).tolist() == [0]
 
@@ -138,7 +151,13 @@ def test_a_path_that_leaves_is_valid_until_another_obstacle_lies_on_it() -> None
         (path, 2.5, grid, 1, [2]),  # its third cell is beyond
         (path[:3], 2.5, grid, 2, [0, 1, 2]),  # it leads nowhere
         (path, 2.5, blocked, 2, [6]),
-        (path, 1.5, grid, 2, [0, 1, 2]),  # a robot beside the obstacle has to go round it
+        (
+            path,
+            1.5,
+            grid,
+            2,
+            [0, 1, 2],
+        ),  # a robot beside the obstacle has to go round it
     ):
         robot = x, 2.5
         found = invalid_poses(part, grid_then, robot=robot, clearing_radius=radius)

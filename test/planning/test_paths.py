@@ -27,7 +27,13 @@ from strategies import (
 )
 
 from ddqn_planner import GridMap, MoveRule, PlanStatus, inflate, simplify
-from ddqn_planner.grid import MOVES, Cell, path_length, shortest_distances, shortest_path
+from ddqn_planner.grid import (
+    MOVES,
+    Cell,
+    path_length,
+    shortest_distances,
+    shortest_path,
+)
 from ddqn_planner.grid.moves import cells_along
 from ddqn_planner.planning import PlanRequest
 from ddqn_planner.planning.path_check import invalid_poses
@@ -43,14 +49,19 @@ def cells_with_positions(path: list[Cell]) -> list[tuple[Cell, Fraction]]:
         vector = [b - a for a, b in zip(first, last, strict=True)]
         steps = max(map(abs, vector))
         for step in range(steps):
-            at = (a + Fraction(step * by, steps) for a, by in zip(first, vector, strict=True))
+            at = (
+                a + Fraction(step * by, steps)
+                for a, by in zip(first, vector, strict=True)
+            )
             x, y = (math.floor(each + Fraction(1, 2)) for each in at)
             passed.append(((x, y), number + Fraction(step, steps)))
     return [*passed, (path[-1], Fraction(len(path) - 1))]
 
 
 def drawn_path(data: Data, grid: GridMap, goal: Cell, rule: MoveRule) -> list[Cell]:
-    path = list(shortest_path(grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule))
+    path = list(
+        shortest_path(grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule)
+    )
     assume(path)
     return path
 
@@ -67,11 +78,17 @@ def test_cells_along_a_path_are_those_nearest_to_it(
 
 
 def is_still_legal(path: Sequence[Cell], grid: GridMap, rule: MoveRule) -> bool:
-    return all(is_legal(*segment, grid, rule) for segment in pairwise([*path, path[-1]]))
+    return all(
+        is_legal(*segment, grid, rule) for segment in pairwise([*path, path[-1]])
+    )
 
 
 def test_what_lies_behind_a_robot_on_a_segment_does_not_count() -> None:
-    grid, path, rule = GridMap(np.zeros((9, 31))), [(0, 2), (15, 5), (30, 7)], "robot_safe"
+    grid, path, rule = (
+        GridMap(np.zeros((9, 31))),
+        [(0, 2), (15, 5), (30, 7)],
+        "robot_safe",
+    )
     for blocked, is_free in (((2, 2), True), ((12, 4), False), ((24, 6), False)):
         after = grid.with_patch([[True]], *blocked)
         assert (len(rest_of_path(path, (5, 3), after, rule)) > 0) == is_free
@@ -85,11 +102,15 @@ def test_a_path_of_which_only_an_occupied_end_or_nothing_is_left_is_lost() -> No
 
 
 @given(GRIDS, RULES, st.data())
-def test_the_rest_of_a_path_leads_to_it(place: Place, rule: MoveRule, data: Data) -> None:
+def test_the_rest_of_a_path_leads_to_it(
+    place: Place, rule: MoveRule, data: Data
+) -> None:
     grid, goal = place
     path = drawn_path(data, grid, goal, rule)
     after = data.draw(patched(grid))
-    robot = data.draw(st.tuples(st.integers(-1, 9), st.integers(-1, 9)) | st.sampled_from(path))
+    robot = data.draw(
+        st.tuples(st.integers(-1, 9), st.integers(-1, 9)) | st.sampled_from(path)
+    )
     for followed in (path, [*simplify(path, grid, rule)]):
         rest = list(map(tuple, rest_of_path(followed, robot, after, rule).tolist()))
         left = followed[followed.index(robot) :] if robot in followed else []
@@ -102,14 +123,17 @@ def test_the_rest_of_a_path_leads_to_it(place: Place, rule: MoveRule, data: Data
         # It may leave a path that is no longer legal, and join it again.
         passed = [cell for cell, _ in cells_with_positions(followed)]
         follows = [
-            cell in passed and {*rest[n + 1 :]} <= {*followed} for n, cell in enumerate(rest)
+            cell in passed and {*rest[n + 1 :]} <= {*followed}
+            for n, cell in enumerate(rest)
         ]
         joins = follows.index(True)
         assert joins <= REACH
         beside = pairwise(rest if followed is path else rest[: joins + 1])
         assert all(max(abs(x - a), abs(y - b)) == 1 for (x, y), (a, b) in beside)
         if followed is path:
-            assert any(rest[n:] == path[n - len(rest) :] for n in range(len(rest))[: REACH + 1])
+            assert any(
+                rest[n:] == path[n - len(rest) :] for n in range(len(rest))[: REACH + 1]
+            )
             if left and is_still_legal(left, after, rule):
                 assert rest == left
 
@@ -134,13 +158,17 @@ def test_a_robot_beside_its_path_comes_back_to_it_and_a_far_one_has_lost_it() ->
 
 @settings(max_examples=300)
 @given(GRIDS, RULES, st.sampled_from([0.0, 0.03, 0.3, 10.0]), st.data())
-def test_what_is_kept_is_cheap(place: Place, rule: MoveRule, threshold: float, data: Data) -> None:
+def test_what_is_kept_is_cheap(
+    place: Place, rule: MoveRule, threshold: float, data: Data
+) -> None:
     grid, goal = place
     start = data.draw(st.sampled_from(grid.free_cells()))
     under_way = shortest_path(grid, start, goal, rule)
     after = data.draw(patched(grid))
     assume(after.is_free(goal) and after.free_cells())
-    robot = data.draw(st.sampled_from([*filter(after.is_free, under_way), *after.free_cells()]))
+    robot = data.draw(
+        st.sampled_from([*filter(after.is_free, under_way), *after.free_cells()])
+    )
     new = shortest_path(after, robot, goal, rule)
     assume(new)
     request = PlanRequest(
@@ -163,9 +191,16 @@ def test_what_is_kept_is_cheap(place: Place, rule: MoveRule, threshold: float, d
 
 
 def test_a_path_pulled_straight_through_an_opening_is_a_new_one() -> None:
-    walled, rule, start, goal = np.zeros((9, 9), dtype=bool), MoveRule.ROBOT_SAFE, (0, 4), (8, 4)
+    walled, rule, start, goal = (
+        np.zeros((9, 9), dtype=bool),
+        MoveRule.ROBOT_SAFE,
+        (0, 4),
+        (8, 4),
+    )
     walled[:8, 4] = True
-    under_way = simplify(shortest_path(GridMap(walled), start, goal, rule), GridMap(walled), rule)
+    under_way = simplify(
+        shortest_path(GridMap(walled), start, goal, rule), GridMap(walled), rule
+    )
     walled[4, 4] = False
     opened, new = GridMap(walled), np.array([start, goal], dtype=np.int32)
     for simplified in (True, False):
@@ -178,7 +213,9 @@ def test_a_path_pulled_straight_through_an_opening_is_a_new_one() -> None:
 
 
 @given(grids_with_costs() | grids_uphill(), RULES, st.data())
-def test_a_search_finds_any_legal_path(place: Place, rule: MoveRule, data: Data) -> None:
+def test_a_search_finds_any_legal_path(
+    place: Place, rule: MoveRule, data: Data
+) -> None:
     grid, goal = place
     start = data.draw(st.sampled_from(grid.free_cells()))
     shape, values = grid.occupancy.shape, st.floats(width=32)
@@ -220,14 +257,19 @@ def test_segments_are_as_their_cells_are(
     for (dx, dy), by in data.draw(st.lists(steps, max_size=4)):  # perhaps off the map
         path.append((path[-1][0] + by * dx, path[-1][1] + by * dy))
     segments, begins = [*pairwise(path)], [Fraction(begin)] + [Fraction(0)] * len(path)
-    expected = [is_legal(*each, grid, rule, at) for each, at in zip(segments, begins, strict=False)]
+    expected = [
+        is_legal(*each, grid, rule, at)
+        for each, at in zip(segments, begins, strict=False)
+    ]
     assert legal_segments(path, grid, rule, begin).tolist() == expected
     if all(map(grid.contains, path)):
         exact = sum(exact_cost(*segment, grid, rule) for segment in segments)
         assert cost_along(path, grid, rule) == pytest.approx(exact)
 
 
-def check_simplified(path: list[Cell], grid: GridMap, rule: MoveRule) -> tuple[Cell, ...]:
+def check_simplified(
+    path: list[Cell], grid: GridMap, rule: MoveRule
+) -> tuple[Cell, ...]:
     """Check that all segments are legal, and cost no more than what they replace."""
     simple = simplify(path, grid, rule)
     assert simple[:1] + simple[-1:] == (*path[:1], *path[-1:])
@@ -244,19 +286,31 @@ def check_simplified(path: list[Cell], grid: GridMap, rule: MoveRule) -> tuple[C
 def check_corners(path: Sequence[Cell], grid: GridMap, rule: MoveRule) -> None:
     """Check that no corner can be left out, or moved by a cell at less cost."""
     for before, (x, y), after in zip(path, path[1:], path[2:], strict=False):
-        cost = sum(exact_cost(*pair, grid, rule) for pair in ((before, (x, y)), ((x, y), after)))
+        cost = sum(
+            exact_cost(*pair, grid, rule)
+            for pair in ((before, (x, y)), ((x, y), after))
+        )
         others = [(before, (x + dx, y + dy), after) for dx, dy in MOVES.tolist()]
-        for cells in [(before, after), *(cells for cells in others if grid.contains(cells[1]))]:
+        for cells in [
+            (before, after),
+            *(cells for cells in others if grid.contains(cells[1])),
+        ]:
             if all(is_legal(*segment, grid, rule) for segment in pairwise(cells)):
-                new_cost = sum(exact_cost(*segment, grid, rule) for segment in pairwise(cells))
+                new_cost = sum(
+                    exact_cost(*segment, grid, rule) for segment in pairwise(cells)
+                )
                 assert new_cost > cost * (1 + 1e-10 if len(cells) == 2 else 1 - 1e-8)
 
 
 @settings(max_examples=300)
 @given(GRIDS, RULES, st.data())
-def test_a_simplified_path_costs_no_more(place: Place, rule: MoveRule, data: Data) -> None:
+def test_a_simplified_path_costs_no_more(
+    place: Place, rule: MoveRule, data: Data
+) -> None:
     grid, goal = place
-    path = shortest_path(grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule)
+    path = shortest_path(
+        grid, data.draw(st.sampled_from(grid.free_cells())), goal, rule
+    )
     simple = check_simplified([*check_simplified(path, grid, rule)], grid, rule)
     check_corners(simple, grid, rule)
     if not grid.has_costs:
@@ -264,8 +318,15 @@ def test_a_simplified_path_costs_no_more(place: Place, rule: MoveRule, data: Dat
 
 
 def test_a_path_turns_at_the_corner_and_not_behind_it() -> None:
-    grid, rule = GridMap(np.zeros((30, 30))).with_patch(np.ones((20, 20)), 0, 0), "robot_safe"
-    path = [(0, 20), *((x, 20) for x in range(1, 21)), *((20, y) for y in range(19, -1, -1))]
+    grid, rule = (
+        GridMap(np.zeros((30, 30))).with_patch(np.ones((20, 20)), 0, 0),
+        "robot_safe",
+    )
+    path = [
+        (0, 20),
+        *((x, 20) for x in range(1, 21)),
+        *((20, y) for y in range(19, -1, -1)),
+    ]
     for cells in (path, path[::-1]):
         assert simplify(cells, grid, rule) == (cells[0], (20, 20), cells[-1])
     wide = [*((x, 25) for x in range(26)), *((25, y) for y in range(24, -1, -1))]
@@ -276,7 +337,9 @@ def test_a_path_turns_at_the_corner_and_not_behind_it() -> None:
 
 @pytest.mark.parametrize("turns", range(4))
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_a_right_angle_is_kept_around_an_obstacle_alone(turns: int, mirrored: bool) -> None:
+def test_a_right_angle_is_kept_around_an_obstacle_alone(
+    turns: int, mirrored: bool
+) -> None:
     occupied = np.zeros((14, 14), dtype=np.bool_)
     occupied[[2, 2, 4, 5], [5, 7, 7, 7]] = True  # at a corner, but not inside it
     number = np.arange(196).reshape(14, 14)
@@ -293,11 +356,15 @@ def test_a_right_angle_is_kept_around_an_obstacle_alone(turns: int, mirrored: bo
 
 @pytest.mark.parametrize("layer", ["cost", "slowness"])
 def test_a_bend_around_an_obstacle_moves_away_from_a_costly_cell(layer: str) -> None:
-    costs = np.zeros((9, 9), np.int8) if layer == "cost" else np.ones((9, 9), np.float32)
+    costs = (
+        np.zeros((9, 9), np.int8) if layer == "cost" else np.ones((9, 9), np.float32)
+    )
     costs[5, 5] = 99
     grid = GridMap(np.pad(np.ones((5, 5)), (0, 4)), **{layer: costs})
     bend = [(0, 5), (5, 5), (5, 0)]
-    check_corners(check_simplified(bend, grid, MoveRule.ROBOT_SAFE), grid, MoveRule.ROBOT_SAFE)
+    check_corners(
+        check_simplified(bend, grid, MoveRule.ROBOT_SAFE), grid, MoveRule.ROBOT_SAFE
+    )
 
 
 def test_a_bend_is_cut_where_corners_may_be() -> None:
@@ -326,12 +393,16 @@ def test_a_simplified_path_across_a_larger_map_costs_no_more(
     check_corners(check_simplified(path, grid, rule), grid, rule)
 
 
-def test_the_better_one_is_taken_of_the_path_pulled_from_its_start_and_from_its_end() -> None:
+def test_the_better_one_is_taken_of_the_path_pulled_from_its_start_and_from_its_end() -> (
+    None
+):
     rule, lengths = MoveRule.ROBOT_SAFE, {}
     for seed in (2, 5, 10):
         grid = GridMap(np.random.default_rng(seed).random((30, 30)) < 0.15)
         for y in (5, 25):
-            simple = simplify(shortest_path(grid, (0, y), (29, 29 - y), rule), grid, rule)
+            simple = simplify(
+                shortest_path(grid, (0, y), (29, 29 - y), rule), grid, rule
+            )
             check_corners(simple, grid, rule)
             lengths[seed, y] = path_length(simple)
     assert lengths[5, 5] < 36.7  # from the start alone, 37.1
@@ -340,7 +411,10 @@ def test_the_better_one_is_taken_of_the_path_pulled_from_its_start_and_from_its_
 def test_segments_are_as_long_as_can_be() -> None:
     rule = MoveRule.ROBOT_SAFE
     grid = GridMap(np.zeros((40, 90)))
-    assert simplify(shortest_path(grid, (2, 5), (80, 31), rule), grid, rule) == ((2, 5), (80, 31))
+    assert simplify(shortest_path(grid, (2, 5), (80, 31), rule), grid, rule) == (
+        (2, 5),
+        (80, 31),
+    )
     assert simplify([], grid, rule) == ()
     assert simplify([(1, 1)], grid, rule) == ((1, 1),)
     diagonal = [(x, x) for x in range(9)]
@@ -360,7 +434,11 @@ def within(allowed: Cells, grid: GridMap) -> GridMap:
 
 def lengths_from(start: Cell, grid: GridMap, rule: MoveRule) -> dict[Cell, float]:
     """The lengths of the shortest ways to all cells that they lead to."""
-    lengths, waiting, legal = dict[Cell, float](), [(0.0, start)], grid.legal_moves(rule)
+    lengths, waiting, legal = (
+        dict[Cell, float](),
+        [(0.0, start)],
+        grid.legal_moves(rule),
+    )
     while waiting:
         length, (x, y) = heapq.heappop(waiting)
         if (x, y) not in lengths:
@@ -372,9 +450,15 @@ def lengths_from(start: Cell, grid: GridMap, rule: MoveRule) -> dict[Cell, float
 
 
 @settings(max_examples=300)
-@given(grids_with_free_cell() | grids_with_directions(), RULES, BODIES, RADII, st.data())
+@given(
+    grids_with_free_cell() | grids_with_directions(), RULES, BODIES, RADII, st.data()
+)
 def test_a_start_that_is_not_free_is_left_by_the_shortest_way(
-    place: Place, rule: MoveRule, robot_radius: float, clearing_radius: float, data: Data
+    place: Place,
+    rule: MoveRule,
+    robot_radius: float,
+    clearing_radius: float,
+    data: Data,
 ) -> None:
     plain, some_cell = place
     grid = inflate(plain, robot_radius)
@@ -398,13 +482,19 @@ def test_a_start_that_is_not_free_is_left_by_the_shortest_way(
     closed = obstacles - near if start in obstacles else obstacles
     distances = shortest_distances(grid, goal, rule)
     joined = {cell for cell in free if np.isfinite(distances[cell[::-1]])}
-    allowed = within({cell for cell in cells if cell in joined or cell not in free | closed}, grid)
+    allowed = within(
+        {cell for cell in cells if cell in joined or cell not in free | closed}, grid
+    )
     lengths = lengths_from(start, allowed, rule)
     ways = {cell: lengths[cell] for cell in joined & lengths.keys()}
     if not ways:
-        leaves = free & lengths_from(start, within({*cells} - closed, grid), rule).keys()
+        leaves = (
+            free & lengths_from(start, within({*cells} - closed, grid), rule).keys()
+        )
         stuck = start in obstacles and not leaves
-        assert plan.status is (PlanStatus.START_OCCUPIED if stuck else PlanStatus.NO_PATH)
+        assert plan.status is (
+            PlanStatus.START_OCCUPIED if stuck else PlanStatus.NO_PATH
+        )
         return
     number = next(index for index, cell in enumerate(plan.cells) if cell in free)
     way, rest = plan.cells[: number + 1], plan.cells[number:]
@@ -414,29 +504,45 @@ def test_a_start_that_is_not_free_is_left_by_the_shortest_way(
     shortest = min(ways.values())
     assert path_length(way, rule) == pytest.approx(shortest)
     tied = [end for end, length in ways.items() if length < shortest + 1e-6]
-    assert math.dist(way[-1], goal) == pytest.approx(min(math.dist(end, goal) for end in tied))
+    assert math.dist(way[-1], goal) == pytest.approx(
+        min(math.dist(end, goal) for end in tied)
+    )
     assert rest == ANY_MAP.plan(grid, way[-1], goal, rule).cells
     poses = np.column_stack([*grid.centres(*plan.path.T), np.zeros(len(plan.path))])
     robot = grid.cell_to_world(start)
-    assert not len(invalid_poses(poses, grid, robot=robot, clearing_radius=clearing_radius))
+    assert not len(
+        invalid_poses(poses, grid, robot=robot, clearing_radius=clearing_radius)
+    )
     if start in obstacles:
         assert len(invalid_poses(poses, grid, robot=robot))
-        several = ANY_MAP.plan_nearest(grid, start, [goal], rule, "greedy", False, clearing_radius)
+        several = ANY_MAP.plan_nearest(
+            grid, start, [goal], rule, "greedy", False, clearing_radius
+        )
         assert several.cells == plan.cells
 
 
-KEPT = [(2, 2)], True, [(2, 2), (2, 3), (3, 4), (4, 4)]  # the robot's cell alone: straight on
+KEPT = (
+    [(2, 2)],
+    True,
+    [(2, 2), (2, 3), (3, 4), (4, 4)],
+)  # the robot's cell alone: straight on
 LEFT = [(2, 2), (2, 3)], False, [(2, 2), (3, 2), (4, 3)]  # round the next cell
 
 
 @pytest.mark.parametrize(("blocked", "is_kept", "begin"), [KEPT, LEFT])
-def test_a_path_is_kept_on_a_way_out(blocked: list[Cell], is_kept: bool, begin: list[Cell]) -> None:
+def test_a_path_is_kept_on_a_way_out(
+    blocked: list[Cell], is_kept: bool, begin: list[Cell]
+) -> None:
     occupancy = np.zeros((6, 12), dtype=bool)
     for x, y in blocked:
         occupancy[y, x] = True
     occupancy[2, 3] = is_kept  # so that there the way out leads north
     under_way = [(0, 2), (1, 2), (2, 2), (2, 3), *((x, 4) for x in range(3, 12))]
-    options = {"under_way": under_way, "switch_threshold": 1.0, "start_clearing_radius": 0.5}
+    options = {
+        "under_way": under_way,
+        "switch_threshold": 1.0,
+        "start_clearing_radius": 0.5,
+    }
     ends = (2, 2), ((11, 4),)
     request = PlanRequest(GridMap(occupancy), *ends, MoveRule.ROBOT_SAFE, **options)
     plan = last_step(ANY_MAP.steps(request))

@@ -21,7 +21,14 @@ from ddqn_planner import GridMap, MoveRule, Plan, inflate
 from ddqn_planner.grid import Cell, legal_moves, path_length, shortest_distances
 from ddqn_planner.grid.grid_map import Exploration
 from ddqn_planner.model import AnyMapQNetwork, ModelMetadata
-from ddqn_planner.planning import PlanMethod, Planner, PlanRequest, PlanStatus, QField, simplify
+from ddqn_planner.planning import (
+    PlanMethod,
+    Planner,
+    PlanRequest,
+    PlanStatus,
+    QField,
+    simplify,
+)
 from ddqn_planner.planning.field import OBJECTS, DistanceField
 from ddqn_planner.planning.plan import ROUNDING
 from ddqn_planner.planning.planner import last_step
@@ -30,11 +37,15 @@ from ddqn_planner.planning.segments import cost_along
 
 def random_planner(height: int, width: int, seed: int) -> Planner:
     sizes = {"height": height, "width": width, "filters": 4, "hidden_units": 0}
-    metadata = ModelMetadata("paper", sizes, MoveRule.CORNER_CUTTING, 0.95, "", 0, seed, "")
+    metadata = ModelMetadata(
+        "paper", sizes, MoveRule.CORNER_CUTTING, 0.95, "", 0, seed, ""
+    )
     return Planner(random_network("paper", seed, **sizes), metadata)
 
 
-def known_field(planner: Planner, grid: GridMap, goal: Cell, rule: MoveRule) -> QField | None:
+def known_field(
+    planner: Planner, grid: GridMap, goal: Cell, rule: MoveRule
+) -> QField | None:
     return planner.fields.find(grid, (goal,), rule)
 
 
@@ -42,10 +53,14 @@ def is_answered_at_once(
     planner: Planner, grid: GridMap, start: Cell, goal: Cell, *how: Any, **more: Any
 ) -> bool:
     """Whether no step of a request is slow: no field is computed, and nothing is searched for."""
-    return next(planner.steps(PlanRequest(grid, start, (goal,), *how, **more))) is not None
+    return (
+        next(planner.steps(PlanRequest(grid, start, (goal,), *how, **more))) is not None
+    )
 
 
-def test_the_unmasked_rollout_is_trapped_by_the_first_illegal_move_that_it_prefers() -> None:
+def test_the_unmasked_rollout_is_trapped_by_the_first_illegal_move_that_it_prefers() -> (
+    None
+):
     grid = GridMap(np.array([[0, 0, 0], [0, 0, 0]]))
     q = np.zeros((8, 2, 3), dtype=np.float32)
     q[0] = 1.0  # +x
@@ -63,7 +78,9 @@ def test_a_plan_is_the_cheapest(
 ) -> None:
     grid, goal = place
     exact, planner = shortest_distances(grid, goal, rule), new_planner()
-    for start in data.draw(st.lists(st.sampled_from(grid.free_cells()), min_size=1, max_size=4)):
+    for start in data.draw(
+        st.lists(st.sampled_from(grid.free_cells()), min_size=1, max_size=4)
+    ):
         plan = planner.plan(grid, start, goal, rule, method)
         assert (plan.method, plan.move_rule) == (PlanMethod.GREEDY, rule)
         assert (plan.cost is None) == (not grid.has_costs or not plan.cells)
@@ -88,7 +105,9 @@ def test_a_plan_is_the_cheapest(
 
 @settings(max_examples=200)
 @given(GRIDS, RULES, st.integers(0, 5), st.data())
-def test_any_networks_moves_are_legal(place: Place, rule: MoveRule, seed: int, data: Data) -> None:
+def test_any_networks_moves_are_legal(
+    place: Place, rule: MoveRule, seed: int, data: Data
+) -> None:
     grid, goal = place
     start = data.draw(st.sampled_from(grid.free_cells()))
     planner = random_planner(grid.height, grid.width, seed)
@@ -109,8 +128,13 @@ def test_any_networks_moves_are_legal(place: Place, rule: MoveRule, seed: int, d
         assert searched == greedy
 
 
-def test_a_request_off_the_free_cells_or_on_a_map_of_another_size_is_told_apart() -> None:
-    planner, grid = random_planner(3, 3, 0), GridMap(np.array([[0, 0, 0], [0, 1, 0], [0, 0, 0]]))
+def test_a_request_off_the_free_cells_or_on_a_map_of_another_size_is_told_apart() -> (
+    None
+):
+    planner, grid = (
+        random_planner(3, 3, 0),
+        GridMap(np.array([[0, 0, 0], [0, 1, 0], [0, 0, 0]])),
+    )
     for start, goal, status in (
         ((-1, 0), (2, 2), PlanStatus.START_OUTSIDE_MAP),
         ((0, 0), (0, 3), PlanStatus.GOAL_OUTSIDE_MAP),
@@ -120,12 +144,16 @@ def test_a_request_off_the_free_cells_or_on_a_map_of_another_size_is_told_apart(
         plan = planner.plan(grid, start, goal, "unit")
         assert (plan.status, plan.goal, plan.move_rule) == (status, None, MoveRule.UNIT)
     larger = GridMap(np.zeros((4, 5)))
-    assert planner.plan(larger, (0, 0), (1, 1)).status is PlanStatus.MAP_SIZE_UNSUPPORTED
+    assert (
+        planner.plan(larger, (0, 0), (1, 1)).status is PlanStatus.MAP_SIZE_UNSUPPORTED
+    )
     with pytest.raises(ValueError, match="5 x 4"):
         planner.q_field(larger, (1, 1))
 
 
-def test_a_plan_tells_how_long_field_and_rollout_took(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plan_tells_how_long_field_and_rollout_took(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def slow(*arguments: Any) -> Any:
         time.sleep(0.05)
         return move_costs(*arguments)
@@ -134,19 +162,26 @@ def test_a_plan_tells_how_long_field_and_rollout_took(monkeypatch: pytest.Monkey
     monkeypatch.setattr(AnyMapQNetwork, "move_costs", slow)
     planner, grid = new_planner(), GridMap(np.zeros((5, 5)))
     ANY_MAP.plan(GridMap(np.zeros((2, 2))), (0, 0), (1, 1))
-    plan, again = (planner.plan(grid, (0, 0), (4, 2), simplified=True) for _ in range(2))
+    plan, again = (
+        planner.plan(grid, (0, 0), (4, 2), simplified=True) for _ in range(2)
+    )
     assert plan == again
     assert again.field_ms < 50 <= plan.field_ms
     assert plan.rollout_ms > 0
     # The time between two steps does not count.
-    steps, began = planner.steps(PlanRequest(grid, (0, 0), ((3, 3),), "unit")), time.perf_counter()
+    steps, began = (
+        planner.steps(PlanRequest(grid, (0, 0), ((3, 3),), "unit")),
+        time.perf_counter(),
+    )
     assert next(steps) is None
     time.sleep(0.2)
     found, waited = last_step(steps), 1e3 * (time.perf_counter() - began)
     assert found.field_ms + found.rollout_ms < waited - 200
 
 
-def test_a_field_grows_in_steps_and_others_are_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_field_grows_in_steps_and_others_are_answered(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     grid = GridMap(np.zeros((40, 40))).with_patch(np.ones((1, 39)), 0, 20)
     whole = new_planner().plan(grid, (0, 0), (0, 39))
     monkeypatch.setattr("ddqn_planner.planning.planner.VISITS", 20)
@@ -155,7 +190,9 @@ def test_a_field_grows_in_steps_and_others_are_answered(monkeypatch: pytest.Monk
     waited = 0
     for plan in steps:
         waited += plan is None
-        assert planner.plan(grid, (waited % 40, 0), (5, 5)).status is PlanStatus.SUCCEEDED
+        assert (
+            planner.plan(grid, (waited % 40, 0), (5, 5)).status is PlanStatus.SUCCEEDED
+        )
     assert waited > 10
     assert plan == whole
     given_up = planner.steps(PlanRequest(grid, (0, 0), ((1, 39),), MoveRule.ROBOT_SAFE))
@@ -171,7 +208,11 @@ def test_a_field_is_computed_once_per_map_goal_and_rule() -> None:
     field = planner.q_field(free, (1, 1))
     assert planner.q_field(GridMap(np.zeros((3, 3))), (1, 1)) is field
     other = free.with_patch([[True]], 0, 0)
-    for others in ((free, (1, 2)), (free, (1, 1), MoveRule.ROBOT_SAFE), (other, (1, 1))):
+    for others in (
+        (free, (1, 2)),
+        (free, (1, 1), MoveRule.ROBOT_SAFE),
+        (other, (1, 1)),
+    ):
         assert planner.q_field(*others) is not field
 
 
@@ -199,7 +240,9 @@ def test_the_memory_for_fields_is_bounded_and_those_used_last_are_kept() -> None
         planner.q_field(grid, goal)
         planner.q_field(grid, first)
     rule = planner.metadata.move_rule
-    known = [goal for goal in grid.free_cells() if known_field(planner, grid, goal, rule)]
+    known = [
+        goal for goal in grid.free_cells() if known_field(planner, grid, goal, rule)
+    ]
     assert known == [first, *goals[-3:]]
     planner.fields.nbytes = 1
     last = GridMap(np.zeros((3, 3)), cost=np.ones((3, 3), np.int8))
@@ -259,7 +302,9 @@ def test_a_tolerance_reaches_the_cells_that_its_metres_name() -> None:
     single = float(np.float32(0.7)) / float(np.float32(0.35))
     tolerances = {0.15 / 0.05: 3, single: 2, 2.99: 2, 1.0: 1}
     for (tolerance, cells), distance in product(tolerances.items(), range(1, 5)):
-        grid = GridMap(np.zeros((1, 9))).with_patch(np.ones((1, distance)), 9 - distance, 0)
+        grid = GridMap(np.zeros((1, 9))).with_patch(
+            np.ones((1, distance)), 9 - distance, 0
+        )
         plan = ANY_MAP.plan(grid, (0, 0), (8, 0), tolerance=tolerance)
         assert (plan.status is PlanStatus.SUCCEEDED) == (distance <= cells)
 
@@ -270,10 +315,14 @@ def test_a_start_too_near_to_an_obstacle_finds_a_goal_that_is_cut_off() -> None:
     grid = inflate(GridMap(occupancy), 1.1)
     plan = ANY_MAP.plan(grid, (1, 2), (11, 2), tolerance=5.0)
     assert (plan.cells[0], plan.cells[-1]) == ((1, 2), (6, 2))
-    assert ANY_MAP.plan(grid, (1, 2), (11, 2), tolerance=4.9).status is PlanStatus.NO_PATH
+    assert (
+        ANY_MAP.plan(grid, (1, 2), (11, 2), tolerance=4.9).status is PlanStatus.NO_PATH
+    )
     assert ANY_MAP.plan(grid, (1, 2), (11, 2), tolerance=1e300).cells == plan.cells
     for tolerance in (-1.0, np.nan):
-        with pytest.raises(ValueError, match=f"the tolerance is {tolerance}; give 0 cells or more"):
+        with pytest.raises(
+            ValueError, match=f"the tolerance is {tolerance}; give 0 cells or more"
+        ):
             ANY_MAP.plan(grid, (1, 2), (11, 2), tolerance=tolerance)
     with pytest.raises(ValueError, match="start_clearing_radius is nan"):
         ANY_MAP.plan(grid, (1, 2), (11, 2), start_clearing_radius=np.nan)
@@ -301,13 +350,20 @@ def test_the_cells_of_a_plan_are_pairs_of_python_ints() -> None:
 
 def test_plans_are_equal_whatever_time_they_took() -> None:
     assert Plan(PlanStatus.SUCCEEDED, np.array(CELLS), cost=2.5) != PLAN
-    for same in (replace(PLAN, field_ms=7.0, rollout_ms=2.0), pickle.loads(pickle.dumps(PLAN))):
+    for same in (
+        replace(PLAN, field_ms=7.0, rollout_ms=2.0),
+        pickle.loads(pickle.dumps(PLAN)),
+    ):
         assert same == PLAN
         assert hash(same) == hash(PLAN)
         assert same.cells == CELLS
     shorter = replace(PLAN, path=np.array(CELLS[:2]))
     assert shorter.cells == CELLS[:2]
-    others = replace(PLAN, cost=2.6), replace(PLAN, goal=(0, 0)), replace(PLAN, move_rule="unit")
+    others = (
+        replace(PLAN, cost=2.6),
+        replace(PLAN, goal=(0, 0)),
+        replace(PLAN, move_rule="unit"),
+    )
     for other in (shorter, replace(PLAN, status=PlanStatus.NO_PATH), *others, CELLS):
         assert other != PLAN
 
@@ -343,7 +399,9 @@ def test_a_field_of_goals_is_the_best(place: Place, rule: MoveRule, data: Data) 
     costs = ANY_MAP.network.move_costs(grid, rule)
     assert costs is not None
     field = DistanceField(goals, grid, costs, rule)
-    value = np.max([new_planner().q_field(grid, goal, rule).q for goal in goals], axis=0)
+    value = np.max(
+        [new_planner().q_field(grid, goal, rule).q for goal in goals], axis=0
+    )
     np.testing.assert_array_equal(field.q, value)
     for x, y in goals:
         assert field.value[y, x] == field.value.max()
@@ -356,31 +414,47 @@ def test_a_field_of_goals_is_the_best(place: Place, rule: MoveRule, data: Data) 
 
 
 def test_a_network_without_costs_plans_to_each_goal() -> None:
-    grid, planner, goals = GridMap(np.zeros((6, 6))), turning_planner(), [(5, 5), (0, 3)]
+    grid, planner, goals = (
+        GridMap(np.zeros((6, 6))),
+        turning_planner(),
+        [(5, 5), (0, 3)],
+    )
     found = planner.plan_nearest(grid, (0, 0), goals, method=PlanMethod.ASTAR_FALLBACK)
     assert found == planner.plan(grid, (0, 0), (0, 3), method=PlanMethod.ASTAR_FALLBACK)
-    assert planner.plan_nearest(grid, (0, 0), goals).status is PlanStatus.ROLLOUT_TRAPPED
+    assert (
+        planner.plan_nearest(grid, (0, 0), goals).status is PlanStatus.ROLLOUT_TRAPPED
+    )
 
 
 @pytest.mark.parametrize("has_costs", [True, False])
 def test_a_robot_between_two_docks_keeps_to_one_of_them(has_costs: bool) -> None:
     planner = ANY_MAP if has_costs else turning_planner(21)
     grid, left, right = GridMap(np.zeros((21, 21))), (0, 10), (20, 10)
-    request = PlanRequest(grid, (9, 10), (left,), MoveRule.ROBOT_SAFE, PlanMethod.ASTAR_FALLBACK)
+    request = PlanRequest(
+        grid, (9, 10), (left,), MoveRule.ROBOT_SAFE, PlanMethod.ASTAR_FALLBACK
+    )
     first = last_step(planner.steps(replace(request, goals=(left, right))))
     assert first.goal == left
-    request = replace(request, start=(11, 10), goals=(left, right), under_way=first.path)
+    request = replace(
+        request, start=(11, 10), goals=(left, right), under_way=first.path
+    )
     kept = last_step(planner.steps(replace(request, switch_threshold=0.5)))
     assert (kept.goal, kept.length) == (left, 11)
     assert kept.extra_cost == pytest.approx(11 / 9 - 1)
-    assert last_step(planner.steps(replace(request, switch_threshold=0.2))).goal == right
-    taken = replace(request, grid=grid.with_patch([[True]], *left), switch_threshold=10.0)
+    assert (
+        last_step(planner.steps(replace(request, switch_threshold=0.2))).goal == right
+    )
+    taken = replace(
+        request, grid=grid.with_patch([[True]], *left), switch_threshold=10.0
+    )
     assert last_step(planner.steps(taken)).goal == right
 
 
 def explored(grid: GridMap, share: float, *slowness: Any) -> GridMap:
     """Return a map with expected times, and those that a bold plan and a safe one hope for."""
-    expected, bold, safe = (replace(grid, slowness=each, seconds_per_cell=0.5) for each in slowness)
+    expected, bold, safe = (
+        replace(grid, slowness=each, seconds_per_cell=0.5) for each in slowness
+    )
     return expected.with_layers(exploration=Exploration(share, bold, safe))
 
 
@@ -392,7 +466,9 @@ def test_what_is_hoped_for_leads_unless_it_is_expected_to_take_longer_than_the_s
     goal = grid.free_cells()[random.integers(len(grid.free_cells()))]
     expected = random.uniform(4, 12, grid.occupancy.shape)
     safe = expected / random.uniform(1, 1 + share, expected.shape)
-    timed = explored(grid, share, expected, expected / random.uniform(1, 4, expected.shape), safe)
+    timed = explored(
+        grid, share, expected, expected / random.uniform(1, 4, expected.shape), safe
+    )
     assert timed.exploration is not None
     without_hope = timed.with_layers()
     plan, best, bold, safe_plan = (
@@ -401,16 +477,22 @@ def test_what_is_hoped_for_leads_unless_it_is_expected_to_take_longer_than_the_s
     )
     assert {each.status for each in (best, bold, safe_plan)} == {plan.status}
     if plan.status is PlanStatus.SUCCEEDED:
-        costs = [0.5 * cost_along(each.path, timed, rule) for each in (plan, bold, best)]
+        costs = [
+            0.5 * cost_along(each.path, timed, rule) for each in (plan, bold, best)
+        ]
         assert plan.cost == pytest.approx(costs[0])
         is_bold = costs[1] <= (1 + share) * costs[2] * (1 + 1e-9)
         assert plan.cells == (bold if is_bold else safe_plan).cells
         assert simplified or costs[0] <= (1 + share) * costs[2] * (1 + 1e-6)
 
 
-def test_a_robot_that_explores_drives_on_where_the_rest_alone_would_take_too_long() -> None:
+def test_a_robot_that_explores_drives_on_where_the_rest_alone_would_take_too_long() -> (
+    None
+):
     occupancy = np.zeros((3, 21), dtype=np.bool_)
-    occupancy[1, 1:10] = occupancy[1, 11:20] = True  # two lanes, with a door in the middle
+    occupancy[1, 1:10] = occupancy[1, 11:20] = (
+        True  # two lanes, with a door in the middle
+    )
     expected = np.full(occupancy.shape, 2.0)
     expected[2, 11:] = 2.3
     bold = np.where(expected > 2, 1.0, expected)
@@ -441,7 +523,9 @@ def test_a_path_through_goals_is_the_sum_of_its_pieces(
             return
         here = pieces[-1].cells[-1]
     cells = [cell for piece in pieces for cell in piece.cells]
-    assert list(plan.cells) == cells[:1] + [cell for last, cell in pairwise(cells) if last != cell]
+    assert list(plan.cells) == cells[:1] + [
+        cell for last, cell in pairwise(cells) if last != cell
+    ]
     assert plan.goal == here
     assert plan.length == pytest.approx(sum(piece.length for piece in pieces))
     assert (plan.cost is None) == (not grid.has_costs)
@@ -452,7 +536,9 @@ def test_a_path_through_goals_is_the_sum_of_its_pieces(
 def test_wrong_goals_are_named() -> None:
     grid = GridMap(np.zeros((3, 3)))
     for plan in (ANY_MAP.plan_nearest, ANY_MAP.plan_through):
-        with pytest.raises(ValueError, match="there is no goal; give at least one cell"):
+        with pytest.raises(
+            ValueError, match="there is no goal; give at least one cell"
+        ):
             plan(grid, (0, 0), [])
         with pytest.raises(ValueError, match=r"goal 2 is .*; give two whole numbers"):
             plan(grid, (0, 0), [(1, 1), (0.5, 1)])  # type: ignore[list-item]

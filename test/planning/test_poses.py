@@ -26,7 +26,13 @@ from ddqn_planner.planning.planner import last_step
 from ddqn_planner.planning.pose_kernels import way_left
 from ddqn_planner.planning.pose_paths import cost_of_poses
 from ddqn_planner.planning.pose_planner import Pose, PosePlanner, PoseRequest
-from ddqn_planner.planning.pose_world import State, body_of, is_possible, rows_of, world_of
+from ddqn_planner.planning.pose_world import (
+    State,
+    body_of,
+    is_possible,
+    rows_of,
+    world_of,
+)
 
 CELL = 0.1
 FORMS = {
@@ -56,10 +62,14 @@ def robot(motion: str, body: str = "") -> tuple[Motions, NDArray[np.bool_]]:
 def planner(motion: str, footprint: str = "") -> PosePlanner:
     motions, swept = robot(motion, footprint)
     body = read_footprint(footprint or BODIES[motion])
-    return PosePlanner(SimpleNamespace(motions=motions, swept=lambda: swept, footprint=body))
+    return PosePlanner(
+        SimpleNamespace(motions=motions, swept=lambda: swept, footprint=body)
+    )
 
 
-def plan(planner: PosePlanner, grid: GridMap, start: Pose, *goals: Pose, **how: Any) -> PosePlan:
+def plan(
+    planner: PosePlanner, grid: GridMap, start: Pose, *goals: Pose, **how: Any
+) -> PosePlan:
     return last_step(planner.steps(PoseRequest(grid, start, goals, **how)))
 
 
@@ -68,7 +78,10 @@ def last_field(planner: PosePlanner) -> pose_field.PoseField:
 
 
 def pose_of(grid: GridMap, state: State) -> Pose:
-    (x, y, heading), angles = state, robot("differential")[0].angles  # the same for all motions
+    (x, y, heading), angles = (
+        state,
+        robot("differential")[0].angles,
+    )  # the same for all motions
     return (*grid.cell_to_world((x, y)), float(angles[heading]) + grid.origin[2])
 
 
@@ -76,7 +89,9 @@ def pose_of(grid: GridMap, state: State) -> Pose:
 @given(
     motion=st.sampled_from(sorted(BODIES)),
     seed=st.integers(0, 2**32 - 1),
-    layers=st.sampled_from([(), ("cost",), ("forbidden",), ("cost", "slowness"), ("uphill",)]),
+    layers=st.sampled_from(
+        [(), ("cost",), ("forbidden",), ("cost", "slowness"), ("uphill",)]
+    ),
     guided=st.booleans(),
 )
 @example(motion="differential", seed=1, layers=("uphill",), guided=False)
@@ -90,17 +105,26 @@ def test_plans_cost_the_least_within_their_bound_also_after_repairs(
     occupancy[random.integers(height), : random.integers(width)] = True
     given_layers = {
         "cost": random.integers(-1, 100, shape),
-        "forbidden": np.where(random.random(shape) < 0.1, random.integers(0, 256, shape), 0),
+        "forbidden": np.where(
+            random.random(shape) < 0.1, random.integers(0, 256, shape), 0
+        ),
         "slowness": random.uniform(1, 4, shape).astype(np.float32),
         "uphill": random.integers(0, 96, shape),
     }
     origin = (*random.uniform(-3, 3, 2), random.choice([0, 0.5]))
-    grid = GridMap(occupancy, CELL, origin, **{name: given_layers[name] for name in layers})
-    states = [(*random.integers((width, height)).tolist(), h) for h in random.integers(16, size=7)]
+    grid = GridMap(
+        occupancy, CELL, origin, **{name: given_layers[name] for name in layers}
+    )
+    states = [
+        (*random.integers((width, height)).tolist(), h)
+        for h in random.integers(16, size=7)
+    ]
     goal, *starts = ((x, y, int(heading)) for x, y, heading in states)
     body = planner(motion)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pose_field, "LOST", 0)  # it is repaired, however much is taken back
+        patch.setattr(
+            pose_field, "LOST", 0
+        )  # it is repaired, however much is taken back
         if guided:
             patch.setattr(pose_field, "UNGUIDED", 16)
         for _ in range(3):
@@ -109,7 +133,10 @@ def test_plans_cost_the_least_within_their_bound_also_after_repairs(
                 bound = float(random.choice([1.0, 1.05, 1.2, 2.0]))
                 start, end = (pose_of(grid, s) for s in ((x, y, heading), goal))
                 found = plan(body, grid, start, end, bound=bound)
-                if found.status in (PlanStatus.START_OCCUPIED, PlanStatus.GOAL_OCCUPIED):
+                if found.status in (
+                    PlanStatus.START_OCCUPIED,
+                    PlanStatus.GOAL_OCCUPIED,
+                ):
                     continue
                 least = best[y, x, heading]
                 if found.poses.size:
@@ -117,9 +144,14 @@ def test_plans_cost_the_least_within_their_bound_also_after_repairs(
                     turned = np.abs(turn_between(0, turned))
                     assert np.hypot(x_off, y_off).max() <= 0.5001 * CELL
                 # Where the body has no room, the next heading counts; on the last path, that one.
-                if found.poses.size and max(x_off.max(), y_off.max(), turned.max()) < 1e-6:
+                if (
+                    found.poses.size
+                    and max(x_off.max(), y_off.max(), turned.max()) < 1e-6
+                ):
                     assert 1 <= found.bound <= bound + 1e-5
-                    same = 1.003 if layers else 1.0001  # the parts of the way are rounded
+                    same = (
+                        1.003 if layers else 1.0001
+                    )  # the parts of the way are rounded
                     assert least / same <= found.cost <= least * found.bound * same
                 elif not found.poses.size:
                     assert found.status is PlanStatus.NO_PATH
@@ -131,7 +163,9 @@ def test_plans_cost_the_least_within_their_bound_also_after_repairs(
 
 @pytest.mark.parametrize("goals", [1, 6])
 @pytest.mark.parametrize("seed", range(3))
-def test_what_the_map_tells_changes_no_least_path(seed: int, goals: int, monkeypatch: Any) -> None:
+def test_what_the_map_tells_changes_no_least_path(
+    seed: int, goals: int, monkeypatch: Any
+) -> None:
     random = np.random.default_rng(seed)
     occupancy = np.zeros((120, 120), np.bool_)
     for x, y in random.integers(0, 110, (40, 2)):
@@ -143,7 +177,9 @@ def test_what_the_map_tells_changes_no_least_path(seed: int, goals: int, monkeyp
     for looks in (2**8, 2**30):
         monkeypatch.setattr(pose_field, "UNGUIDED", looks)
         body = planner("differential")
-        for number, start in enumerate(poses[:6]):  # toward one goal: all from one field
+        for number, start in enumerate(
+            poses[:6]
+        ):  # toward one goal: all from one field
             found = plan(body, grid, start, poses[6 + number % goals], bound=1.0)
             costs.setdefault(looks, []).append(found.cost or 0.0)
     few, many = costs.values()
@@ -151,16 +187,24 @@ def test_what_the_map_tells_changes_no_least_path(seed: int, goals: int, monkeyp
 
 
 @pytest.mark.parametrize("motion", sorted(BODIES))
-def test_a_core_is_what_all_motions_sweep_around_each_cell_of_the_origin(motion: str) -> None:
+def test_a_core_is_what_all_motions_sweep_around_each_cell_of_the_origin(
+    motion: str,
+) -> None:
     body, cells = planner(motion).body, []
     for begin, end in pairwise(body.first.tolist()):
-        rows = zip(body.row[begin:end].tolist(), body.bits[begin:end].tolist(), strict=True)
-        cells.append({(x + i, y) for (y, x), bits in rows for i in range(64) if bits >> i & 1})
+        rows = zip(
+            body.row[begin:end].tolist(), body.bits[begin:end].tolist(), strict=True
+        )
+        cells.append(
+            {(x + i, y) for (y, x), bits in rows for i in range(64) if bits >> i & 1}
+        )
     for heading in range(16):
         swept_around = [
             {(x - over, y - up) for x, y in cells[primitive]}
             for primitive in range(body.out[heading], body.out[heading + 1])
-            for over, up, *_ in body.passed[slice(*body.first_passed[primitive : primitive + 2])]
+            for over, up, *_ in body.passed[
+                slice(*body.first_passed[primitive : primitive + 2])
+            ]
         ]
         assert cells[body.start.size + 16 + heading] == set.intersection(*swept_around)
 
@@ -212,7 +256,10 @@ def test_requests_that_share_a_field_prove_their_own_bounds(seed: int) -> None:
     def is_asked(state: list[int], bound: float) -> bool:
         row, column, turned = state
         start = pose_of(grid, (column, row, turned))
-        found, least = plan(body, grid, start, goal, bound=bound), best[row, column, turned]
+        found, least = (
+            plan(body, grid, start, goal, bound=bound),
+            best[row, column, turned],
+        )
         if np.abs(found.poses[0] - start)[:2].max() > 1e-6:
             return False  # it lies beside the path planned last
         assert least / 1.0001 <= found.cost <= least * found.bound * 1.0001
@@ -222,7 +269,9 @@ def test_requests_that_share_a_field_prove_their_own_bounds(seed: int) -> None:
         assert sum(threads.map(is_asked, starts, [1.0, 2.0] * 30)) > 40
 
 
-def test_a_second_look_sees_a_wall_that_is_thinner_than_a_tile(monkeypatch: Any) -> None:
+def test_a_second_look_sees_a_wall_that_is_thinner_than_a_tile(
+    monkeypatch: Any,
+) -> None:
     grid = GridMap(np.zeros((120, 120)), CELL).with_patch(np.ones((1, 120)), 0, 51)
     start, goal = (pose_of(grid, state) for state in ((60, 20, 0), (60, 100, 0)))
     monkeypatch.setattr(pose_field, "UNGUIDED", 2**8)
@@ -256,7 +305,10 @@ def test_what_was_far_from_obstacles_is_looked_at_again_when_one_comes(
 
 @pytest.mark.parametrize("motion", sorted(BODIES))
 def test_a_box_on_the_path_is_driven_around_at_the_least_cost(motion: str) -> None:
-    grid, random = GridMap(np.zeros((70, 140), np.bool_), CELL), np.random.default_rng(3)
+    grid, random = (
+        GridMap(np.zeros((70, 140), np.bool_), CELL),
+        np.random.default_rng(3),
+    )
     start, goal = (pose_of(grid, state) for state in ((15, 20, 0), (125, 50, 0)))
     body = planner(motion)
     way = plan(body, grid, start, goal, bound=1.0)
@@ -284,27 +336,39 @@ def test_no_body_touches_an_occupied_cell(motion: str, seed: int) -> None:
     occupancy = random.random((25, 110)) < 0.03
     grid = GridMap(occupancy, CELL, (*random.uniform(-3, 3, 2), 0))
     start, goal = (
-        (grid.origin[0] + x, grid.origin[1] + random.uniform(0, 2.5), random.uniform(-4, 4))
+        (
+            grid.origin[0] + x,
+            grid.origin[1] + random.uniform(0, 2.5),
+            random.uniform(-4, 4),
+        )
         for x in random.uniform(0, 11, 2)
     )
     poses = plan(planner(motion), grid, start, goal).poses
     y, x = np.nonzero(np.pad(occupancy, 1, constant_values=True))
     low = (np.column_stack([x, y]) - 1) * CELL + grid.origin[:2]
     cells = shapely.STRtree(shapely.box(*low.T, *(low + CELL).T))
-    body = shapely.Polygon(read_footprint(BODIES[motion])).buffer(-1e-6, join_style="mitre")
+    body = shapely.Polygon(read_footprint(BODIES[motion])).buffer(
+        -1e-6, join_style="mitre"
+    )
     # Every 2 cm and 2 degrees between poses that are half a cell apart at most.
     for before, after in pairwise(poses):
         move = after - before
         assert math.hypot(*move[:2]) <= CELL / 2 + 1e-9
         move[2] = (move[2] + math.pi) % (2 * math.pi) - math.pi
-        for share in np.linspace(0, 1, 1 + math.ceil(max(abs(move[2]) / math.radians(2), 3))):
-            assert not len(cells.query(placed(body, before + share * move), "intersects"))
+        for share in np.linspace(
+            0, 1, 1 + math.ceil(max(abs(move[2]) / math.radians(2), 3))
+        ):
+            assert not len(
+                cells.query(placed(body, before + share * move), "intersects")
+            )
 
 
 @pytest.mark.parametrize("form", FORMS)
 @settings(max_examples=4)
 @given(
-    motion=st.sampled_from(sorted(BODIES)), seed=st.integers(0, 2**32 - 1), has_costs=st.booleans()
+    motion=st.sampled_from(sorted(BODIES)),
+    seed=st.integers(0, 2**32 - 1),
+    has_costs=st.booleans(),
 )
 def test_a_concave_body_or_one_beside_its_origin_takes_the_cheapest_free_path(
     form: str, motion: str, seed: int, has_costs: bool
@@ -312,21 +376,35 @@ def test_a_concave_body_or_one_beside_its_origin_takes_the_cheapest_free_path(
     random, height, width = np.random.default_rng(seed), 26, 34
     occupancy = random.random((height, width)) < 0.005
     cost = random.integers(0, 99, occupancy.shape) if has_costs else None
-    grid, (motions, swept) = GridMap(occupancy, CELL, cost=cost), robot(motion, FORMS[form])
+    grid, (motions, swept) = (
+        GridMap(occupancy, CELL, cost=cost),
+        robot(motion, FORMS[form]),
+    )
     body = planner(motion, FORMS[form])
     states = random.integers((width, height, 16), size=(60, 3)).tolist()
-    free = [s for s in states if len(body._at(grid, pose_of(grid, s), body._world(grid)))]
-    shape = shapely.Polygon(read_footprint(FORMS[form])).buffer(-1e-6, join_style="mitre")
+    free = [
+        s for s in states if len(body._at(grid, pose_of(grid, s), body._world(grid)))
+    ]
+    shape = shapely.Polygon(read_footprint(FORMS[form])).buffer(
+        -1e-6, join_style="mitre"
+    )
     y, x = np.nonzero(np.pad(occupancy, 1, constant_values=True))
     cells = shapely.STRtree(shapely.box(*np.array([x - 1, y - 1, x, y]) * CELL))
     goal = free[0]
     best = least_costs(
-        grid, motions, swept, tuple(body._at(grid, pose_of(grid, goal), body._world(grid))[0])
+        grid,
+        motions,
+        swept,
+        tuple(body._at(grid, pose_of(grid, goal), body._world(grid))[0]),
     )
     for start in free[1:4]:
         own = tuple(body._at(grid, pose_of(grid, start), body._world(grid))[0])
         found = plan(
-            planner(motion, FORMS[form]), grid, pose_of(grid, start), pose_of(grid, goal), bound=1.0
+            planner(motion, FORMS[form]),
+            grid,
+            pose_of(grid, start),
+            pose_of(grid, goal),
+            bound=1.0,
         )
         least = best[own[1], own[0], own[2]]
         assert (found.status is PlanStatus.SUCCEEDED) == (least < math.inf)
@@ -334,9 +412,12 @@ def test_a_concave_body_or_one_beside_its_origin_takes_the_cheapest_free_path(
             assert found.cost == pytest.approx(least, rel=2e-3, abs=1e-6)
             assert all(map(grid.contains, found.cells))
             assert not any(
-                len(cells.query(placed(shape, pose), "intersects")) for pose in found.poses
+                len(cells.query(placed(shape, pose), "intersects"))
+                for pose in found.poses
             )
-            assert np.array_equal(body.rest_of(found.poses, found.poses[0], grid), found.poses)
+            assert np.array_equal(
+                body.rest_of(found.poses, found.poses[0], grid), found.poses
+            )
 
 
 def test_a_path_on_which_the_origin_leaves_the_map_is_not_free() -> None:
@@ -349,13 +430,17 @@ def test_a_path_on_which_the_origin_leaves_the_map_is_not_free() -> None:
     assert not len(body.rest_of(outside, outside[0], grid))
 
 
-@pytest.mark.parametrize(("row", "is_free"), [(1, False), (2, True), (12, True), (13, False)])
+@pytest.mark.parametrize(
+    ("row", "is_free"), [(1, False), (2, True), (12, True), (13, False)]
+)
 def test_a_primitive_on_which_the_origin_leaves_the_map_is_impossible(
     row: int, is_free: bool
 ) -> None:
     motions, away = make_motions("differential", 0.2, CELL), 1 if row < 7 else -1
     footprint = read_footprint([(0, 0.5 * away), (0.1, 0.5 * away), (0.1, 0.6 * away)])
-    ahead = np.flatnonzero((motions.start == 0) & (motions.offset == (4, 0)).all(axis=1))[0]
+    ahead = np.flatnonzero(
+        (motions.start == 0) & (motions.offset == (4, 0)).all(axis=1)
+    )[0]
     share = np.linspace(0, 1, 17)
     # The origin comes two cells nearer to the border than both ends; the body is not there.
     swing = -2 * away * np.sin(math.pi * share)
@@ -373,8 +458,12 @@ def test_a_plan_begins_and_ends_as_asked_and_the_rest_of_it_is_known() -> None:
     body = planner("differential")
     whole = plan(body, grid, start, goal)
     assert np.abs((whole.poses[[0, -1]] - [start, goal])[:, :2]).max() < 1e-9
-    assert np.abs(turn_between(whole.poses[[0, -1], 2], [start[2], goal[2]])).max() < 1e-9
-    assert whole.length * CELL == pytest.approx(np.hypot(*np.diff(whole.poses[:, :2].T)).sum())
+    assert (
+        np.abs(turn_between(whole.poses[[0, -1], 2], [start[2], goal[2]])).max() < 1e-9
+    )
+    assert whole.length * CELL == pytest.approx(
+        np.hypot(*np.diff(whole.poses[:, :2].T)).sum()
+    )
     assert whole.cells[0] == (10, 10)
     assert whole.cells[-1] == (50, 20) == whole.goal
     rest = plan(body, grid, tuple(whole.poses[7]), goal)
@@ -383,10 +472,13 @@ def test_a_plan_begins_and_ends_as_asked_and_the_rest_of_it_is_known() -> None:
     assert plan(body, grid, goal, goal).poses.shape == (1, 3)
 
 
-def test_the_nearest_goal_counts_and_one_without_room_moves_within_the_tolerance() -> None:
+def test_the_nearest_goal_counts_and_one_without_room_moves_within_the_tolerance() -> (
+    None
+):
     grid = GridMap(np.zeros((30, 60)), CELL).with_patch([[True]], 40, 10)
     start, near, far, occupied = (
-        pose_of(grid, state) for state in ((10, 10, 0), (20, 10, 0), (50, 10, 0), (40, 10, 0))
+        pose_of(grid, state)
+        for state in ((10, 10, 0), (20, 10, 0), (50, 10, 0), (40, 10, 0))
     )
     body = planner("differential")
     assert plan(body, grid, start, far, near).goal == (20, 10)
@@ -396,7 +488,9 @@ def test_the_nearest_goal_counts_and_one_without_room_moves_within_the_tolerance
     assert plan(body, grid, occupied, near).status is PlanStatus.START_OCCUPIED
     assert plan(body, grid, (-1, 0, 0), near).status is PlanStatus.START_OUTSIDE_MAP
     assert plan(body, grid, near, (99, 0, 0)).status is PlanStatus.GOAL_OUTSIDE_MAP
-    with pytest.raises(ValueError, match=r"learned cells of 0.1 m, and the map's have 0.05 m"):
+    with pytest.raises(
+        ValueError, match=r"learned cells of 0.1 m, and the map's have 0.05 m"
+    ):
         plan(body, GridMap(grid.occupancy, 0.05), start, near)
 
 
@@ -404,7 +498,9 @@ def test_a_goal_may_move_as_far_as_one_likes() -> None:
     grid = GridMap(np.zeros((60, 80)), CELL).with_patch([[True]], 40, 30)
     start, occupied = (pose_of(grid, (x, 30, 0)) for x in (10, 40))
     far = 2.2, math.pi  # more states than a field has room for at first
-    moved = plan(planner("differential"), grid, start, occupied, tolerance=far, bound=1.0)
+    moved = plan(
+        planner("differential"), grid, start, occupied, tolerance=far, bound=1.0
+    )
     assert (moved.goal, moved.length) == ((18, 30), pytest.approx(8))
 
 
@@ -415,7 +511,9 @@ def test_a_goal_may_move_as_far_as_one_likes() -> None:
     metres=st.sampled_from([0.0, 0.35, 1.2, 9.0]),
     radians=st.sampled_from([0.0, 0.5, 4.0]),
 )
-@example(motion="ackermann", seed=73, metres=9.0, radians=0.0)  # no room in the start's heading
+@example(
+    motion="ackermann", seed=73, metres=9.0, radians=0.0
+)  # no room in the start's heading
 def test_an_occupied_goal_moves_to_where_the_way_costs_the_least(
     motion: str, seed: int, metres: float, radians: float
 ) -> None:
@@ -431,7 +529,9 @@ def test_an_occupied_goal_moves_to_where_the_way_costs_the_least(
     ends = [(*cell, int(turned)) for cell in cells for turned in headings]
     best = least_costs(grid, motions, swept, *ends)
     body, goal = planner(motion), pose_of(grid, (x, y, heading))
-    for row, column, turned in np.column_stack([random.integers(n, size=5) for n in best.shape]):
+    for row, column, turned in np.column_stack(
+        [random.integers(n, size=5) for n in best.shape]
+    ):
         start = pose_of(grid, (int(column), int(row), int(turned)))
         found = plan(body, grid, start, goal, tolerance=(metres, radians), bound=1.0)
         least = best[row, column, turned]
@@ -456,10 +556,17 @@ def test_a_body_that_cannot_leave_its_place_has_no_path() -> None:
 
 @settings(max_examples=12)
 @given(motion=st.sampled_from(sorted(BODIES)), seed=st.integers(0, 2**32 - 1))
-def test_the_rest_of_a_path_is_free_unless_a_box_stands_ahead(motion: str, seed: int) -> None:
+def test_the_rest_of_a_path_is_free_unless_a_box_stands_ahead(
+    motion: str, seed: int
+) -> None:
     random = np.random.default_rng(seed)
-    grid = GridMap(np.zeros((40, 60), np.bool_), CELL, (1, 2, float(random.choice([0, 0.5]))))
-    states = [(*random.integers((8, 8), (52, 32)).tolist(), h) for h in random.integers(16, size=2)]
+    grid = GridMap(
+        np.zeros((40, 60), np.bool_), CELL, (1, 2, float(random.choice([0, 0.5])))
+    )
+    states = [
+        (*random.integers((8, 8), (52, 32)).tolist(), h)
+        for h in random.integers(16, size=2)
+    ]
     start, goal = (pose_of(grid, (x, y, int(h))) for x, y, h in states)
     body = planner(motion)
     poses = plan(body, grid, start, goal).poses
@@ -469,7 +576,9 @@ def test_the_rest_of_a_path_is_free_unless_a_box_stands_ahead(motion: str, seed:
     assert math.dist(rest[0, :2], poses[at, :2]) < 0.1
     x, y = grid.world_to_cell(*poses[at, :2])
     blocked = grid.with_patch(np.ones((2, 2), np.bool_), x, y)
-    box = shapely.Polygon([blocked.centres(x + a - 0.5, y + b - 0.5) for a, b in SQUARE])
+    box = shapely.Polygon(
+        [blocked.centres(x + a - 0.5, y + b - 0.5) for a, b in SQUARE]
+    )
     shape = shapely.Polygon(read_footprint(BODIES[motion]))
     for robot_at in (0, at, len(poses) - 1):
         ahead = body.rest_of(poses, tuple(poses[robot_at]), grid)
@@ -497,7 +606,9 @@ def test_a_path_is_kept_while_it_costs_hardly_more_and_leads_to_a_goal() -> None
     hall = GridMap(np.zeros((41, 60)), CELL).with_patch(np.ones((21, 20)), 20, 10)
     # The way below the obstacle is expensive, or the one above.
     shape = 10, 20
-    below, above = (hall.with_patch(np.zeros(shape), 20, y, np.full(shape, 3)) for y in (0, 31))
+    below, above = (
+        hall.with_patch(np.zeros(shape), 20, y, np.full(shape, 3)) for y in (0, 31)
+    )
     start, goal, other = (pose_of(hall, (x, 20, 0)) for x in (8, 52, 50))
     body = planner("differential")
     first = plan(body, below, start, goal, bound=1.0)
@@ -511,7 +622,9 @@ def test_a_path_is_kept_while_it_costs_hardly_more_and_leads_to_a_goal() -> None
     assert kept.extra_cost == pytest.approx(kept.cost / new.cost - 1)
     assert kept.bound == pytest.approx(kept.cost / new.cost)
     assert kept.cost == pytest.approx(cost_of_poses(first.poses, above), rel=0.02)
-    assert plan(body, above, start, other, switch_threshold=0.2, **how).extra_cost is None
+    assert (
+        plan(body, above, start, other, switch_threshold=0.2, **how).extra_cost is None
+    )
 
 
 def test_cells_that_are_only_too_near_for_a_disc_are_free_at_the_highest_cost() -> None:

@@ -36,7 +36,9 @@ def grid_of(radius: float = 0.0, **values: int) -> GridMap:
     return inflate(GridMap.from_occupancy_values(hall(**values)), radius)
 
 
-THROUGH = "no path leads from the start to the goal, but a path leads through unknown space"
+THROUGH = (
+    "no path leads from the start to the goal, but a path leads through unknown space"
+)
 IN_UNKNOWN, BUT = "lies in unknown space", ", but a path leads through unknown space"
 NEAR = "the goal is nearer to unknown space than the robot's body allows"
 
@@ -62,7 +64,9 @@ def test_unknown_space_is_named(
     free = GridMap.from_occupancy_values(hall(**values), allow_unknown=True)
     freed = planner.plan(inflate(free, radius), START, GOAL)
     is_closed_by_unknown = REMEDY in reason
-    assert (freed.status is PlanStatus.SUCCEEDED) == (is_closed_by_unknown or not values)
+    assert (freed.status is PlanStatus.SUCCEEDED) == (
+        is_closed_by_unknown or not values
+    )
 
 
 def test_too_near_to_unknown_space_is_no_obstacle(planner: Planner) -> None:
@@ -95,8 +99,13 @@ def test_a_goal_may_move_only_through_unknown_space(planner: Planner) -> None:
     grid = grid_of(across=UNKNOWN, goal=WALL)
     plan = planner.plan(grid, START, GOAL, tolerance=4.0)
     assert plan.status is PlanStatus.GOAL_OCCUPIED
-    assert plan.reason == f"the goal is occupied, but a path leads through unknown space; {REMEDY}"
-    assert planner.plan(grid, START, GOAL, tolerance=1.0).reason == "the goal is occupied"
+    assert (
+        plan.reason
+        == f"the goal is occupied, but a path leads through unknown space; {REMEDY}"
+    )
+    assert (
+        planner.plan(grid, START, GOAL, tolerance=1.0).reason == "the goal is occupied"
+    )
     in_unknown = planner.plan(grid_of(goal=UNKNOWN), START, GOAL, tolerance=4.0)
     assert in_unknown.status is PlanStatus.SUCCEEDED
 
@@ -112,7 +121,10 @@ def test_each_of_several_goals_is_named(planner: Planner) -> None:
     through = planner.plan_through(grid, (10, 5), [(12, 5), GOAL])
     assert through.reason == f"goal 2 of 2: the goal lies in unknown space; {REMEDY}"
     assert through.goal == GOAL
-    assert planner.plan_through(grid, (10, 5), [(99, 5)]).reason == "the goal lies outside the map"
+    assert (
+        planner.plan_through(grid, (10, 5), [(99, 5)]).reason
+        == "the goal lies outside the map"
+    )
     many = planner.plan_nearest(grid, (10, 5), [GOAL] * 7)
     assert many.reason.startswith("goal 1 lies")
     assert "goal 5 lies in unknown space, ...;" in many.reason
@@ -124,11 +136,23 @@ def test_each_of_several_goals_is_named(planner: Planner) -> None:
 @pytest.mark.parametrize(
     ("across", "goals", "reason"),
     [
-        (UNKNOWN, [(15, 2), GOAL], f"goal 1 {IN_UNKNOWN}, no path leads to goal 2{BUT}; {REMEDY}"),
+        (
+            UNKNOWN,
+            [(15, 2), GOAL],
+            f"goal 1 {IN_UNKNOWN}, no path leads to goal 2{BUT}; {REMEDY}",
+        ),
         (WALL, [(15, 2), GOAL], "goal 1 is occupied, no path leads to goal 2"),
-        (WALL, [GOAL, (15, 2), (28, 2)], "goal 2 is occupied, no path leads to goals 1, 3"),
+        (
+            WALL,
+            [GOAL, (15, 2), (28, 2)],
+            "goal 2 is occupied, no path leads to goals 1, 3",
+        ),
         (WALL, [(99, 5), (15, 2)], "goal 1 lies outside the map, goal 2 is occupied"),
-        (WALL, [(99, 5), (-1, 2)], "goal 1 lies outside the map, goal 2 lies outside the map"),
+        (
+            WALL,
+            [(99, 5), (-1, 2)],
+            "goal 1 lies outside the map, goal 2 lies outside the map",
+        ),
     ],
 )
 def test_each_of_several_goals_has_its_own_reason(
@@ -136,9 +160,13 @@ def test_each_of_several_goals_has_its_own_reason(
 ) -> None:
     plan = planner.plan_nearest(grid_of(across=across), START, goals)
     assert plan.reason == reason
-    grid = GridMap(np.array(hall(across=across) != FREE))  # it does not know what is unknown
+    grid = GridMap(
+        np.array(hall(across=across) != FREE)
+    )  # it does not know what is unknown
     occupied = (
-        reason.replace(IN_UNKNOWN, "is occupied").replace(BUT, "").removesuffix(f"; {REMEDY}")
+        reason.replace(IN_UNKNOWN, "is occupied")
+        .replace(BUT, "")
+        .removesuffix(f"; {REMEDY}")
     )
     assert planner.plan_nearest(grid, START, goals).reason == occupied
 
@@ -151,15 +179,23 @@ def test_a_start_that_leaves_an_obstacle(planner: Planner) -> None:
     assert left.status is PlanStatus.SUCCEEDED
 
 
-def test_costmaps_name_unknown_space_but_not_what_is_inscribed(planner: Planner) -> None:
+def test_costmaps_name_unknown_space_but_not_what_is_inscribed(
+    planner: Planner,
+) -> None:
     for value, reason in (
         (UNKNOWN, f"the goal lies in unknown space; {REMEDY}"),
         (99, "the goal is occupied"),
         (100, "the goal is occupied"),
     ):
-        assert planner.plan(grid_from_costmap(hall(goal=value)), START, GOAL).reason == reason
+        assert (
+            planner.plan(grid_from_costmap(hall(goal=value)), START, GOAL).reason
+            == reason
+        )
     closed = hall(across=UNKNOWN)
-    assert planner.plan(grid_from_costmap(closed), START, GOAL).reason == f"{THROUGH}; {REMEDY}"
+    assert (
+        planner.plan(grid_from_costmap(closed), START, GOAL).reason
+        == f"{THROUGH}; {REMEDY}"
+    )
     closed[:, 14:17] = 99, UNKNOWN, 99
     inscribed = planner.plan(grid_from_costmap(closed), START, GOAL)
     assert inscribed.reason == "no path leads from the start to the goal"
@@ -177,7 +213,9 @@ def test_unknown_space_is_named_exactly_if_there_is_a_path_without_it(
     seed: int, radius: float
 ) -> None:
     random = np.random.default_rng(seed)
-    values = random.choice([FREE, FREE, FREE, FREE, FREE, WALL, UNKNOWN], (9, 12)).astype(np.int8)
+    values = random.choice(
+        [FREE, FREE, FREE, FREE, FREE, WALL, UNKNOWN], (9, 12)
+    ).astype(np.int8)
     start, goal = (tuple(random.integers(0, (12, 9)).tolist()) for _ in range(2))
     planner = Planner.load("any_map")
     grids = [
@@ -207,7 +245,9 @@ def test_a_map_knows_its_unknown_cells() -> None:
     assert mapped.unknown is not None
     assert not mapped.unknown.any()
     patch = np.ones((1, 2), np.bool_)
-    patched = GridMap.from_occupancy_values(hall()).with_patch(patch, 3, 2, unknown=[[True, False]])
+    patched = GridMap.from_occupancy_values(hall()).with_patch(
+        patch, 3, 2, unknown=[[True, False]]
+    )
     assert patched.unknown is not None
     assert np.argwhere(patched.unknown).tolist() == [[2, 3]]
     free = np.zeros((2, 2), np.bool_)
@@ -240,8 +280,14 @@ POSES = (1.25, 2.0, 0.0), (6.75, 2.0, 0.0)
 @pytest.mark.parametrize(
     ("values", "reason"),
     [
-        ({"start": UNKNOWN}, "the start is so near to unknown space that the robot's body touches"),
-        ({"goal": UNKNOWN}, "the goal is so near to unknown space that the robot's body touches"),
+        (
+            {"start": UNKNOWN},
+            "the start is so near to unknown space that the robot's body touches",
+        ),
+        (
+            {"goal": UNKNOWN},
+            "the goal is so near to unknown space that the robot's body touches",
+        ),
         ({"across": UNKNOWN}, THROUGH),
         ({"start": WALL}, "the start is occupied"),
         ({"goal": WALL}, "the goal is occupied"),
@@ -257,13 +303,19 @@ def test_unknown_space_that_a_body_touches_is_named(
     assert not plan.poses.size
     assert plan.reason.startswith(reason)
     assert plan.reason.endswith(REMEDY) == ("unknown" in reason)
-    assert plan.reason in (reason, plan.reason) if "unknown" in reason else plan.reason == reason
+    assert (
+        plan.reason in (reason, plan.reason)
+        if "unknown" in reason
+        else plan.reason == reason
+    )
 
 
 def test_the_goals_of_a_body_are_numbered(car: Planner) -> None:
     grid = body_hall(goal=UNKNOWN)
     plan = car.plan_poses(grid, POSES[0], [(99.0, 2.0, 0.0), POSES[1], (6.9, 2.0, 0.0)])
-    assert plan.reason.startswith("goal 1 lies outside the map, goal 2 is so near to unknown space")
+    assert plan.reason.startswith(
+        "goal 1 lies outside the map, goal 2 is so near to unknown space"
+    )
     assert "goal 3 lies in unknown space" in plan.reason
 
 
@@ -282,7 +334,9 @@ def test_the_console_names_unknown_space(
     assert load_map(path).unknown is not None
     ends = ["--start", *map(str, START), "--goal", *map(str, GOAL)]
     assert main(["plan", str(path), *ends]) == 1
-    assert f"no path: the goal lies in unknown space; {REMEDY}" in capsys.readouterr().err
+    assert (
+        f"no path: the goal lies in unknown space; {REMEDY}" in capsys.readouterr().err
+    )
     assert main(["plan", str(path), *ends, "--json"]) == 1
     answer = json.loads(capsys.readouterr().out)
     assert (answer["status"], answer["reason"]) == (

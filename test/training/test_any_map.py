@@ -29,7 +29,9 @@ def evaluation_of(planner: Planner, grid: GridMap, rule: MoveRule) -> Evaluation
 
 @pytest.mark.slow(seconds=20)
 @pytest.mark.parametrize("rule", MOVE_RULES)
-def test_training_on_random_maps_learns_moves_and_costs(planner: Planner, rule: MoveRule) -> None:
+def test_training_on_random_maps_learns_moves_and_costs(
+    planner: Planner, rule: MoveRule
+) -> None:
     random = np.random.default_rng(2)
     rooms = np.zeros((40, 50), dtype=bool)
     rooms[::8] = rooms[:, ::10] = True
@@ -49,7 +51,9 @@ def test_training_on_random_maps_learns_moves_and_costs(planner: Planner, rule: 
     assert evaluation.mean_ratio < (1 + blind.mean_ratio) / 2
 
 
-def test_the_maps_to_train_on_are_those_of_the_seed_and_have_costs_of_every_sort() -> None:
+def test_the_maps_to_train_on_are_those_of_the_seed_and_have_costs_of_every_sort() -> (
+    None
+):
     scenarios, *others = (random_scenarios(seed) for seed in (3, 3, 4))
     said, same, other = (
         [(each.grid.fingerprint, each.start, each.goal) for each in some]

@@ -12,7 +12,11 @@ from gymnasium.utils.seeding import np_random
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.model.networks import ROBOT, observation_background
-from ddqn_planner.training.environment import GridEnvironment, GridVectorEnvironment, Scenario
+from ddqn_planner.training.environment import (
+    GridEnvironment,
+    GridVectorEnvironment,
+    Scenario,
+)
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
 WALLED = np.array([[0, 0, 1, 0], [0, 0, 1, 0], [1, 1, 0, 0]])
@@ -20,7 +24,11 @@ PARAMETERS = HyperParameters(max_episode_steps=12)
 
 
 def step_by_hand(
-    scenario: Scenario, rule: MoveRule, parameters: HyperParameters, cell: Cell, action: int
+    scenario: Scenario,
+    rule: MoveRule,
+    parameters: HyperParameters,
+    cell: Cell,
+    action: int,
 ) -> tuple[Cell, float, bool]:
     """What one move gives: the next cell, the reward, and whether the episode terminates."""
     (x, y), (dx, dy) = cell, MOVES[action].tolist()
@@ -45,11 +53,15 @@ def step_by_hand(
 @pytest.mark.parametrize("rule", MoveRule)
 @pytest.mark.parametrize("count", [1, 3])
 @pytest.mark.parametrize("reward", ["paper", "path_cost"])
-def test_a_batch_moves_as_by_hand(paper: Scenario, rule: MoveRule, count: int, reward: str) -> None:
+def test_a_batch_moves_as_by_hand(
+    paper: Scenario, rule: MoveRule, count: int, reward: str
+) -> None:
     changes = {"reward": reward, "environments": count, "alpha": 0.7, "beta": 0.2}
     parameters = replace(PARAMETERS, **changes)
     cost = np.random.default_rng(0).integers(0, 99, (20, 20))
-    paper = replace(paper, grid=replace(paper.grid, cost=cost.astype(np.int8)), move_rule=rule)
+    paper = replace(
+        paper, grid=replace(paper.grid, cost=cost.astype(np.int8)), move_rule=rule
+    )
     batch = GridVectorEnvironment([paper], parameters)
     random = np.random.default_rng(count)
     batch.reset()
@@ -61,7 +73,9 @@ def test_a_batch_moves_as_by_hand(paper: Scenario, rule: MoveRule, count: int, r
         rewards, terminated, truncated = batch.move(actions)
         observations = batch.observe(batch.scenario, batch.cell)
         for i, cell in enumerate(cells):
-            after, reward_by_hand, ended = step_by_hand(paper, rule, parameters, cell, actions[i])
+            after, reward_by_hand, ended = step_by_hand(
+                paper, rule, parameters, cell, actions[i]
+            )
             steps[i] += 1
             observation = background.reshape(20, 20).copy()
             observation[after[1], after[0]] = ROBOT
@@ -96,7 +110,9 @@ def test_the_scalar_environment_is_a_batch_of_one(paper: Scenario) -> None:
 
 
 @pytest.mark.parametrize("p_r", [0.0, 0.5, 1.0])
-def test_an_episode_starts_with_probability_p_r_in_any_cell(paper: Scenario, p_r: float) -> None:
+def test_an_episode_starts_with_probability_p_r_in_any_cell(
+    paper: Scenario, p_r: float
+) -> None:
     scenarios = [paper, Scenario(GridMap(np.zeros((20, 20))), (0, 0), (4, 3))]
     parameters = HyperParameters(environments=4000, p_r=p_r)
     random = np.random.default_rng(2)
@@ -112,7 +128,9 @@ def test_an_episode_starts_with_probability_p_r_in_any_cell(paper: Scenario, p_r
         start, goal = (y * 20 + x for x, y in (scenario.start, scenario.goal))
         free = {*np.flatnonzero(~scenario.grid.occupancy).tolist()} - {goal}
         counts = np.bincount(cells, minlength=400)
-        assert counts[start] / len(cells) == pytest.approx(1 - p_r + p_r / len(free), abs=0.03)
+        assert counts[start] / len(cells) == pytest.approx(
+            1 - p_r + p_r / len(free), abs=0.03
+        )
         if p_r:
             assert set(cells) == free
             assert counts[[*free - {start}]].max() < 3 * p_r * len(cells) / len(free)
@@ -121,12 +139,18 @@ def test_an_episode_starts_with_probability_p_r_in_any_cell(paper: Scenario, p_r
 def test_gymnasium_accepts_the_environment() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        environment = gymnasium.make("ddqn_planner.training.environment:ddqn_planner/Grid-v0")
+        environment = gymnasium.make(
+            "ddqn_planner.training.environment:ddqn_planner/Grid-v0"
+        )
         check_env(environment.unwrapped, skip_render_check=True)
 
 
 def test_a_scenario_needs_two_free_cells(small: Scenario) -> None:
-    wrong = {"start": ((2, 0), (4, 0)), "goal": ((0, 0), (5, 0)), "different": ((0, 0), (0, 0))}
+    wrong = {
+        "start": ((2, 0), (4, 0)),
+        "goal": ((0, 0), (5, 0)),
+        "different": ((0, 0), (0, 0)),
+    }
     for named, ends in wrong.items():
         with pytest.raises(ValueError, match=named):
             Scenario(small.grid, *ends)
@@ -135,19 +159,29 @@ def test_a_scenario_needs_two_free_cells(small: Scenario) -> None:
         GridVectorEnvironment([small, other], PARAMETERS)
 
 
-def test_a_move_that_succeeds_is_rewarded_for_the_goal_only_beside_it(small: Scenario) -> None:
+def test_a_move_that_succeeds_is_rewarded_for_the_goal_only_beside_it(
+    small: Scenario,
+) -> None:
     parameters = HyperParameters(alpha=0.0, beta=0.0)
     environment = GridVectorEnvironment([small], parameters)
-    rewarded = {(int(c) % 5, int(c) // 5) for _, c in np.argwhere(environment.free_reward[0])}
+    rewarded = {
+        (int(c) % 5, int(c) // 5) for _, c in np.argwhere(environment.free_reward[0])
+    }
     # The goal (4, 0) is at the end of its row: the first cells of the next one are far from it.
     assert rewarded == {(3, 0), (3, 1), (4, 1)}
 
 
-@pytest.mark.parametrize("action", [-1, 8, 2.5, 2.0, math.nan, None, "2", True, [2], np.array([2])])
-def test_what_is_no_action_is_refused_and_changes_nothing(paper: Scenario, action: Any) -> None:
+@pytest.mark.parametrize(
+    "action", [-1, 8, 2.5, 2.0, math.nan, None, "2", True, [2], np.array([2])]
+)
+def test_what_is_no_action_is_refused_and_changes_nothing(
+    paper: Scenario, action: Any
+) -> None:
     environment = GridEnvironment(paper, PARAMETERS)
     before, _ = environment.reset(seed=0)
-    with pytest.raises(ValueError, match=r"the action is .*; give a whole number, 0 to 7"):
+    with pytest.raises(
+        ValueError, match=r"the action is .*; give a whole number, 0 to 7"
+    ):
         environment.step(action)
     np.testing.assert_array_equal(environment._observe(), before)
     with pytest.raises(ValueError, match="the actions"):
@@ -167,7 +201,9 @@ def test_each_integer_type_is_an_action(paper: Scenario, kind: Any) -> None:
 
 def test_no_step_is_made_before_a_reset_or_after_the_end(paper: Scenario) -> None:
     environment = GridEnvironment(paper, replace(PARAMETERS, max_episode_steps=1))
-    with pytest.raises(gymnasium.error.ResetNeeded, match="call reset before the first step"):
+    with pytest.raises(
+        gymnasium.error.ResetNeeded, match="call reset before the first step"
+    ):
         environment.step(0)
     for _ in range(2):
         environment.reset(seed=0)
@@ -180,9 +216,24 @@ def test_no_step_is_made_before_a_reset_or_after_the_end(paper: Scenario) -> Non
 @pytest.mark.parametrize(
     ("start", "goal", "rule", "reason"),
     [
-        ((0, 0), (3, 0), "corner_cutting", r"no path .* \(0, 0\) .* \(3, 0\) .*open the map"),
-        ((0, 0), (3, 2), "robot_safe", "no path .* robot_safe; give other cells, or open the map"),
-        ((1, 1), (2, 2), "robot_safe", "robot_safe; .* give the move rule corner_cutting"),
+        (
+            (0, 0),
+            (3, 0),
+            "corner_cutting",
+            r"no path .* \(0, 0\) .* \(3, 0\) .*open the map",
+        ),
+        (
+            (0, 0),
+            (3, 2),
+            "robot_safe",
+            "no path .* robot_safe; give other cells, or open the map",
+        ),
+        (
+            (1, 1),
+            (2, 2),
+            "robot_safe",
+            "robot_safe; .* give the move rule corner_cutting",
+        ),
         ((2, 0), (0, 0), "robot_safe", r"the start \(2, 0\) is not a free cell"),
         ((0, 0), (9, 0), "robot_safe", r"the goal \(9, 0\) is not a free cell"),
         ((0, 0), (0, 0), "robot_safe", r"both \(0, 0\); give two different"),

@@ -55,7 +55,9 @@ def test_few_places_tell_little_and_what_no_wall_explains_tells_nothing() -> Non
         rows = zones(count, 1)
         mean = np.average(rows[:, -2], weights=rows[:, -1])
         assert train_prior(rows).log_slowness(rooms(5)) == pytest.approx(mean, abs=0.1)
-    foretold = [train_prior(zones(20, seed)).log_slowness(rooms(5)) for seed in range(7)]
+    foretold = [
+        train_prior(zones(20, seed)).log_slowness(rooms(5)) for seed in range(7)
+    ]
     assert np.median(np.std(foretold, axis=1)) < 0.1
 
 
@@ -96,8 +98,15 @@ def test_the_places_of_experience_teach_its_prior_where_they_lie_on_a_map() -> N
     occupancy = np.zeros((60, 120), dtype=np.bool_)
     occupancy[30] = True
     grid = GridMap(occupancy, 0.25, (10.0, 0.0, 0.0))
-    rows = (3.0, 1.0), (7.0, 4.0), (11.0, 1.0), (900.0, 9.0)  # the last lies off the map
-    experience = driven(*[straight((10, y), (35, y), slowness, rate=2) for y, slowness in rows])
+    rows = (
+        (3.0, 1.0),
+        (7.0, 4.0),
+        (11.0, 1.0),
+        (900.0, 9.0),
+    )  # the last lies off the map
+    experience = driven(
+        *[straight((10, y), (35, y), slowness, rate=2) for y, slowness in rows]
+    )
     teach_prior(experience, GridMap(np.zeros((4, 4), dtype=np.bool_), 0.25))
     assert experience.prior is None
     teach_prior(experience, grid)
@@ -107,20 +116,27 @@ def test_the_places_of_experience_teach_its_prior_where_they_lie_on_a_map() -> N
     assert foretold[44, 60] < 0.5
     first = experience.prior
     other = GridMap(np.roll(occupancy, 9, axis=0), 0.25, grid.origin)
-    for place, more in ((grid, False), (other, True)):  # no place is kept twice, none is forgotten
+    for place, more in (
+        (grid, False),
+        (other, True),
+    ):  # no place is kept twice, none is forgotten
         teach_prior(experience, place)
         assert (len(experience.prior.replay) > len(first.replay)) == more
 
 
 def test_what_all_places_have_in_common_is_not_learned_twice() -> None:
-    experience = driven(*[straight((1, y), (26, y), 4, rate=2) for y in (2.0, 4.0, 6.0)])
+    experience = driven(
+        *[straight((1, y), (26, y), 4, rate=2) for y in (2.0, 4.0, 6.0)]
+    )
     grid = GridMap(np.zeros((40, 120), dtype=np.bool_), 0.25)
     before = experience.slowness(grid)
     assert before[36, 60] == pytest.approx(4, rel=0.4)
     teach_prior(experience, grid)
     np.testing.assert_allclose(experience.slowness(grid), before, rtol=0.1)
     again = Experience.from_bytes(experience.to_bytes())
-    np.testing.assert_allclose(again.slowness(grid), experience.slowness(grid), rtol=0.01)
+    np.testing.assert_allclose(
+        again.slowness(grid), experience.slowness(grid), rtol=0.01
+    )
     merged = Experience(0.5)
     merged.merge(experience)
     np.testing.assert_allclose(merged.slowness(grid), before, rtol=0.1)

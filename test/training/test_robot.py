@@ -24,11 +24,18 @@ FORK = (
 )
 
 
-def test_the_command_trains_a_robot_that_is_proved(console: Any, tmp_path: Path) -> None:
-    path, (footprint, motion, radius, resolution, _) = tmp_path / "tiny.safetensors", TINY
+def test_the_command_trains_a_robot_that_is_proved(
+    console: Any, tmp_path: Path
+) -> None:
+    path, (footprint, motion, radius, resolution, _) = (
+        tmp_path / "tiny.safetensors",
+        TINY,
+    )
     command = f"train-robot --motion {motion} --turning-radius {radius} --resolution {resolution}"
     given = "--padding", 0.02, "--out", path, "--footprint", footprint
-    assert re.search("steps|seed", console(command, *given, "--steps", 20_000, status=1).err)
+    assert re.search(
+        "steps|seed", console(command, *given, "--steps", 20_000, status=1).err
+    )
     assert not path.exists()
     printed = console(command, *given).out
     assert re.search(r"transitions: proved: all [\d,]+ cells", printed)
@@ -79,7 +86,9 @@ def test_a_robot_bumps_where_its_body_touches_an_obstacle() -> None:
         seen = occupancy[np.ix_(rows % width, columns % width)]
         bumps = bool((seen & swept[primitive]).any())
         dx, dy = motions.offset[primitive]
-        reached = 16 * ((y + dy) % width * width + (x + dx) % width) + motions.end[primitive]
+        reached = (
+            16 * ((y + dy) % width * width + (x + dx) % width) + motions.end[primitive]
+        )
         assert after == (cell if bumps else reached)
         goes_on = not bumps and after != trainer.goal_M[number]
         assert discount == (np.float32(trainer.parameters.gamma) if goes_on else 0)
@@ -104,9 +113,13 @@ WRONG = {
 
 
 @pytest.mark.parametrize("options", WRONG)
-def test_what_is_no_robot_is_refused(console: Any, tmp_path: Path, options: str) -> None:
+def test_what_is_no_robot_is_refused(
+    console: Any, tmp_path: Path, options: str
+) -> None:
     given = "--out", tmp_path / "robot.safetensors", *options.split()
-    assert WRONG[options] in console("train-robot --footprint 0.2", *given, status=2).err
+    assert (
+        WRONG[options] in console("train-robot --footprint 0.2", *given, status=2).err
+    )
     assert not any(tmp_path.iterdir())
 
 
@@ -117,5 +130,7 @@ def test_a_training_makes_as_many_transitions_as_it_may() -> None:
             pass
         assert trainer.steps == len(trainer._replay) == steps
     for wrong in (0, -5, 0.5, True, 1e300, None):
-        with pytest.raises(ValueError, match=r"number of steps is .* give a whole number, 1 to"):
+        with pytest.raises(
+            ValueError, match=r"number of steps is .* give a whole number, 1 to"
+        ):
             next(trainer.run(wrong))  # type: ignore[arg-type]

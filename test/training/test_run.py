@@ -42,18 +42,30 @@ def rows(folder: Path) -> list[dict[str, str]]:
 
 
 @pytest.mark.parametrize("rule", MoveRule)
-def test_an_episode_is_a_row_of_the_curves(small: Scenario, tmp_path: Path, rule: MoveRule) -> None:
+def test_an_episode_is_a_row_of_the_curves(
+    small: Scenario, tmp_path: Path, rule: MoveRule
+) -> None:
     episodes = finish(open_run(tmp_path, replace(small, move_rule=rule), steps=150))
-    assert any(x != u and y != v for e in episodes for (x, y), (u, v) in pairwise(e.cells))
+    assert any(
+        x != u and y != v for e in episodes for (x, y), (u, v) in pairwise(e.cells)
+    )
     for row, episode in zip(rows(tmp_path), episodes, strict=True):
         assert int(row["episode"]) == episode.number
-        assert float(row["average_reward"]) == pytest.approx(episode.average_reward, abs=1e-6)
-        assert float(row["length"]) == pytest.approx(path_length(episode.cells, rule), abs=1e-4)
+        assert float(row["average_reward"]) == pytest.approx(
+            episode.average_reward, abs=1e-6
+        )
+        assert float(row["length"]) == pytest.approx(
+            path_length(episode.cells, rule), abs=1e-4
+        )
     recorded = list(read_cells(tmp_path / "episodes.csv", every=3))
-    assert recorded == [episode.cells for episode in episodes if episode.number % 3 == 0]
+    assert recorded == [
+        episode.cells for episode in episodes if episode.number % 3 == 0
+    ]
 
 
-def test_a_run_continues_from_its_checkpoint_and_rows(small: Scenario, tmp_path: Path) -> None:
+def test_a_run_continues_from_its_checkpoint_and_rows(
+    small: Scenario, tmp_path: Path
+) -> None:
     uninterrupted = open_run(tmp_path / "uninterrupted", small)
     finish(uninterrupted)
     first = open_run(tmp_path / "cut", small)
@@ -74,13 +86,19 @@ def test_a_run_continues_from_its_checkpoint_and_rows(small: Scenario, tmp_path:
     assert all(map(np.array_equal, *weights))
 
 
-def test_a_finished_run_can_be_made_longer_but_not_changed(small: Scenario, tmp_path: Path) -> None:
+def test_a_finished_run_can_be_made_longer_but_not_changed(
+    small: Scenario, tmp_path: Path
+) -> None:
     finish(open_run(tmp_path, small, steps=100))
     before = contents(tmp_path)
-    with pytest.raises(CheckpointError, match=r"gamma 0\.95 \(now 0\.9\), p_r") as refused:
+    with pytest.raises(
+        CheckpointError, match=r"gamma 0\.95 \(now 0\.9\), p_r"
+    ) as refused:
         open_run(tmp_path, small, gamma=0.9, p_r=0.0)
     assert contents(tmp_path) == before
-    assert refused  # its frames keep the failed run alive: the folder is unlocked all the same
+    assert (
+        refused
+    )  # its frames keep the failed run alive: the folder is unlocked all the same
     (tmp_path / "training.lock").unlink()  # a version without locks made it
     longer = open_run(tmp_path, small, steps=150)
     finish(longer)
@@ -91,11 +109,15 @@ NAMES = ["episodes.csv", "model.safetensors", ".episodes.csv.swp", "sub/thesis.t
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_folder_of_something_else_is_left(small: Scenario, tmp_path: Path, name: str) -> None:
+def test_a_folder_of_something_else_is_left(
+    small: Scenario, tmp_path: Path, name: str
+) -> None:
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
     path.write_text("mine")
-    with pytest.raises(ValueError, match="no training; give a new or empty folder") as error:
+    with pytest.raises(
+        ValueError, match="no training; give a new or empty folder"
+    ) as error:
         open_run(tmp_path, small)
     assert name.split("/")[0] in str(error.value)
     assert [entry for entry in tmp_path.rglob("*") if entry.is_file()] == [path]
@@ -164,7 +186,11 @@ def test_a_training_that_cannot_fit_is_refused_with_the_remedy(tmp_path: Path) -
 GOOD = b"1,9,0,reached_goal,2,2.0,1.5,0.75,0:0 1:0 2:0\r\n"
 
 
-@given(st.lists(st.binary() | st.sampled_from([GOOD, GOOD[:-9], GOOD.replace(b"1:0", b"1:")])))
+@given(
+    st.lists(
+        st.binary() | st.sampled_from([GOOD, GOOD[:-9], GOOD.replace(b"1:0", b"1:")])
+    )
+)
 def test_complete_rows_of_a_broken_file_are_read(
     tmp_path_factory: pytest.TempPathFactory, lines: list[bytes]
 ) -> None:
@@ -174,7 +200,9 @@ def test_complete_rows_of_a_broken_file_are_read(
     assert cells[-1] == ((0, 0), (1, 0), (2, 0))
 
 
-def test_an_episode_of_any_length_can_be_read_and_cut(small: Scenario, tmp_path: Path) -> None:
+def test_an_episode_of_any_length_can_be_read_and_cut(
+    small: Scenario, tmp_path: Path
+) -> None:
     open_run(tmp_path, small).close()
     path = tmp_path / "episodes.csv"
     cells = b" ".join([b"0:0"] * 10**5)

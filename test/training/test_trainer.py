@@ -21,11 +21,17 @@ from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import CheckpointError, Trainer
 
 QUICK = HyperParameters(
-    learning_rate=0.003, filters=8, learning_starts=50, epsilon_steps=1500, target_interval=100
+    learning_rate=0.003,
+    filters=8,
+    learning_starts=50,
+    epsilon_steps=1500,
+    target_interval=100,
 )
 
 
-def make(scenario: Scenario, parameters: HyperParameters = QUICK, seed: int = 0) -> Trainer:
+def make(
+    scenario: Scenario, parameters: HyperParameters = QUICK, seed: int = 0
+) -> Trainer:
     return Trainer([scenario], parameters, seed)
 
 
@@ -66,14 +72,18 @@ def test_episodes_say_how_they_ended(trained: Any, small: Scenario) -> None:
         assert episode.average_reward == episode.total_reward / episode.moves
         collided = episode.outcome is EpisodeEnd.COLLIDED
         assert episode.moves == len(episode.cells) - (0 if collided else 1)
-        assert (episode.cells[-1] == small.goal) == (episode.outcome is EpisodeEnd.REACHED_GOAL)
+        assert (episode.cells[-1] == small.goal) == (
+            episode.outcome is EpisodeEnd.REACHED_GOAL
+        )
         if episode.outcome is EpisodeEnd.OUT_OF_STEPS:
             assert episode.moves == 20
 
 
 @pytest.mark.parametrize("network", ["paper", "propagation", "any_map"])
 def test_weights_begin_as_those_of_torch(small: Scenario, network: str) -> None:
-    tensors = make(small, HyperParameters(network=network, hidden_units=3)).network.tensors
+    tensors = make(
+        small, HyperParameters(network=network, hidden_units=3)
+    ).network.tensors
     prices = tensors.pop("prices.bias", np.ones(8))
     assert (prices == 1).all()  # a multiplier below 1 has no gradient
     seed, *_ = np.random.SeedSequence(0).spawn(4)
@@ -81,15 +91,26 @@ def test_weights_begin_as_those_of_torch(small: Scenario, network: str) -> None:
     for name in [name for name in tensors if name.endswith("weight")]:
         outputs, *inputs = tensors[name].shape
         is_dense = len(inputs) == 1
-        layer = torch.nn.Linear(*inputs, outputs) if is_dense else torch.nn.Conv2d(1, outputs, 3)
+        layer = (
+            torch.nn.Linear(*inputs, outputs)
+            if is_dense
+            else torch.nn.Conv2d(1, outputs, 3)
+        )
         for part, expected in layer.state_dict().items():
             found = tensors.get(name.replace("weight", part), expected)
             np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize("rule", MoveRule)
-def test_a_propagation_network_learns(small: Scenario, paper: Scenario, rule: MoveRule) -> None:
-    quick = {"learning_rate": 0.003, "batch_size": 256, "filters": 32, "environments": 8}
+def test_a_propagation_network_learns(
+    small: Scenario, paper: Scenario, rule: MoveRule
+) -> None:
+    quick = {
+        "learning_rate": 0.003,
+        "batch_size": 256,
+        "filters": 32,
+        "environments": 8,
+    }
     quick |= {"target_interval": 50, "update_interval": 8}
     parameters = HyperParameters(network="propagation", **quick)
     trainer = Trainer([replace(paper, move_rule=rule)], parameters, seed=0)
@@ -109,7 +130,9 @@ def test_an_interrupted_training_continues_bit_for_bit_and_another_seed_gives_an
 ) -> None:
     changes = {"replay_capacity": 200, "update_interval": 2, "target_interval": 30}
     parameters = replace(QUICK, environments=environments, network=network, **changes)
-    uninterrupted, interrupted, other = (make(small, parameters, seed) for seed in (0, 0, 1))
+    uninterrupted, interrupted, other = (
+        make(small, parameters, seed) for seed in (0, 0, 1)
+    )
     episodes = train(uninterrupted, 400)
     before = train(interrupted, first)
     interrupted.save_checkpoint(tmp_path / "checkpoint")
@@ -124,14 +147,22 @@ def test_an_interrupted_training_continues_bit_for_bit_and_another_seed_gives_an
 
 
 @pytest.mark.parametrize(("environments", "interval"), [(1, 1), (3, 2), (3, 5), (4, 3)])
-def test_updates_keep_their_ratio(small: Scenario, environments: int, interval: int) -> None:
-    changes = {"environments": environments, "update_interval": interval, "learning_starts": 0}
+def test_updates_keep_their_ratio(
+    small: Scenario, environments: int, interval: int
+) -> None:
+    changes = {
+        "environments": environments,
+        "update_interval": interval,
+        "learning_starts": 0,
+    }
     trainer = make(small, replace(QUICK, **changes))
     train(trainer, 120)
     assert trainer.updates == trainer.steps // interval
 
 
-def test_learning_starts_and_targets_are_copied_when_the_parameters_say(small: Scenario) -> None:
+def test_learning_starts_and_targets_are_copied_when_the_parameters_say(
+    small: Scenario,
+) -> None:
     trainer = make(small, replace(QUICK, learning_starts=5, target_interval=3))
     train(trainer, 5)
     assert trainer.updates == 0
@@ -142,15 +173,27 @@ def test_learning_starts_and_targets_are_copied_when_the_parameters_say(small: S
 
 
 def test_epsilon_falls_linearly_and_then_stays(small: Scenario) -> None:
-    trainer = make(small, HyperParameters(epsilon_start=0.8, epsilon_end=0.2, epsilon_steps=100))
-    for trainer.steps, epsilon in ((0, 0.8), (25, 0.65), (100, 0.2), (101, 0.2), (1000, 0.2)):
+    trainer = make(
+        small, HyperParameters(epsilon_start=0.8, epsilon_end=0.2, epsilon_steps=100)
+    )
+    for trainer.steps, epsilon in (
+        (0, 0.8),
+        (25, 0.65),
+        (100, 0.2),
+        (101, 0.2),
+        (1000, 0.2),
+    ):
         assert trainer.epsilon == pytest.approx(epsilon)
 
 
 def test_an_episode_adds_up_its_own_rewards_alone(small: Scenario) -> None:
     free = replace(QUICK, alpha=0.0, beta=0.0, max_episode_steps=5, epsilon_end=1.0)
     episodes = train(make(small, replace(free, learning_starts=10**6)), 1000)
-    totals = {EpisodeEnd.REACHED_GOAL: 10.0, EpisodeEnd.COLLIDED: -10.0, EpisodeEnd.OUT_OF_STEPS: 0}
+    totals = {
+        EpisodeEnd.REACHED_GOAL: 10.0,
+        EpisodeEnd.COLLIDED: -10.0,
+        EpisodeEnd.OUT_OF_STEPS: 0,
+    }
     assert {(each.outcome, each.total_reward) for each in episodes} == {*totals.items()}
 
 
@@ -184,7 +227,15 @@ def test_the_format_of_a_checkpoint_stays(checkpoint: Path) -> None:
         metadata = file.metadata()
         shapes = {key: file.get_slice(key).get_shape() for key in file.keys()}  # noqa: SIM118
     assert {*metadata} == {"ddqn_planner_checkpoint", "sha256"}
-    names = ["seed", "move_rule", "parameters", "scenarios", "counters", "walked", "generators"]
+    names = [
+        "seed",
+        "move_rule",
+        "parameters",
+        "scenarios",
+        "counters",
+        "walked",
+        "generators",
+    ]
     assert [*json.loads(metadata["ddqn_planner_checkpoint"])] == names
     network = {"convolution.weight": [8, 1, 3, 3], "convolution.bias": [8]}
     network |= {"fully_connected.weight": [8, 48], "fully_connected.bias": [8]}
@@ -194,11 +245,15 @@ def test_the_format_of_a_checkpoint_stays(checkpoint: Path) -> None:
     for number, (name, shape) in enumerate(network.items()):
         expected |= {f"network.{name}": shape, f"target.{name}": shape}
         moments = {"step": [], "exp_avg": shape, "exp_avg_sq": shape}
-        expected |= {f"optimiser.{number}.{moment}": size for moment, size in moments.items()}
+        expected |= {
+            f"optimiser.{number}.{moment}": size for moment, size in moments.items()
+        }
     assert shapes == expected
 
 
-def test_a_wrong_checkpoint_is_refused(small: Scenario, paper: Scenario, checkpoint: Path) -> None:
+def test_a_wrong_checkpoint_is_refused(
+    small: Scenario, paper: Scenario, checkpoint: Path
+) -> None:
     for other in (paper, replace(small, start=(0, 1)), replace(small, goal=(4, 1))):
         with pytest.raises(CheckpointError, match="another map, start or goal"):
             make(other, BRIEF).restore(checkpoint)
@@ -206,7 +261,10 @@ def test_a_wrong_checkpoint_is_refused(small: Scenario, paper: Scenario, checkpo
     random = np.random.default_rng(0)
     header = 8 + int.from_bytes(content[:8], "little")
     broken = [content[: int(part * len(content))] for part in (0.0, 0.3, 0.9)]
-    for position in [*random.integers(header, size=30), *random.integers(len(content), size=30)]:
+    for position in [
+        *random.integers(header, size=30),
+        *random.integers(len(content), size=30),
+    ]:
         flipped = bytearray(content)
         flipped[position] ^= 1 << random.integers(8)
         broken.append(bytes(flipped))
@@ -217,23 +275,35 @@ def test_a_wrong_checkpoint_is_refused(small: Scenario, paper: Scenario, checkpo
             make(small, BRIEF).restore(checkpoint)
 
 
-def test_a_checkpoint_of_holes_is_refused_unread(small: Scenario, checkpoint: Path) -> None:
+def test_a_checkpoint_of_holes_is_refused_unread(
+    small: Scenario, checkpoint: Path
+) -> None:
     header = json.loads(checkpoint.read_bytes()[8:].split(b"}}", 1)[0] + b"}}")
     size = 2**30
     for entry in header.values():
         if "data_offsets" in entry:
             entry.update(shape=[0], data_offsets=[size, size])
-    header["network.convolution.weight"].update(shape=[size // 4], data_offsets=[0, size])
+    header["network.convolution.weight"].update(
+        shape=[size // 4], data_offsets=[0, size]
+    )
     text = json.dumps(header).encode()
     with checkpoint.open("wb") as file:
         file.write(len(text).to_bytes(8, "little") + text)
         file.truncate(file.tell() + size)
-    with memory_grows_less_than(130), pytest.raises(CheckpointError, match="names or shapes"):
+    with (
+        memory_grows_less_than(130),
+        pytest.raises(CheckpointError, match="names or shapes"),
+    ):
         make(small, BRIEF).restore(checkpoint)
 
 
 def test_a_parameter_out_of_range_is_named() -> None:
-    wrong = {"target": "sarsa", "gamma": 1.5, "batch_size": 0, "learning_rate": float("nan")}
+    wrong = {
+        "target": "sarsa",
+        "gamma": 1.5,
+        "batch_size": 0,
+        "learning_rate": float("nan"),
+    }
     for name, value in wrong.items():
         with pytest.raises(ValueError, match=f"{name} is {value!r}"):
             HyperParameters(**{name: value})

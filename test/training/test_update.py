@@ -23,7 +23,13 @@ from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions
 from ddqn_planner.training.environment import Scenario, paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.robot import RobotTrainer
-from ddqn_planner.training.shared_background import adam, differentiate, evaluate, look, networks_of
+from ddqn_planner.training.shared_background import (
+    adam,
+    differentiate,
+    evaluate,
+    look,
+    networks_of,
+)
 from ddqn_planner.training.trainer import Trainer
 
 Q = dict[Scenario, dict[Cell, Tensor]]
@@ -31,7 +37,9 @@ Q = dict[Scenario, dict[Cell, Tensor]]
 
 
 @given(st.integers(1, 8), st.lists(st.integers(1, 8), max_size=12))
-def test_the_buffer_holds_the_last_transitions_whole(capacity: int, batches: list[int]) -> None:
+def test_the_buffer_holds_the_last_transitions_whole(
+    capacity: int, batches: list[int]
+) -> None:
     buffer, added = ReplayBuffer(capacity), 0
     for count in batches:
         numbers = np.arange(added, added + min(count, capacity))
@@ -60,7 +68,9 @@ def mean_squared_error(
     errors = []
     for number, cell, action, reward, next_cell, discount in zip(*batch, strict=True):
         scenario = trainer.scenarios[number]
-        state, next_state = ((int(c) % width, int(c) // width) for c in (cell, next_cell))
+        state, next_state = (
+            (int(c) % width, int(c) // width) for c in (cell, next_cell)
+        )
         with torch.no_grad():
             best = selection[scenario][next_state].argmax()
             y = reward + discount * evaluation[scenario][next_state][best]
@@ -75,7 +85,9 @@ def check_update(trainer: Trainer, loss: Tensor, before: dict[str, Tensor]) -> N
     scale = max(float(gradient.abs().max()) for gradient in expected)
     parts = map(in_torch, trainer._parts)
     weights, _, mean, square = (tensors.values() for tensors in parts)
-    for *found, gradient, old in zip(weights, mean, square, expected, before.values(), strict=True):
+    for *found, gradient, old in zip(
+        weights, mean, square, expected, before.values(), strict=True
+    ):
         weight, moment, square_of = found
         slope = moment / (1 - 0.9)
         torch.testing.assert_close(slope, gradient, rtol=2e-3, atol=2e-3 * scale)
@@ -90,23 +102,34 @@ def test_compiled_training_is_that_of_torch(
     small: Scenario, tmp_path: Path, target: str, units: int
 ) -> None:
     walls = small.grid.occupancy
-    scenarios = [replace(small, grid=GridMap(other)) for other in (walls, walls[::-1], walls & 0)]
+    scenarios = [
+        replace(small, grid=GridMap(other)) for other in (walls, walls[::-1], walls & 0)
+    ]
     brief = {"learning_rate": 0.001, "learning_starts": 20, "target_interval": 10}
-    brief |= {"epsilon_steps": 60, "environments": 3, "max_episode_steps": 7, "filters": 4}
+    brief |= {
+        "epsilon_steps": 60,
+        "environments": 3,
+        "max_episode_steps": 7,
+        "filters": 4,
+    }
     parameters = HyperParameters(target=target, hidden_units=units, **brief)
     trainers = [Trainer(scenarios, parameters, seed=2) for _ in range(2)]
     compiled, of_torch = trainers
     for trainer in trainers:
         part(trainer)
     TorchLearner(of_torch)
-    one, other = ([e for ended in t.run(90) for e in ended] for t in (compiled, of_torch))
+    one, other = (
+        [e for ended in t.run(90) for e in ended] for t in (compiled, of_torch)
+    )
     assert one == other
     assert compiled.updates == of_torch.updates > 60
     check_same(compiled, of_torch)
     of_torch.save_checkpoint(tmp_path / "checkpoint")
     compiled = Trainer(scenarios, parameters, seed=2)
     compiled.restore(tmp_path / "checkpoint")
-    one, other = ([e for ended in t.run(180) for e in ended] for t in (compiled, of_torch))
+    one, other = (
+        [e for ended in t.run(180) for e in ended] for t in (compiled, of_torch)
+    )
     assert one == other
     check_same(compiled, of_torch)
 
@@ -122,7 +145,9 @@ def check_same(compiled: Trainer, of_torch: Trainer) -> None:
 def test_weights_whose_gradients_fade_move_as_those_of_torch(small: Scenario) -> None:
     parameters = HyperParameters(hidden_units=6, filters=4)
     trainer = Trainer([small], parameters, seed=2)
-    zeros = ({name: 0 * t for name, t in trainer.network.tensors.items()} for _ in range(3))
+    zeros = (
+        {name: 0 * t for name, t in trainer.network.tensors.items()} for _ in range(3)
+    )
     e, parts = trainer.environment, (trainer.network.tensors, *zeros)
     windows, networks = networks_of(e.background, e.shape, parts, batch=1)
     online, gradient, *moments = networks
@@ -130,7 +155,10 @@ def test_weights_whose_gradients_fade_move_as_those_of_torch(small: Scenario) ->
     weight = torch.tensor(online.weights)
     optimiser = torch.optim.Adam([weight], 0.01)
     for update in range(1, 701):
-        if update in (1, 700):  # until the last one, Adam's mean of the first fades to 0
+        if update in (
+            1,
+            700,
+        ):  # until the last one, Adam's mean of the first fades to 0
             look(online, windows)
             evaluate(online, windows, np.array([0]), np.array([0]))
             gradient.q[0] = 1
@@ -150,30 +178,43 @@ def test_an_update_is_the_equations_and_counts_each_reward_once(
     cost = np.arange(20, dtype=np.int8).reshape(4, 5)
     walls = small.grid.occupancy
     scenarios = [
-        replace(small, grid=GridMap(walls, cost=cost), move_rule=MoveRule.CORNER_CUTTING),
+        replace(
+            small, grid=GridMap(walls, cost=cost), move_rule=MoveRule.CORNER_CUTTING
+        ),
         Scenario(GridMap(walls[::-1]), (4, 3), (0, 1), MoveRule.ROBOT_SAFE),
     ]
-    settings = {"reward": "path_cost", "gamma": 0.5, "obstacle_reward": -20.0, "filters": 4}
+    settings = {
+        "reward": "path_cost",
+        "gamma": 0.5,
+        "obstacle_reward": -20.0,
+        "filters": 4,
+    }
     settings |= {"learning_starts": 60, "environments": 5, "update_interval": 5}
     parameters = HyperParameters("any_map", target, max_episode_steps=7, **settings)
     trainer = Trainer(scenarios, parameters, seed=1)
     list(trainer.run(60))
     part(trainer)
     trainer._learner.settle()
-    trainer.network.tensors["prices.bias"][::2] = -1.0  # a multiplier below 1 is clipped
+    trainer.network.tensors["prices.bias"][
+        ::2
+    ] = -1.0  # a multiplier below 1 is clipped
     before, target_weights = map(in_torch, trainer._parts[:2])
     for weight in before.values():
         weight.requires_grad_()
     lengths = torch.from_numpy(LENGTHS.astype(np.float32))
 
-    def q_of(weights: dict[str, Tensor], scenario: Scenario, value: Any) -> dict[Cell, Tensor]:
+    def q_of(
+        weights: dict[str, Tensor], scenario: Scenario, value: Any
+    ) -> dict[Cell, Tensor]:
         seen = patches(scenario.grid.occupancy, scenario.grid.cost)
         features = torch.from_numpy(AnyMapQNetwork.features(seen, scenario.move_rule))
         p, multiplier = propagation_layers(weights, features)
         answers = {}
         for number in range(20):
             x, y = number % 5, number // 5
-            onward = torch.tensor([value.get((x + dx, y + dy), -20.0) for dx, dy in MOVES.tolist()])
+            onward = torch.tensor(
+                [value.get((x + dx, y + dy), -20.0) for dx, dy in MOVES.tolist()]
+            )
             success = -lengths * multiplier[number] + 0.5 * onward
             answers[x, y] = p[number] * success + (1 - p[number]) * -20.0
         return answers
@@ -211,20 +252,28 @@ def test_an_update_is_the_equations_and_counts_each_reward_once(
         ("network", ["paper"], "give one of paper"),
     ],
 )
-def test_hyper_parameters_of_a_wrong_kind_are_named(name: str, value: Any, reason: str) -> None:
+def test_hyper_parameters_of_a_wrong_kind_are_named(
+    name: str, value: Any, reason: str
+) -> None:
     with pytest.raises(ValueError, match=reason):
         HyperParameters(**{name: value})
 
 
 def test_hyper_parameters_are_plain_numbers() -> None:
     made = HyperParameters(steps=np.int64(7), batch_size=4.0, gamma=1)  # type: ignore[arg-type]
-    assert [type(value) for value in (made.steps, made.batch_size, made.gamma)] == [int, int, float]
+    assert [type(value) for value in (made.steps, made.batch_size, made.gamma)] == [
+        int,
+        int,
+        float,
+    ]
     assert made == HyperParameters(steps=7, batch_size=4, gamma=1.0)
 
 
 @pytest.mark.parametrize("seed", [-1, 0.5, True, None, "0", 2**63, math.nan])
 def test_a_seed_that_is_none_is_named(seed: Any) -> None:
-    with pytest.raises(ValueError, match=r"the seed is .*; give a whole number, 0 to 9223"):
+    with pytest.raises(
+        ValueError, match=r"the seed is .*; give a whole number, 0 to 9223"
+    ):
         as_seed(seed)
     with pytest.raises(ValueError, match="the seed is"):
         Trainer([paper_scenario()], HyperParameters(), seed)

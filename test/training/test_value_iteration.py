@@ -11,7 +11,11 @@ from ddqn_planner.training.propagation import value_iteration
 
 
 def settled(
-    tables: Any, shape: tuple[int, int], goal: int, gamma: float = 1.0, collision: float = -10_000.0
+    tables: Any,
+    shape: tuple[int, int],
+    goal: int,
+    gamma: float = 1.0,
+    collision: float = -10_000.0,
 ) -> np.ndarray:
     """The return of each move on one map, (8, C), given success and reward of each."""
     success, reward = np.asarray(tables, np.float32)[:, None]
@@ -27,7 +31,9 @@ def settled(
 
 
 @given(grids_with_free_cell(), st.sampled_from(MoveRule))
-def test_without_discount_values_are_shortest_lengths(place: Place, rule: MoveRule) -> None:
+def test_without_discount_values_are_shortest_lengths(
+    place: Place, rule: MoveRule
+) -> None:
     grid, goal = place
     shape = grid.occupancy.shape
     legal = legal_moves(grid.occupancy, rule).reshape(8, -1)
@@ -50,9 +56,14 @@ def test_with_discount_a_value_is_what_the_rewards_on_the_way_add_up_to() -> Non
     return_AC = settled(tables, (1, 4), 3, gamma=0.9, collision=-2.0)
     value_2 = 0.5 * 10.0 + 0.5 * -2.0
     value_1 = 0.5 * (1.0 + 0.9 * value_2) + 0.5 * -2.0
-    assert return_AC[0, :3] == pytest.approx([1.0 + 0.9 * value_1, 1.0 + 0.9 * value_2, 10.0])
+    assert return_AC[0, :3] == pytest.approx(
+        [1.0 + 0.9 * value_1, 1.0 + 0.9 * value_2, 10.0]
+    )
     # Values propagate as far as a map reaches, and those that never settle end anyway.
     success, reward = np.zeros((8, 2500)), np.full((8, 2500), -1.0)
     success[0] = 1.0
     assert settled((success, reward), (1, 2500), 2499)[0, 0] == 1 - 2500
-    assert settled((np.full((8, 4), np.nan), np.ones((8, 4))), (2, 2), 3).shape == (8, 4)
+    assert settled((np.full((8, 4), np.nan), np.ones((8, 4))), (2, 2), 3).shape == (
+        8,
+        4,
+    )
