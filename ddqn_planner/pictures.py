@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.files import as_path, write_atomically
 from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap
-from ddqn_planner.grid.footprint import placed
+from ddqn_planner.robot.footprint import placed
 
 Array = NDArray[np.float64]
 

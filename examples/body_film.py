@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from ddqn_planner import GridMap, Planner
 from ddqn_planner.files import as_path
-from ddqn_planner.grid.footprint import placed
 from ddqn_planner.model import RobotNetwork
 from ddqn_planner.pictures import PATH_COLOUR, VALUE_COLOURS, draw_obstacles
+from ddqn_planner.robot.footprint import placed
 
 FRAMES_PER_SECOND, LAST_FRAMES = 20, 30
 TRACE = 6  # poses from one outline that stays to the next

@@ -27,11 +27,11 @@ from tables import table
 from ddqn_planner import GridMap, Planner, load_map
 from ddqn_planner.cli import file_of
 from ddqn_planner.grid import MOVES, Cell, MoveRule
-from ddqn_planner.grid.footprint import read_footprint
-from ddqn_planner.grid.motions import HEADINGS, Motion, Motions, make_motions
 from ddqn_planner.grid.moves import UPHILL, actions_along
 from ddqn_planner.model import ModelMetadata, RobotNetwork, package_version
 from ddqn_planner.planning.plan import PosePlan
+from ddqn_planner.robot.footprint import read_footprint
+from ddqn_planner.robot.motions import HEADINGS, Motion, Motions, make_motions
 from ddqn_planner.warm_up import warm_up
 
 CELL: Final = 0.05  # metres

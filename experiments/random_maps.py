@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid.arguments import Occupancy
-from ddqn_planner.grid.body import clearance
+from ddqn_planner.grid.inflation import clearance
 
 MINIMUM_SIDE = 5  # of a map: a maze of two corridors between its walls
 SHORTEST_STEP = (

@@ -5,8 +5,6 @@ from pathlib import Path
 import numpy as np
 
 from ddqn_planner.grid import MoveRule
-from ddqn_planner.grid.footprint import read_footprint
-from ddqn_planner.grid.motions import make_motions
 from ddqn_planner.model import (
     NETWORKS,
     ModelMetadata,
@@ -15,6 +13,8 @@ from ddqn_planner.model import (
     save_model,
 )
 from ddqn_planner.planning import Planner
+from ddqn_planner.robot.footprint import read_footprint
+from ddqn_planner.robot.motions import make_motions
 
 
 def random_network(

@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from ddqn_planner import Experience, Planner, load_map
 from ddqn_planner.experience.drives import DriveFolder
 from ddqn_planner.files import as_path
-from ddqn_planner.grid.motions import read_lattice
 from ddqn_planner.model import load_model, save_model
 from ddqn_planner.model.model_file import find_model
 from ddqn_planner.resources import find_map
+from ddqn_planner.robot.motions import read_lattice
 from ddqn_planner.training.environment import paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.run import TrainingRun

@@ -16,7 +16,7 @@ from ddqn_planner.files import WorkFolder, write_atomically
 from ddqn_planner.resources import find_map
 
 ROOT = Path(__file__).resolve().parent.parent
-ROOMS = ["grid", "model", "planning", "experience", "training", "nodes"]
+ROOMS = ["grid", "robot", "model", "planning", "experience", "training", "nodes"]
 TRAINING = {"torch", "gymnasium"}
 PIP = [sys.executable, "-m", "pip", "--quiet"]
 

@@ -15,7 +15,7 @@ from PIL import Image
 
 from ddqn_planner import Planner, inflate, pictures
 from ddqn_planner.grid import MapFile
-from ddqn_planner.grid.footprint import placed
+from ddqn_planner.robot.footprint import placed
 
 
 def test_plan_prints_the_papers_path_by_its_rule(console: Any) -> None:

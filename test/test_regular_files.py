@@ -16,8 +16,8 @@ from ddqn_planner.code_cache import read_checked
 from ddqn_planner.experience.drives import DriveFolder, read_csv, read_drives, read_mcap
 from ddqn_planner.files import read_file, write_atomically
 from ddqn_planner.grid.map_file import MapNotFoundError
-from ddqn_planner.grid.motions import read_lattice
 from ddqn_planner.resources import find_resource
+from ddqn_planner.robot.motions import read_lattice
 from ddqn_planner.training.episodes import read_cells
 
 LARGE = 2**40  # bytes of a sparse file

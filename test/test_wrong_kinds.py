@@ -13,13 +13,13 @@ import pytest
 
 from ddqn_planner import Experience, GridMap, MoveRule, Planner, inflate, simplify
 from ddqn_planner.grid import MapFile
-from ddqn_planner.grid.body import clearance
-from ddqn_planner.grid.footprint import read_footprint
-from ddqn_planner.grid.motions import make_motions, read_lattice
+from ddqn_planner.grid.inflation import clearance
 from ddqn_planner.grid.noise import scatter_obstacles
 from ddqn_planner.planning.path_check import invalid_poses
 from ddqn_planner.planning.plan import PlanRequest
 from ddqn_planner.planning.planner import last_step
+from ddqn_planner.robot.footprint import read_footprint
+from ddqn_planner.robot.motions import make_motions, read_lattice
 from ddqn_planner.training.environment import Scenario
 
 GRID = GridMap(np.zeros((40, 40), np.bool_), 0.05).with_patch(np.ones((2, 2)), 30, 30)

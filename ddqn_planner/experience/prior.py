@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import Occupancy
-from ddqn_planner.grid.body import clearance
+from ddqn_planner.grid.inflation import clearance
 
 Float32 = NDArray[np.float32]
 

@@ -1,8 +1,8 @@
 """What the robot moves on: the grid map, the eight moves, shortest paths, map files and noise."""
 
 from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell
-from ddqn_planner.grid.body import clearance, inflate
 from ddqn_planner.grid.grid_map import MAX_COST_MULTIPLIER, GridMap
+from ddqn_planner.grid.inflation import clearance, inflate
 from ddqn_planner.grid.map_file import MapFile, MapFileError, load_map, read_map_file
 from ddqn_planner.grid.moves import (
     LENGTHS,

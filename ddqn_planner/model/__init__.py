@@ -17,4 +17,4 @@ from ddqn_planner.model.networks import (
     PropagationQNetwork,
     QNetwork,
 )
-from ddqn_planner.model.robot import RobotNetwork
+from ddqn_planner.model.robot_network import RobotNetwork

@@ -20,7 +20,7 @@ from ddqn_planner.model.networks import (
     PropagationQNetwork,
     QNetwork,
 )
-from ddqn_planner.model.robot import RobotNetwork
+from ddqn_planner.model.robot_network import RobotNetwork
 from ddqn_planner.resources import PACKAGE, find_resource
 
 METADATA_KEY = "ddqn_planner"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar, TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,7 @@ from ddqn_planner.model.move_costs import (
     legal_in_patches,
     unique_patches,
 )
-
-if TYPE_CHECKING:
-    from ddqn_planner.model.robot import BodyCertificate
+from ddqn_planner.robot.body_certificate import BodyCertificate
 
 Array: TypeAlias = NDArray[np.float32]
 

@@ -15,8 +15,8 @@ from std_msgs.msg import Header, MultiArrayDimension, MultiArrayLayout, UInt8Mul
 
 from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.grid.arguments import Cells
-from ddqn_planner.grid.body import grid_from_costmap
 from ddqn_planner.grid.grid_map import METRES_PER_CELL, RESOLUTIONS
+from ddqn_planner.grid.inflation import grid_from_costmap
 from ddqn_planner.grid.map_file import MAX_CELLS
 from ddqn_planner.grid.rotations import Rotation
 from ddqn_planner.planning.exact_paths import dense

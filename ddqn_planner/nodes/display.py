@@ -15,12 +15,12 @@ from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from ddqn_planner.grid import MOVES, GridMap
-from ddqn_planner.grid.motions import turn_between
 from ddqn_planner.nodes.conversions import occupancy_message
 from ddqn_planner.nodes.report import Outcome
 from ddqn_planner.nodes.runtime import LATCHED, Worker
 from ddqn_planner.planning import QField
 from ddqn_planner.planning.plan import PosePlan
+from ddqn_planner.robot.motions import turn_between
 
 MAX_ARROWS = 10_000  # more take longer to make than a plan, and are too small to see
 LINE_WIDTH = 0.06  # in cells; larger arrows have wider lines

@@ -16,8 +16,6 @@ from rclpy.task import Future
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
-from ddqn_planner.grid.footprint import read_footprint
-from ddqn_planner.grid.motions import HEADINGS
 from ddqn_planner.model import find_model
 from ddqn_planner.model.certificate import NO_CERTIFICATE
 from ddqn_planner.nodes.conversions import (
@@ -48,6 +46,8 @@ from ddqn_planner.planning.paths import rest_of_path
 from ddqn_planner.planning.plan import PosePlan, joined
 from ddqn_planner.planning.pose_paths import points_of
 from ddqn_planner.planning.pose_planner import PoseRequest
+from ddqn_planner.robot.footprint import read_footprint
+from ddqn_planner.robot.motions import HEADINGS
 from ddqn_planner.warm_up import warm_up
 
 HEADING = (

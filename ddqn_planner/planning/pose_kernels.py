@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place, inlined
-from ddqn_planner.grid.motions import HEADINGS
 from ddqn_planner.planning.pose_world import (
     SHIFT,
     TILE,
@@ -16,6 +15,7 @@ from ddqn_planner.planning.pose_world import (
     is_inside,
     is_possible,
 )
+from ddqn_planner.robot.motions import HEADINGS
 
 # A state is a cell and one of 16 headings. Its number counts headings, then the cells of a tile of
 # 4 x 4, then tiles: so what a request visits lies on few pages of memory, 4 bytes a distance.

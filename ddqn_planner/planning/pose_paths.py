@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place
 from ddqn_planner.grid import GridMap
-from ddqn_planner.grid.footprint import inside, outline
 from ddqn_planner.grid.grid_map import MULTIPLIERS
-from ddqn_planner.grid.motions import BEHIND, TURN, turn_between
 from ddqn_planner.grid.moves import UPHILL, actions_along
 from ddqn_planner.planning.plan import PlanStatus, PosePlan
 from ddqn_planner.planning.pose_world import body_costs, occupied_for_body
 from ddqn_planner.planning.segments import ACTIONS
+from ddqn_planner.robot.footprint import inside, outline
+from ddqn_planner.robot.motions import BEHIND, TURN, turn_between
 
 Float64 = NDArray[np.float64]
 Body = tuple[Float64, Float64]

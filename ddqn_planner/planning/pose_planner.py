@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap
-from ddqn_planner.grid.body import with_unknown_free
-from ddqn_planner.grid.motions import HEADINGS, turn_between
+from ddqn_planner.grid.inflation import with_unknown_free
 from ddqn_planner.planning import pose_paths as paths
 from ddqn_planner.planning import unknown_space
 from ddqn_planner.planning.plan import ROUNDING, PlanStatus, PosePlan
@@ -30,6 +29,7 @@ from ddqn_planner.planning.pose_world import (
     world_of,
 )
 from ddqn_planner.planning.segments import SAME_COST
+from ddqn_planner.robot.motions import HEADINGS, turn_between
 
 Pose: TypeAlias = tuple[
     float, float, float

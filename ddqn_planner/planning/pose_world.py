@@ -10,10 +10,10 @@ from ddqn_planner.grid import GridMap, MoveRule
 from ddqn_planner.grid.arguments import OCCUPIED
 from ddqn_planner.grid.copies import Box
 from ddqn_planner.grid.grid_map import MULTIPLIERS
-from ddqn_planner.grid.motions import HEADINGS, Motions, closer
 from ddqn_planner.grid.moves import UPHILL, actions_along
 from ddqn_planner.planning.field import changed_cells
 from ddqn_planner.planning.segments import ACTIONS
+from ddqn_planner.robot.motions import HEADINGS, Motions, closer
 
 SHIFT: Final = 2  # so many bits tell where in its tile a cell lies, along a side
 TILE: Final = 1 << SHIFT  # cells of a side

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from ddqn_planner.grid import Cell, GridMap
-from ddqn_planner.grid.body import ROUNDING, with_unknown_free
 from ddqn_planner.grid.copies import wider
+from ddqn_planner.grid.inflation import ROUNDING, with_unknown_free
 from ddqn_planner.planning.paths import way_and_ends
 from ddqn_planner.planning.plan import Plan, PlanRequest, PlanStatus
 

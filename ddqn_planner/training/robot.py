@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from ddqn_planner.grid import GridMap, MoveRule
 from ddqn_planner.grid.arguments import as_seed, as_whole
-from ddqn_planner.grid.footprint import read_footprint
-from ddqn_planner.grid.motions import HEADINGS, Motion, make_motions, read_lattice
 from ddqn_planner.model import ModelMetadata, RobotNetwork, package_version
-from ddqn_planner.model.robot import BodyCertificate
+from ddqn_planner.robot.body_certificate import BodyCertificate
+from ddqn_planner.robot.footprint import read_footprint
+from ddqn_planner.robot.motions import HEADINGS, Motion, make_motions, read_lattice
 from ddqn_planner.training.double_dqn import (
     ReplayBuffer,
     Transitions,

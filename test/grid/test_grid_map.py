@@ -28,8 +28,8 @@ from ddqn_planner.grid import (
     inflate,
 )
 from ddqn_planner.grid.arguments import as_cell
-from ddqn_planner.grid.body import Inflation, grid_from_costmap
 from ddqn_planner.grid.copies import boxes_of, cells_in, replaced
+from ddqn_planner.grid.inflation import Inflation, grid_from_costmap
 
 ZEROS = np.zeros((2, 3))
 origins = st.tuples(*3 * [st.floats(-100, 100)])

@@ -110,7 +110,7 @@ def test_large_maps_have_no_more_arrows_than_the_bound(shape: tuple[int, int]) -
 TOLD = """
 import os
 import ddqn_planner.nodes.display as display
-from ddqn_planner.grid.body import Inflation
+from ddqn_planner.grid.inflation import Inflation
 
 def told(words, function):
     def say_and_call(*arguments):

@@ -10,7 +10,7 @@ from networks import ANY_MAP
 from strategies import GRIDS, Data, Place
 
 from ddqn_planner import GridMap, inflate
-from ddqn_planner.grid.body import grid_from_costmap
+from ddqn_planner.grid.inflation import grid_from_costmap
 from ddqn_planner.planning.path_check import invalid_poses
 from ddqn_planner.planning.pose_paths import points_of
 

@@ -17,9 +17,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from ddqn_planner import GridMap
-from ddqn_planner.grid.body import INSCRIBED, grid_from_costmap
-from ddqn_planner.grid.footprint import read_footprint, swept_cells
-from ddqn_planner.grid.motions import Motions, make_motions, turn_between
+from ddqn_planner.grid.inflation import INSCRIBED, grid_from_costmap
 from ddqn_planner.planning import pose_field
 from ddqn_planner.planning.plan import PlanStatus, PosePlan
 from ddqn_planner.planning.planner import last_step
@@ -33,6 +31,8 @@ from ddqn_planner.planning.pose_world import (
     rows_of,
     world_of,
 )
+from ddqn_planner.robot.footprint import read_footprint, swept_cells
+from ddqn_planner.robot.motions import Motions, make_motions, turn_between
 
 CELL = 0.1
 FORMS = {

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from ddqn_planner import GridMap, Planner, PlanStatus, inflate, load_map
 from ddqn_planner.cli import main
-from ddqn_planner.grid.body import grid_from_costmap
+from ddqn_planner.grid.inflation import grid_from_costmap
 from ddqn_planner.planning.unknown_space import REMEDY
 
 FREE, WALL, UNKNOWN = 0, 100, -1

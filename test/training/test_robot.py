@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ddqn_planner.grid.footprint import swept_cells
 from ddqn_planner.model import RobotNetwork, load_model, model_bytes
+from ddqn_planner.robot.footprint import swept_cells
 from ddqn_planner.training.robot import RobotTrainer
 
 TINY: Any = (

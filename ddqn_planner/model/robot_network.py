@@ -2,56 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import MoveRule
-from ddqn_planner.grid.footprint import read_footprint, swept_cells
-from ddqn_planner.grid.motions import HEADINGS, Motions, turn_between
-from ddqn_planner.model.certificate import ROUNDING
 from ddqn_planner.model.networks import ModelFileError, QNetwork
+from ddqn_planner.robot.body_certificate import BodyCertificate, certify_body
+from ddqn_planner.robot.footprint import read_footprint, swept_cells
+from ddqn_planner.robot.motions import HEADINGS, Motions, turn_between
+from ddqn_planner.robot.units import units_of
 
 Float64: TypeAlias = NDArray[np.float64]
 
 # Shapes: P = primitives, U = units of the network, S x S cells with the robot in the middle.
-
-QUARTER = HEADINGS // 4  # headings in a quarter turn
-SAME = (
-    1e-6  # cells or radians: primitives differ by more, and are not written so exactly
-)
-
-
-@dataclass(frozen=True)
-class BodyCertificate:
-    """What is proved about a robot's network, for all patterns of occupied cells at once."""
-
-    primitives: int
-    cells: int  # that they sweep, all together
-    weak: int  # of these, which do not forbid their primitive by themselves
-    forbidden: int  # primitives that cells forbid which they do not sweep
-    margin: float  # least distance of a logit from 0, over its threshold; not above 0 if wrong
-
-    @property
-    def proved(self) -> bool:
-        """Whether a primitive is possible just where no cell that it sweeps is occupied."""
-        return self.weak == self.forbidden == 0
-
-    def __str__(self) -> str:
-        if self.proved:
-            what = f"all {self.cells:,} cells that {self.primitives:,} primitives sweep forbid them"
-            return f"proved: {what}, and no others do, margin {self.margin:.2f}"
-        weak = (
-            f"{self.weak:,} of {self.cells:,} swept cells do not forbid their primitive"
-        )
-        others = (
-            f"{self.forbidden:,} of {self.primitives:,} are forbidden by other cells"
-        )
-        return f"not proved: {weak}, {others}"
 
 
 class RobotNetwork(QNetwork):
@@ -81,8 +47,7 @@ class RobotNetwork(QNetwork):
     @classmethod
     def untrained(cls, footprint: Float64, motions: Motions) -> RobotNetwork:
         """Return the network of a robot that knows nothing yet; a ValueError for no robot."""
-        *_, units = units_of(motions)
-        swept_USS = swept_cells(footprint, units)
+        swept_USS = swept_cells(footprint, units_of(motions).motions)
         poses = [len(one) for one in motions.poses]
         columns = motions.start, motions.end, *motions.offset.T, motions.cost, poses
         tensors: dict[str, Any] = {
@@ -101,9 +66,9 @@ class RobotNetwork(QNetwork):
         super().__init__(sizes, tensors)
         self.footprint = read_footprint(tensors["footprint"].tolist())
         self.motions = _motions_of(self.tensors)
-        self.unit, self.turns, units = units_of(self.motions)
+        self.unit, self.turns, unit_motions = units_of(self.motions)
         # (U, S, S): the cells that the body sweeps on one primitive of each unit
-        self.swept_by_unit = swept_cells(self.footprint, units)
+        self.swept_by_unit = swept_cells(self.footprint, unit_motions)
         found = dict(zip(self.size_names, self.swept_by_unit.shape[:2], strict=False))
         if wrong := {name: size for name, size in found.items() if size != sizes[name]}:
             raise ValueError(
@@ -121,25 +86,11 @@ class RobotNetwork(QNetwork):
 
     def certificate(self, move_rule: MoveRule | None = None) -> BodyCertificate:
         """Return what is proved of its primitives, for all patterns of occupied cells."""
-        # Weights are at least 0, so more occupied cells never make a primitive possible: what each
-        # swept cell does by itself, and what all others do together, decides every pattern. A sum
-        # is not less than its terms in float32 either, and its relative error is bounded.
-        weight_USS = np.maximum(self.tensors["weight"].astype(np.float64), 0)
-        threshold_U = self.tensors["threshold"].astype(np.float64)
-        swept_USS, count_U = self.swept_by_unit, np.bincount(self.unit)
-        lack_USS = weight_USS - threshold_U[:, None, None]
-        weak_U = (swept_USS & (lack_USS <= 0)).sum(axis=(1, 2))
-        others_U = weight_USS.sum(axis=(1, 2), where=~swept_USS)
-        rest_U = threshold_U - others_U * (1 + weight_USS[0].size * ROUNDING)
-        least_U = np.minimum(
-            rest_U, lack_USS.min(axis=(1, 2), where=swept_USS, initial=np.inf)
-        )
-        return BodyCertificate(
-            primitives=len(self.unit),
-            cells=int(count_U @ swept_USS.sum(axis=(1, 2))),
-            weak=int(count_U @ weak_U),
-            forbidden=int(count_U @ (rest_U <= 0)),
-            margin=float((least_U / np.maximum(np.abs(threshold_U), 1e-30)).min()),
+        return certify_body(
+            weight_USS=self.tensors["weight"],
+            threshold_U=self.tensors["threshold"],
+            swept_USS=self.swept_by_unit,
+            unit_P=self.unit,
         )
 
     def swept(self) -> NDArray[np.bool_]:
@@ -150,30 +101,6 @@ class RobotNetwork(QNetwork):
             raise ModelFileError(f"the robot's body is {certificate}; {remedy}")
         learned_USS = self.tensors["weight"] > self.tensors["threshold"][:, None, None]
         return self.of_primitives(learned_USS)
-
-
-def units_of(motions: Motions) -> tuple[NDArray[np.int64], NDArray[np.int64], Motions]:
-    """Return the unit of each primitive, its quarter turns, (P,), and motions with units' poses."""
-    turns_P, numbers = motions.start // QUARTER, []
-    units: list[Float64] = []
-    for turns, poses in zip(turns_P.tolist(), motions.poses, strict=True):
-        x, y, yaw = poses.T
-        for _ in range(turns):
-            x, y = y, -x
-        back = np.column_stack([x, y, yaw - turns * math.pi / 2])
-        alike = (unit for unit, other in enumerate(units) if _is_same(back, other))
-        numbers.append(next(alike, len(units)))
-        if numbers[-1] == len(units):
-            units.append(back)
-    return np.array(numbers), turns_P, replace(motions, poses=tuple(units))
-
-
-def _is_same(poses: Float64, others: Float64) -> bool:
-    """Return whether poses are the same as others, but for rounding and whole turns."""
-    if len(poses) != len(others):
-        return False
-    x, y, yaw = (poses - others).T
-    return bool(np.abs([x, y, turn_between(0, yaw)]).max() < SAME)
 
 
 def _motions_of(tensors: Mapping[str, Any]) -> Motions:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid.arguments import as_number, numbers
-from ddqn_planner.grid.motions import Motions, closer
+from ddqn_planner.robot.motions import Motions, closer
 
 Corners = NDArray[np.float64]  # (K, 2), metres from the robot's origin
 

@@ -12,8 +12,8 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ddqn_planner.grid.footprint import inside, read_footprint, swept_cells
-from ddqn_planner.grid.motions import Motion, make_motions, read_lattice, turn_between
+from ddqn_planner.robot.footprint import inside, read_footprint, swept_cells
+from ddqn_planner.robot.motions import Motion, make_motions, read_lattice, turn_between
 
 ARROW = "[[0.4, 0], [-0.3, 0.3], [-0.1, 0], [-0.3, -0.3]]"
 FORMS = {

@@ -13,8 +13,6 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ddqn_planner.grid import MoveRule
-from ddqn_planner.grid.footprint import read_footprint, swept_cells
-from ddqn_planner.grid.motions import Motions, make_motions
 from ddqn_planner.model import (
     ModelFileError,
     ModelMetadata,
@@ -24,6 +22,8 @@ from ddqn_planner.model import (
     model_of,
     save_model,
 )
+from ddqn_planner.robot.footprint import read_footprint, swept_cells
+from ddqn_planner.robot.motions import Motions, make_motions
 
 
 @cache

@@ -1,4 +1,4 @@
-"""The robot's body: which cells are too near to an obstacle, and which are better avoided."""
+"""Inflation: which cells are too near to an obstacle, and which are better avoided."""
 
 import sys
 from typing import Any

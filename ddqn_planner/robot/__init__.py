@@ -1,0 +1,1 @@
+"""A body that moves: its footprint, its motions, and the proof of its network."""

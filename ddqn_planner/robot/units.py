@@ -1,0 +1,63 @@
+"""Primitives that are quarter turns of each other: one unit of a network serves them."""
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.robot.motions import HEADINGS, Motions, turn_between
+
+Poses = NDArray[np.float64]  # (N, 3): x and y in cells, yaw in radians
+
+HEADINGS_PER_QUARTER = HEADINGS // 4
+# Cells or radians: two primitives differ by more; a lattice is written less exactly.
+SAME = 1e-6
+
+
+class Units(NamedTuple):
+    """The units of P primitives."""
+
+    unit: NDArray[np.int64]  # (P,) the unit of each primitive
+    turns: NDArray[np.int64]  # (P,) by how many quarter turns it differs from its unit
+    motions: Motions  # whose poses are those of the units
+
+
+def units_of(motions: Motions) -> Units:
+    """Return the units of primitives: those that turn into each other share one."""
+    turns = motions.start // HEADINGS_PER_QUARTER
+    unit_of_primitive: list[int] = []
+    poses_of_units: list[Poses] = []
+    for quarter_turns, poses in zip(turns.tolist(), motions.poses, strict=True):
+        turned_poses = _turned_back(poses, quarter_turns)
+        unit = _first_same(poses_of_units, turned_poses)
+        if unit is None:
+            unit = len(poses_of_units)
+            poses_of_units.append(turned_poses)
+        unit_of_primitive.append(unit)
+    unit_motions = replace(motions, poses=tuple(poses_of_units))
+    return Units(np.array(unit_of_primitive), turns, unit_motions)
+
+
+def _turned_back(poses: Poses, quarter_turns: int) -> Poses:
+    """Return poses turned clockwise around the origin."""
+    x, y, yaw = poses.T
+    for _ in range(quarter_turns):
+        x, y = y, -x
+    return np.column_stack([x, y, yaw - quarter_turns * math.pi / 2])
+
+
+def _first_same(poses_of_units: list[Poses], poses: Poses) -> int | None:
+    for unit, unit_poses in enumerate(poses_of_units):
+        if _are_same(poses, unit_poses):
+            return unit
+    return None
+
+
+def _are_same(first_poses: Poses, second_poses: Poses) -> bool:
+    """Return whether poses are the same but for rounding and whole turns."""
+    if len(first_poses) != len(second_poses):
+        return False
+    x, y, yaw = (first_poses - second_poses).T
+    return bool(np.abs([x, y, turn_between(0, yaw)]).max() < SAME)
