@@ -198,7 +198,8 @@ print(sorted(signatures() - before), f"planning.{sys.argv[2]}" in str(before))
 
 
 @pytest.mark.parametrize(
-    ("model", "other"), [("any_map", "pose_kernels"), ("differential_robot", "kernels")]
+    ("model", "other"),
+    [("any_map", "pose_space"), ("differential_robot", "cell_space")],
 )
 def test_a_warm_up_compiles_what_requests_need_and_no_more(
     model: str, other: str

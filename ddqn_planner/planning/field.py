@@ -17,8 +17,8 @@ from ddqn_planner.grid.copies import Box
 from ddqn_planner.grid.grid_map import LAYERS
 from ddqn_planner.model import PropagationQNetwork, QNetwork
 from ddqn_planner.model.move_costs import MoveCosts
-from ddqn_planner.planning import kernels
-from ddqn_planner.planning.kernels import Known
+from ddqn_planner.planning import cell_space as kernels
+from ddqn_planner.planning.cell_space import Known
 from ddqn_planner.planning.plan import Plan, PlanStatus
 
 Goals: TypeAlias = tuple[

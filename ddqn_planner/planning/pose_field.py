@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ddqn_planner.grid import GridMap
-from ddqn_planner.planning import pose_kernels as kernels
-from ddqn_planner.planning.pose_kernels import Aim, Search, heap_of
+from ddqn_planner.planning import pose_space as kernels
 from ddqn_planner.planning.pose_paths import SAME, Way
+from ddqn_planner.planning.pose_space import Aim, Search, heap_of
 from ddqn_planner.planning.pose_world import (
     SHIFT,
     TILE,

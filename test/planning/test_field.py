@@ -35,8 +35,8 @@ from ddqn_planner.grid.moves import MOVES, legal_moves, move_costs, shortest_dis
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.model import move_costs as move_costs_module
 from ddqn_planner.model.move_costs import MoveCosts
+from ddqn_planner.planning import cell_space as kernels
 from ddqn_planner.planning import field as fields
-from ddqn_planner.planning import kernels
 from ddqn_planner.planning.field import DistanceField, QField, network_field
 from ddqn_planner.planning.segments import cost_along
 

@@ -21,9 +21,9 @@ from ddqn_planner.grid.inflation import INSCRIBED, grid_from_costmap
 from ddqn_planner.planning import pose_field
 from ddqn_planner.planning.plan import PlanStatus, PosePlan
 from ddqn_planner.planning.planner import last_step
-from ddqn_planner.planning.pose_kernels import way_left
 from ddqn_planner.planning.pose_paths import cost_of_poses
 from ddqn_planner.planning.pose_planner import Pose, PosePlanner, PoseRequest
+from ddqn_planner.planning.pose_space import way_left
 from ddqn_planner.planning.pose_world import (
     State,
     body_of,
