@@ -1,6 +1,5 @@
 """Copies of large arrays that differ in few cells, and share the memory of the others."""
 
-import math
 import mmap
 import os
 from collections.abc import Sequence
@@ -11,13 +10,9 @@ from weakref import ReferenceType, WeakSet, finalize
 import numpy as np
 from numpy.typing import NDArray
 
-Box = tuple[slice, ...]  # rows and columns
-
-ORIGIN: Box = (slice(0, 0), slice(0, 0))
+from ddqn_planner.grid.boxes import Box, cells_in, hull
 
 SMALL = 2**22  # bytes of an array that is copied as fast, and read faster
-APART = 16  # rows or columns between what gets boxes of its own
-FEW = 8  # boxes: each takes as long as some thousand cells
 BOX = 2**13  # cells that are copied as fast as a box is begun
 LARGE = 64  # copies share memory if they differ in less than one cell in so many
 MOST_ALIVE = (
@@ -99,50 +94,3 @@ def _with(boxes: tuple[Box, ...], box: Box) -> tuple[Box, ...]:
 
 def _effort(boxes: Sequence[Box]) -> int:
     return sum(BOX + cells_in(box) for box in boxes)
-
-
-def boxes_of(is_set: NDArray[np.bool_], apart: int = APART) -> list[Box]:
-    """Return at most `FEW` boxes that hold all that is True, and little else."""
-    boxes: list[Box] = [
-        (rows, columns)
-        for rows in _runs(np.any(is_set, axis=1), apart)
-        for columns in _runs(np.any(is_set[rows], axis=0), apart)
-    ]
-    return boxes if len(boxes) <= FEW else boxes_of(is_set, is_set.size)
-
-
-def _runs(is_set: NDArray[np.bool_], apart: int) -> list[slice]:
-    """Return where something is True, with gaps of so many others at most."""
-    places = np.flatnonzero(is_set)
-    runs = np.split(places, np.flatnonzero(np.diff(places) > apart) + 1)
-    return [slice(int(run[0]), int(run[-1]) + 1) for run in runs if run.size]
-
-
-def hull(boxes: list[Box]) -> Box:
-    """Return the least box that holds some."""
-    sides = zip(*boxes, strict=True)
-    return tuple(
-        slice(min(s.start for s in of), max(s.stop for s in of)) for of in sides
-    )
-
-
-def cells_in(box: Box) -> int:
-    """Return how many cells a box has."""
-    return math.prod(side.stop - side.start for side in box)
-
-
-def wider(box: Box, by: int, shape: tuple[int, ...]) -> Box:
-    """Return a box with so many more cells on each side, as far as an array has them."""
-    sides = zip(box, shape, strict=True)
-    return tuple(
-        slice(max(side.start - by, 0), min(side.stop + by, size))
-        for side, size in sides
-    )
-
-
-def within(box: Box, outer: Box, border: int = 0) -> Box:
-    """Return where a box lies in another one, which may have a border."""
-    sides = [
-        (side, other.start - border) for side, other in zip(box, outer, strict=True)
-    ]
-    return tuple(slice(side.start - first, side.stop - first) for side, first in sides)

@@ -21,7 +21,8 @@ from ddqn_planner.grid.arguments import (
     Occupancy,
     as_number,
 )
-from ddqn_planner.grid.copies import ORIGIN, Box, replaced
+from ddqn_planner.grid.boxes import ORIGIN, Box
+from ddqn_planner.grid.copies import replaced
 from ddqn_planner.grid.moves import MoveRule, flood, legal_moves
 
 MAX_COST_MULTIPLIER = 5.0
@@ -244,7 +245,7 @@ class GridMap:
             raise ValueError(
                 f"a patch of {part} is not inside the map of {size}; cut it"
             )
-        box = slice(bottom, bottom + height), slice(left, left + width)
+        box = Box(slice(bottom, bottom + height), slice(left, left + width))
         costs = self.cost
         if costs is not None or cost is not None:
             costs = (

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Occupancy, as_mask, as_number
-from ddqn_planner.grid.copies import Box, cells_in, hull, wider, within
+from ddqn_planner.grid.boxes import Box, cells_in, hull, wider, within
 from ddqn_planner.grid.grid_map import MAX_COST_MULTIPLIER, GridMap, check_grid
 
 # Linear and exponential costs, with paths as long, kept no clearly greater distances.

@@ -18,7 +18,8 @@ from ddqn_planner.grid import (
     MoveRule,
     legal_moves,
 )
-from ddqn_planner.grid.copies import ORIGIN, Box, replaced, wider, within
+from ddqn_planner.grid.boxes import ORIGIN, Box, wider, within
+from ddqn_planner.grid.copies import replaced
 from ddqn_planner.grid.grid_map import LAYERS
 from ddqn_planner.grid.moves import UPHILL
 

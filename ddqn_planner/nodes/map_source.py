@@ -18,7 +18,7 @@ from std_msgs.msg import Header, UInt8MultiArray
 
 from ddqn_planner.experience import Experience
 from ddqn_planner.grid import GridMap
-from ddqn_planner.grid.copies import boxes_of
+from ddqn_planner.grid.boxes import boxes_of
 from ddqn_planner.grid.inflation import Inflation
 from ddqn_planner.nodes import conversions
 from ddqn_planner.nodes.conversions import MAP_PARAMETERS, grid_from_message

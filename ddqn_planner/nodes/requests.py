@@ -16,6 +16,7 @@ from rclpy.task import Future
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
+from ddqn_planner.grid.map_changes import shift_between
 from ddqn_planner.model import find_model
 from ddqn_planner.model.certificate import NO_CERTIFICATE
 from ddqn_planner.nodes.conversions import (
@@ -40,7 +41,6 @@ from ddqn_planner.nodes.retries import FAILURES, Retries
 from ddqn_planner.nodes.runtime import BaseNode, Worker
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus
 from ddqn_planner.planning.exact_paths import NO_PATH, ExactPath, exact_path
-from ddqn_planner.planning.field import shift_between
 from ddqn_planner.planning.path_check import LETHAL, invalid_poses
 from ddqn_planner.planning.paths import rest_of_path
 from ddqn_planner.planning.plan import PosePlan, joined

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -13,8 +12,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import cell_inside, numbers
-from ddqn_planner.grid.copies import Box
-from ddqn_planner.grid.grid_map import LAYERS
+from ddqn_planner.grid.map_changes import changed_cells
 from ddqn_planner.model import PropagationQNetwork, QNetwork
 from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning import cell_space as kernels
@@ -29,9 +27,6 @@ REPAIRED = 100  # cells that a repair may take back before a new field is begun
 # back takes longer, and it is visited again. See docs/benchmarks.md.
 VISITS = 8
 REPAIRED_SHARE = 0.02  # of the map's cells that a repair may take back
-CHANGED_SHARE = (
-    0.02  # of the map's cells may have changed: with more, a new field is cheaper
-)
 CACHE_BYTES = (
     2**23
 )  # for a planner's Q fields: 3 of 500 x 500 cells, at 9 bytes per cell
@@ -40,9 +35,6 @@ ALWAYS_KEPT = (
 )
 MOST_KEPT = 64  # fields, however small: a request's map is compared with that of each
 OBJECTS = 4_000  # bytes of a field, its costs and its map beside their arrays
-SAME_PLACE = (
-    0.01  # cells that a shift may be off whole ones: messages' resolution is float32
-)
 
 
 class QField:
@@ -309,73 +301,6 @@ def network_field(
     else:
         q = network.q_values(grid, goal, move_rule)
     return QField(goal, q, grid.legal_moves(move_rule), move_rule)
-
-
-# What has changed between two maps of one place: a robot sees some cells of millions
-
-
-def shift_between(old: GridMap, new: GridMap) -> Cell | None:
-    """Return by how many cells a map has moved in a newer one with the same layers, or None."""
-    if any(
-        (getattr(old, layer) is None) != (getattr(new, layer) is None)
-        for layer in LAYERS
-    ):
-        return None
-    return offset_between(old, new)
-
-
-def offset_between(old: GridMap, new: GridMap) -> Cell | None:
-    """Return where cell (0, 0) of one map lies in another; None if their cells do not match."""
-    same = math.isclose(old.resolution, new.resolution, rel_tol=1e-6)
-    if not same or old.origin[2] != new.origin[2]:
-        return None
-    corner = old.cell_to_world((0, 0))
-    try:
-        shift = new.world_to_cell(*corner)
-    except (OverflowError, ValueError):  # too far away to have a number of cells
-        return None
-    apart = math.dist(corner, new.cell_to_world(shift))
-    return shift if apart < SAME_PLACE * new.resolution else None
-
-
-def overlap(old: GridMap, new: GridMap, shift: Cell) -> tuple[Box, Box]:
-    """Return the rows and columns that both maps show, in the old map and in the new one."""
-    sizes = zip(shift[::-1], old.occupancy.shape, new.occupancy.shape, strict=True)
-    # Where a box ends beyond an array, NumPy cuts it.
-    sides = [
-        (
-            slice(max(-by, 0), max(new_size - by, 0)),
-            slice(max(by, 0), max(old_size + by, 0)),
-        )
-        for by, old_size, new_size in sizes
-    ]
-    before, after = zip(*sides, strict=True)
-    return before, after
-
-
-def changed_cells(
-    old: GridMap, new: GridMap, differs: Callable[[Box], Any] | None = None
-) -> NDArray[np.int64] | None:
-    """Return the cells (N, 2) in which maps of one place differ; None for others, or for many."""
-    if shift_between(old, new) != (0, 0) or old.occupancy.shape != new.occupancy.shape:
-        return None
-    whole: Box = (slice(0, new.height), slice(0, new.width))
-    found, patches = [np.empty((0, 2), np.int64)], new.patches_since(old)
-    most = CHANGED_SHARE * new.occupancy.size
-    for box in [whole] if patches is None else patches:
-        rows, columns = box
-        number = np.flatnonzero(
-            new.differs(old, box) if differs is None else differs(box)
-        )
-        most -= len(number)
-        if (
-            most < 0
-        ):  # before their places are looked up: experience changes most of a map
-            return None
-        # With few of many, sooner than `np.nonzero`.
-        y, x = np.divmod(number, columns.stop - columns.start)
-        found.append(np.column_stack([x + columns.start, y + rows.start]))
-    return np.concatenate(found)
 
 
 # The fields that a planner keeps

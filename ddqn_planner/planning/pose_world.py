@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from ddqn_planner.compiled import in_place, inlined
 from ddqn_planner.grid import GridMap, MoveRule
 from ddqn_planner.grid.arguments import OCCUPIED
-from ddqn_planner.grid.copies import Box
+from ddqn_planner.grid.boxes import Box
 from ddqn_planner.grid.grid_map import MULTIPLIERS
+from ddqn_planner.grid.map_changes import changed_cells
 from ddqn_planner.grid.moves import UPHILL, actions_along
-from ddqn_planner.planning.field import changed_cells
 from ddqn_planner.planning.segments import ACTIONS
 from ddqn_planner.robot.motions import HEADINGS, Motions, closer
 

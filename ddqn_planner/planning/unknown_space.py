@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from ddqn_planner.grid import Cell, GridMap
-from ddqn_planner.grid.copies import wider
+from ddqn_planner.grid.boxes import Box, wider
 from ddqn_planner.grid.inflation import ROUNDING, with_unknown_free
 from ddqn_planner.planning.paths import way_and_ends
 from ddqn_planner.planning.plan import Plan, PlanRequest, PlanStatus
@@ -91,7 +91,7 @@ def place_in_words(grid: GridMap, cell: Cell) -> str:
         return ""
     cells = grid.body_radius * (1 - ROUNDING) / grid.resolution
     rows, columns = wider(
-        (slice(y, y + 1), slice(x, x + 1)), int(cells) + 1, grid.occupancy.shape
+        Box(slice(y, y + 1), slice(x, x + 1)), int(cells) + 1, grid.occupancy.shape
     )
     obstacles = grid.obstacles[rows, columns] & ~grid.unknown[rows, columns]
     for row, column in zip(*obstacles.nonzero(), strict=True):

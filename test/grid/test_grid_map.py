@@ -28,7 +28,8 @@ from ddqn_planner.grid import (
     inflate,
 )
 from ddqn_planner.grid.arguments import as_cell
-from ddqn_planner.grid.copies import boxes_of, cells_in, replaced
+from ddqn_planner.grid.boxes import MAX_BOXES, Box, boxes_of, cells_in
+from ddqn_planner.grid.copies import replaced
 from ddqn_planner.grid.inflation import Inflation, grid_from_costmap
 
 ZEROS = np.zeros((2, 3))
@@ -456,7 +457,7 @@ def test_each_copy_keeps_what_it_was_given_whatever_comes_after(
     expected, views = [copied[0].copy()], []
     for origin, (y, height, x, width), shape, fate in changes:
         before = origin % len(copied)  # any of the copies may be changed again
-        box = slice(y, y + height), slice(x, x + width)
+        box = Box(slice(y, y + height), slice(x, x + width))
         changed = expected[before].reshape(shape).copy()
         changed[box] = len(copied)
         copied.append(replaced(copied[before].reshape(shape), box, changed[box]))
@@ -520,7 +521,7 @@ def test_a_few_boxes_hold_all_changes(cells: list[tuple[int, int]]) -> None:
     for box in boxes:
         assert is_set[box].any()
         covered[box] = True
-    assert len(boxes) <= copies.FEW
+    assert len(boxes) <= MAX_BOXES
     assert not (is_set & ~covered).any()
 
 
@@ -555,7 +556,9 @@ def test_maps_that_differ_in_one_cell_are_not_the_same(layer: str, row: int) -> 
     changed[row, 1] = 1 - changed[row, 1] if layer == "occupancy" else 2
     other = GridMap(**{"occupancy": grid.occupancy, **layers, layer: changed})
     assert not grid.same_cells(other)
-    assert np.argwhere(grid.differs(other, np.s_[:, :])).tolist() == [[row, 1]]
+    assert np.argwhere(grid.differs(other, Box(slice(None), slice(None)))).tolist() == [
+        [row, 1]
+    ]
 
 
 def test_a_map_with_two_patches_is_the_same_only_if_both_change_nothing() -> None:

@@ -29,7 +29,7 @@ from strategies import (
 )
 
 from ddqn_planner import GridMap, MoveRule, Plan, Planner, PlanStatus
-from ddqn_planner.grid import Cell, copies, grid_map
+from ddqn_planner.grid import Cell, copies, grid_map, map_changes
 from ddqn_planner.grid.grid_map import LAYERS
 from ddqn_planner.grid.moves import MOVES, legal_moves, move_costs, shortest_distances
 from ddqn_planner.grid.noise import random_requests
@@ -193,7 +193,7 @@ def test_a_map_may_hold_all_sets_of_directions(classes: int) -> None:
 @pytest.fixture(autouse=True)
 def any_share(monkeypatch: pytest.MonkeyPatch) -> None:
     """Repair the small maps of these tests, however much of them changes."""
-    monkeypatch.setattr(fields, "CHANGED_SHARE", 1.0)
+    monkeypatch.setattr(map_changes, "CHANGED_SHARE", 1.0)
     monkeypatch.setattr(fields, "REPAIRED_SHARE", 1.0)
     monkeypatch.setattr(fields, "REPAIRED", fields.REPAIRED)  # tests change it
     for name, value in {
@@ -449,7 +449,7 @@ def test_after_too_many_changes_both_fields_are_kept(
     first, second = (
         GridMap(np.random.default_rng(n).random((60, 60)) < 0.2) for n in (0, 1)
     )
-    assert fields.changed_cells(first, second) is None
+    assert map_changes.changed_cells(first, second) is None
     goal = next(cell for cell in first.free_cells() if second.is_free(cell))
     planner = new_planner()
     kept = [planner.q_field(grid, goal) for grid in (first, second, first, second)]
@@ -466,9 +466,11 @@ def test_maps_are_compared_where_one_is_the_other_shifted_by_whole_cells() -> No
         *((0.05, (x, 0.0, 0.0), None) for x in (0.02, 5e10 + 0.02)),
         (0.1, (0.0, 0.0, 0.0), None),
     ):
-        assert fields.shift_between(old, GridMap(cells, resolution, origin)) == shift
+        assert (
+            map_changes.shift_between(old, GridMap(cells, resolution, origin)) == shift
+        )
         with_costs = GridMap(cells, resolution, origin, np.ones((9, 9), dtype=np.int8))
-        assert fields.shift_between(old, with_costs) is None
+        assert map_changes.shift_between(old, with_costs) is None
 
 
 @pytest.mark.usefixtures("often_switched")

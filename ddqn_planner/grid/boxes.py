@@ -1,0 +1,87 @@
+"""Boxes of cells: rows and columns of an array."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+MAX_GAP = 16  # rows or columns without a set cell within one box
+MAX_BOXES = 8  # each box takes as long as some thousand cells
+
+
+class Box(NamedTuple):
+    """Some rows and columns of an array, which `array[box]` selects."""
+
+    rows: slice
+    columns: slice
+
+
+ORIGIN = Box(slice(0, 0), slice(0, 0))
+
+
+def boxes_of(is_set: NDArray[np.bool_], max_gap: int = MAX_GAP) -> list[Box]:
+    """Return at most `MAX_BOXES` boxes that hold all cells that are True, and few others."""
+    boxes = []
+    for rows in _runs(np.any(is_set, axis=1), max_gap):
+        for columns in _runs(np.any(is_set[rows], axis=0), max_gap):
+            boxes.append(Box(rows, columns))
+    if len(boxes) > MAX_BOXES:
+        return boxes_of(is_set, max_gap=is_set.size)  # one box
+    return boxes
+
+
+def _runs(is_set: NDArray[np.bool_], max_gap: int) -> list[slice]:
+    """Return the runs of True, which may contain gaps of some length."""
+    indices = np.flatnonzero(is_set)
+    if indices.size == 0:
+        return []
+    first_of_next_run = np.flatnonzero(np.diff(indices) > max_gap) + 1
+    runs = np.split(indices, first_of_next_run)
+    return [slice(int(run[0]), int(run[-1]) + 1) for run in runs]
+
+
+def hull(boxes: Sequence[Box]) -> Box:
+    """Return the smallest box that holds all boxes."""
+    return Box(
+        rows=_hull_of_slices([box.rows for box in boxes]),
+        columns=_hull_of_slices([box.columns for box in boxes]),
+    )
+
+
+def _hull_of_slices(slices: Sequence[slice]) -> slice:
+    start = min(part.start for part in slices)
+    stop = max(part.stop for part in slices)
+    return slice(start, stop)
+
+
+def cells_in(box: Box) -> int:
+    """Return the number of cells of a box."""
+    height = box.rows.stop - box.rows.start
+    width = box.columns.stop - box.columns.start
+    return int(height * width)
+
+
+def wider(box: Box, margin: int, shape: tuple[int, ...]) -> Box:
+    """Return a box with more cells on each side, cut at the border of an array."""
+    height, width = shape
+    return Box(
+        rows=_wider_slice(box.rows, margin, height),
+        columns=_wider_slice(box.columns, margin, width),
+    )
+
+
+def _wider_slice(part: slice, margin: int, size: int) -> slice:
+    return slice(max(part.start - margin, 0), min(part.stop + margin, size))
+
+
+def within(box: Box, outer: Box, border: int = 0) -> Box:
+    """Return where a box lies in the array of an outer box, which may have a border."""
+    first_row = outer.rows.start - border
+    first_column = outer.columns.start - border
+    return Box(
+        rows=slice(box.rows.start - first_row, box.rows.stop - first_row),
+        columns=slice(
+            box.columns.start - first_column, box.columns.stop - first_column
+        ),
+    )
