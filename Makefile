@@ -1,4 +1,4 @@
-# make setup | demo | demo-driving | demo-training | test | test-fast | experiments-test | docs | lint | format | types | bench | body | faults | fuzz | load | soak | model | model-dilemma | robots
+# make setup | demo | demo-driving | demo-training | test | test-fast | coverage | experiments-test | docs | lint | format | types | bench | body | faults | fuzz | load | soak | model | model-dilemma | robots
 PYTHON ?= python3
 # What pip is asked for. PyPI's builds for Linux bring CUDA. The CPU build alone:
 # make setup TORCH="torch==2.13.0 --index-url https://download.pytorch.org/whl/cpu"
@@ -7,7 +7,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: setup demo demo-driving demo-training test test-fast experiments-test docs lint format types bench body faults fuzz load soak model model-dilemma robots
+.PHONY: setup demo demo-driving demo-training test test-fast coverage experiments-test docs lint format types bench body faults fuzz load soak model model-dilemma robots
 .DEFAULT_GOAL := help
 
 .PHONY: help
@@ -34,7 +34,7 @@ $(VENV)/train: $(VENV)/base Makefile
 # With setuptools for the tests that build the package.
 $(VENV)/full: $(VENV)/train
 	@echo "installing what tests and experiments need"
-	@$(INSTALL) "setuptools>=64" --editable ".[bags,experiments,test,watch]"
+	@$(INSTALL) "setuptools>=64" --editable ".[bags,experiments,lint,test]"
 	@touch $@
 
 $(VENV)/docs $(VENV)/bench: $(VENV)/full
@@ -68,6 +68,10 @@ test: $(VENV)/compiled
 # No ROS and nothing slow: for every save.
 test-fast: setup
 	$(PYTEST) --ignore test/integration -m "not slow"
+
+# Which lines and branches the fast tests run, as a table; compiled functions do not count.
+coverage: setup
+	$(PYTEST) --ignore test/integration -m "not slow" --cov --cov-report term-missing:skip-covered
 
 # What measures has tests of its own: they train and drive for minutes.
 experiments-test: $(VENV)/compiled

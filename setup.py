@@ -58,7 +58,6 @@ setup(
         "figures": ["matplotlib>=3.6"],
         "experiments": ["joblib>=1.3", "matplotlib>=3.6"],
         "bags": ["mcap-ros2-support>=0.5"],
-        "watch": ["rerun-sdk>=0.39"],
         "docs": ["furo", "myst-parser>=3.0", "sphinx>=7.3"],
         "bench": [
             "dijkstra3d>=1.15",
@@ -73,15 +72,13 @@ setup(
             "colcon-package-selection",
             "colcon-ros>=0.4",
             "hypothesis>=6.80",
-            "mypy>=1.10",
             "pytest>=7.4",
+            "pytest-cov>=4.1",
             "pytest-xdist>=3.5",
-            "ruff>=0.9",
             "setuptools<80",  # with a newer one, colcon's --symlink-install makes copies
             "shapely>=2.0",
-            "types-PyYAML",
-            "types-tqdm",
         ],
+        "lint": ["mypy>=1.10", "ruff>=0.9", "types-PyYAML", "types-tqdm"],
     },
     entry_points={
         "console_scripts": [

@@ -19,7 +19,6 @@ PACKAGES: Final = {
     "mcap": "mcap-ros2-support",
     "mcap_ros2": "mcap-ros2-support",
     "numba": "numba",
-    "rerun": "'rerun-sdk>=0.39'",
     "safetensors": "safetensors",
     "torch": "torch gymnasium",
 }

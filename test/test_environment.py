@@ -138,5 +138,5 @@ def test_only_what_trains_waits_for_torch(tmp_path: Path) -> None:
             in (commands(target))
         )
     for target in ("test", "docs"):
-        assert "bags,experiments,test,watch" in commands(target)
+        assert "bags,experiments,lint,test" in commands(target)
     assert '".[docs]"' in commands("docs")
