@@ -579,7 +579,7 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
                 f"no drive taught anything, and {out} is as before; {reasons[0]}"
             )
         try:
-            from ddqn_planner.training.prior import prior_of
+            from ddqn_planner.training.prior_training import prior_of
 
             experience.prior = prior_of(
                 grid, experience.evidence.table, experience.prior

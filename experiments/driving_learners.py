@@ -14,7 +14,7 @@ from scipy.sparse.linalg import cg
 from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience import Learned
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
-from ddqn_planner.training.prior import prior_of
+from ddqn_planner.training.prior_training import prior_of
 
 WINDOW: Final = 0.5  # seconds over which poses are averaged
 MORE_PLACES: Final = 1.1  # times as many as the last time teach the prior anew

@@ -14,7 +14,7 @@ from random_maps import Random
 
 from ddqn_planner import Experience, Planner, inflate, load_map
 from ddqn_planner.grid import Cell
-from ddqn_planner.training.prior import prior_of
+from ddqn_planner.training.prior_training import prior_of
 
 MOVED_AT: Final = 100  # the mission before which all that is slow moves, where it does
 FAULT_EVERY: Final = (

@@ -34,15 +34,15 @@ from ddqn_planner.grid import (
     shortest_path,
 )
 from ddqn_planner.planning.paths import search
-from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
-from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.shared_background import (
+from ddqn_planner.training.compiled_learner import (
     adam,
     differentiate,
     evaluate,
     look,
     networks_of,
 )
+from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
+from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import Trainer
 
 TRAINING_MAPS, TEST_MAPS, NOISE_SEED = 100, 200, 0

@@ -18,6 +18,7 @@ from ddqn_planner.files import write_atomically, write_csv
 from ddqn_planner.grid import LENGTHS, neighbours
 from ddqn_planner.model import PaperQNetwork
 from ddqn_planner.planning import Planner
+from ddqn_planner.training.compiled_learner import evaluate, look, networks_of
 from ddqn_planner.training.environment import (
     GridVectorEnvironment,
     Scenario,
@@ -26,7 +27,6 @@ from ddqn_planner.training.environment import (
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.propagation import value_iteration
 from ddqn_planner.training.run import TrainingRun
-from ddqn_planner.training.shared_background import evaluate, look, networks_of
 from ddqn_planner.training.trainer import Trainer
 
 SCENARIO: Final = paper_scenario()

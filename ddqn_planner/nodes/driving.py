@@ -195,7 +195,7 @@ class Driving:
             evidence.prior,
             self._node.value("seed"),
         )
-        training = "ddqn_planner.training.prior"  # it imports torch
+        training = "ddqn_planner.training.prior_training"  # it imports torch
         try:
             prior = await self._node.worker.call(
                 lambda: import_module(training).prior_of(*given)

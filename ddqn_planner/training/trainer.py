@@ -27,12 +27,12 @@ from ddqn_planner.model import (
     package_version,
 )
 from ddqn_planner.planning import Planner
+from ddqn_planner.training.compiled_learner import arrays_of, play
 from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.episodes import Episode, EpisodeEnd
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.propagation import PropagationLearner
-from ddqn_planner.training.shared_background import arrays_of, play
 
 CHECKPOINT_KEY, DIGEST_KEY = "ddqn_planner_checkpoint", "sha256"
 

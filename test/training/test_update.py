@@ -19,17 +19,17 @@ from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import as_seed
 from ddqn_planner.model import AnyMapQNetwork
 from ddqn_planner.model.move_costs import patches
-from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions
-from ddqn_planner.training.environment import Scenario, paper_scenario
-from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.robot import RobotTrainer
-from ddqn_planner.training.shared_background import (
+from ddqn_planner.training.compiled_learner import (
     adam,
     differentiate,
     evaluate,
     look,
     networks_of,
 )
+from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions
+from ddqn_planner.training.environment import Scenario, paper_scenario
+from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.robot import RobotTrainer
 from ddqn_planner.training.trainer import Trainer
 
 Q = dict[Scenario, dict[Cell, Tensor]]

@@ -7,7 +7,7 @@ from random_maps import generate_map
 
 from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience.prior import Prior, map_features
-from ddqn_planner.training.prior import REPLAYED, prior_of, train_prior
+from ddqn_planner.training.prior_training import REPLAYED, prior_of, train_prior
 
 rng = np.random.default_rng
 
