@@ -31,7 +31,7 @@ from std_msgs.msg import Header
 from ddqn_planner.grid import OCCUPIED, Cell, GridMap, MapFile, MoveRule, read_map_file
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.nodes.conversions import occupancy_message, quaternion
-from ddqn_planner.nodes.report import seconds
+from ddqn_planner.nodes.diagnostics import seconds
 from ddqn_planner.resources import find_map
 
 RULE = MoveRule.ROBOT_SAFE  # of the planner's default model

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.one_way import forbidden_on
 from ddqn_planner.nodes.conversions import grid_from_message
-from ddqn_planner.nodes.report import Report
+from ddqn_planner.nodes.diagnostics import PlannerDiagnostics
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode
 
 DIRECTIONS = "map_directions"
@@ -29,9 +29,12 @@ class Directions:
     """
 
     def __init__(
-        self, node: BaseNode, report: Report, on_change: Callable[[], None]
+        self,
+        node: BaseNode,
+        diagnostics: PlannerDiagnostics,
+        on_change: Callable[[], None],
     ) -> None:
-        self._node, self._report, self._on_change = node, report, on_change
+        self._node, self._diagnostics, self._on_change = node, diagnostics, on_change
         self._frame = ""
         self._zones: GridMap | None = None  # None if nothing is forbidden
         self._have_come = False
@@ -79,7 +82,7 @@ class Directions:
 
     def take(self, message: OccupancyGrid) -> None:
         """Obey a message from now on, or refuse it and obey the one before."""
-        with self._report.taking(DIRECTIONS):
+        with self._diagnostics.receiving(DIRECTIONS):
             zones = None
             if message.info.width or message.info.height or message.data:
                 grid = grid_from_message(message)

@@ -58,7 +58,7 @@ class DrivingRobot:
         self._space = f"{name}/" if name else ""  # before its topics and its frame
         self.recorder = DriveRecorder(partial(on_drive, f" by {name}" if name else ""))
         self._aborted: set[bytes] | None = None
-        listen(node, f"{self._space}goal_pose", 10, node.refusals, self._on_goal)
+        listen(node, f"{self._space}goal_pose", 10, node.diagnostics, self._on_goal)
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         topic = f"{self._space}{NAVIGATION}"
         node.create_subscription(GoalStatusArray, topic, self._on_status, latched)
@@ -66,7 +66,7 @@ class DrivingRobot:
             frames.listen()
             node.create_timer(0.05, self._look_up, clock=STEADY)  # every pose counts
         else:
-            listen(node, f"{self._space}odom", 1000, node.refusals, self._on_pose)
+            listen(node, f"{self._space}odom", 1000, node.diagnostics, self._on_pose)
 
     def _on_pose(self, pose: PoseStamped) -> None:
         """Record a pose; a ValueError refuses it."""
@@ -81,7 +81,7 @@ class DrivingRobot:
     def _look_up(self) -> None:
         if (place := self._node.map) is None:
             return
-        with self._node.refusals.taking(f"{self._space}tf", often=True):
+        with self._node.diagnostics.receiving(f"{self._space}tf", is_frequent=True):
             frame = f"{self._space}{self._node.value('robot_frame')}".lstrip("/")
             try:
                 pose = self._frames.origin_of(frame, place.frame)

@@ -22,8 +22,9 @@ from ddqn_planner.grid.boxes import boxes_of
 from ddqn_planner.grid.inflation import Inflation
 from ddqn_planner.nodes import conversions
 from ddqn_planner.nodes.conversions import MAP_PARAMETERS, grid_from_message
+from ddqn_planner.nodes.diagnostics import PlannerDiagnostics, seconds
 from ddqn_planner.nodes.directions import PUBLISHER_WAIT, Directions, Forbidden
-from ddqn_planner.nodes.report import NO_REQUEST, Outcome, Report, RequestError, seconds
+from ddqn_planner.nodes.outcome import NO_REQUEST, Outcome, RequestError
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker, apt_install
 
 try:
@@ -96,15 +97,19 @@ class MapSource:
     """The map to plan on; `on_map` is called when anything about it is new."""
 
     def __init__(
-        self, node: BaseNode, report: Report, worker: Worker, on_map: Callable[[], None]
+        self,
+        node: BaseNode,
+        diagnostics: PlannerDiagnostics,
+        worker: Worker,
+        on_map: Callable[[], None],
     ) -> None:
-        self._node, self._report, self._worker, self._on_map = (
+        self._node, self._diagnostics, self._worker, self._on_map = (
             node,
-            report,
+            diagnostics,
             worker,
             on_map,
         )
-        self.times = ExpectedTimes(node, report, worker, self.change)
+        self.times = ExpectedTimes(node, diagnostics, worker, self.change)
         self.arrivals = Arrivals()
         self._used: Received | None = None
         self._waiting: Received | None = (
@@ -118,7 +123,7 @@ class MapSource:
         self._inflate = Inflation()
         self._ready: Future | None = None
         # Before the subscription of the map: directions that come with a map are taken first.
-        self._directions = Directions(node, report, self._on_directions)
+        self._directions = Directions(node, diagnostics, self._on_directions)
         self._topic = node.create_subscription(
             OccupancyGrid, "map", self._take, LATCHED
         ).topic_name
@@ -156,7 +161,7 @@ class MapSource:
     def check(self) -> Header:
         """Return the header of the map or update that is planned on, or raise a RequestError."""
         self.look()
-        refused = self._report.refused.get("map")
+        refused = self._diagnostics.refused.get("map")
         because = f" ({refused})" if refused else ""
         if self._used is None:
             missing, since = (
@@ -201,7 +206,7 @@ class MapSource:
             description["map updates refused"] = str(
                 self._updates - self._applied_updates
             )
-        return description | self.times.told(self._report.outcome)
+        return description | self.times.told(self._diagnostics.outcome)
 
     def ready(self) -> Future:
         """Return the `GridMap` to plan on, with body and times: computed for the first request."""
@@ -236,17 +241,17 @@ class MapSource:
     def change(self) -> None:
         """Plan on what is new."""
         self._ready = None
-        self._report.change()
+        self._diagnostics.change()
         self._on_map()
 
     def _take(self, message: OccupancyGrid) -> None:
         try:
             grid = self._read(message, self._waiting or self._used)
         except (ValueError, MemoryError) as error:
-            self._report.refuse("map", str(error) or repr(error))
+            self._diagnostics.refuse("map", str(error) or repr(error))
             return
         self._waiting = Received(message, grid, message.header, self.arrivals.note())
-        self._report.accept("map_updates")
+        self._diagnostics.ok("map_updates")
         self.look()
 
     def _read(self, message: OccupancyGrid, last: Received | None = None) -> GridMap:
@@ -270,7 +275,7 @@ class MapSource:
     def _take_update(self, update: Any) -> None:
         """Plan on the map with other values in a box from now on, or refuse the update."""
         newest, self._updates = self._waiting or self._used, self._updates + 1
-        with self._report.taking("map_updates", often=True):
+        with self._diagnostics.receiving("map_updates", is_frequent=True):
             if newest is None:
                 raise ValueError(f"an update came before a map; {REMEDY}")
             values = updated_values(newest.message, update)
@@ -299,7 +304,7 @@ class MapSource:
         before, self._size = self._size, f"{size} in frame {self.frame!r}"
         if self._size != before:
             self._node.get_logger().info(f"map of {self._size}")
-        self._report.accept("map")
+        self._diagnostics.ok("map")
         self.change()
 
     def _keep_waiting(self, reason: str) -> None:
@@ -311,8 +316,8 @@ class MapSource:
         if is_lasting and kind != self._logged_reason:
             self._logged_reason = kind
             self._node.get_logger().warning(f"map refused: {reason}")
-        if reason != self._report.refused.get("map"):
-            self._report.refuse("map", reason, log=False)
+        if reason != self._diagnostics.refused.get("map"):
+            self._diagnostics.refuse("map", reason, log=False)
 
     def _on_directions(self) -> None:
         """Obey other directions on the map in use, or plan on it no more if some are required."""
@@ -333,9 +338,9 @@ class MapSource:
             received.forbidden = None
             if self._node.value("require_directions"):
                 return f"{error}, or set require_directions to false"
-            self._report.refuse(ONE_WAY_ZONES, str(error))
+            self._diagnostics.refuse(ONE_WAY_ZONES, str(error))
         else:
-            self._report.accept(ONE_WAY_ZONES)
+            self._diagnostics.ok(ONE_WAY_ZONES)
         return ""
 
 
@@ -386,13 +391,13 @@ class ExpectedTimes:
     def __init__(
         self,
         node: BaseNode,
-        report: Report,
+        diagnostics: PlannerDiagnostics,
         worker: Worker,
         on_change: Callable[[], None],
     ) -> None:
-        self._node, self._report, self._worker, self._on_change = (
+        self._node, self._diagnostics, self._worker, self._on_change = (
             node,
-            report,
+            diagnostics,
             worker,
             on_change,
         )
@@ -417,7 +422,7 @@ class ExpectedTimes:
 
     async def on_sent(self, message: UInt8MultiArray | None = None) -> None:
         """Plan by what drives taught, or refuse the trainer's message, or the file that is set."""
-        with self._report.taking("experience"):
+        with self._diagnostics.receiving("experience"):
             if await self._worker.call(self.load, message):
                 self._on_change()
 
@@ -431,7 +436,7 @@ class ExpectedTimes:
                 self._worker.call(self.describe, outcome),
             )
         if not self._forecast.done():
-            self._report.change()  # to look again soon
+            self._diagnostics.change()  # to look again soon
         is_refused = self._forecast.exception()  # as when no memory is left
         return {} if is_refused else self._forecast.result() or {}
 

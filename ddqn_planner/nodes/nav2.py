@@ -19,7 +19,7 @@ from ddqn_planner.nodes.other_planners import (
     OtherPlanners,
     action_name,
 )
-from ddqn_planner.nodes.report import ALL_GOALS, Outcome
+from ddqn_planner.nodes.outcome import ALL_GOALS, Outcome
 from ddqn_planner.nodes.runtime import BaseNode, apt_install
 from ddqn_planner.planning import PlanStatus
 

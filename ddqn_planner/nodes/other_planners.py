@@ -10,7 +10,7 @@ from rclpy.action.client import ActionClient
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.task import Future
 
-from ddqn_planner.nodes.report import Outcome
+from ddqn_planner.nodes.outcome import Outcome
 from ddqn_planner.nodes.runtime import SERVICE_QUALITY, STEADY, BaseNode
 
 GivenUp = Callable[[], Outcome | None]  # returns why a request is given up now, or None

@@ -15,30 +15,26 @@ from std_msgs.msg import UInt8MultiArray
 from ddqn_planner.experience import Experience
 from ddqn_planner.memory import give_back, llvm_was_used, reuse_small_arrays
 from ddqn_planner.model import model_of
+from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal
 from ddqn_planner.nodes.conversions import along, bytes_of, path_bytes, path_message
+from ddqn_planner.nodes.diagnostics import PlannerDiagnostics
 from ddqn_planner.nodes.display import FieldDisplay
 from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
+from ddqn_planner.nodes.model_source import ModelSource, read_model
 from ddqn_planner.nodes.nav2 import Planning as Nav2Planning
 from ddqn_planner.nodes.nav2 import Task, serve_nav2
 from ddqn_planner.nodes.other_planners import GivenUp, OtherPlanners, check_prefix
-from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
-from ddqn_planner.nodes.poses import Places, check_source
-from ddqn_planner.nodes.report import (
+from ddqn_planner.nodes.outcome import (
     NO_REQUEST,
     NOT_ACTIVE,
     STOPPING,
     Outcome,
-    Report,
     RequestError,
 )
-from ddqn_planner.nodes.requests import (
-    UNCHANGED,
-    ActiveGoal,
-    ModelSource,
-    Requests,
-    read_model,
-)
+from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
+from ddqn_planner.nodes.poses import Places, check_source
+from ddqn_planner.nodes.requests import Requests
 from ddqn_planner.nodes.runtime import (
     LATCHED,
     STEADY,
@@ -67,11 +63,11 @@ class PlannerNode(ManagedNode):
         super().__init__("planner", PLANNER_PARAMETERS)
         self._settings = self.settings()
         self._looks = self.create_timer(LOOK_PERIOD, self._on_look, clock=STEADY)
-        self._report = Report(self, self._look_soon)
+        self._diagnostics = PlannerDiagnostics(self, self._look_soon)
         self._worker, self._map_worker, self._display_worker = (
             Worker(self) for _ in range(3)
         )
-        self._model = ModelSource(self, self._report, self._worker)
+        self._model = ModelSource(self, self._diagnostics, self._worker)
         self.deactivate()
         self.add_post_set_parameters_callback(self._apply_parameters)
         if self._settings.autostart:
@@ -94,9 +90,9 @@ class PlannerNode(ManagedNode):
         # In a group of its own: triggers that come while it plans make it plan once more after.
         group = MutuallyExclusiveCallbackGroup()
         self._replan = self.create_guard_condition(self._plan_for_active_goal, group)
-        self._map = MapSource(self, self._report, self._map_worker, self._on_map)
+        self._map = MapSource(self, self._diagnostics, self._map_worker, self._on_map)
         self._places = Places(
-            self, self._report, lambda: self._map.frame, self._on_start
+            self, self._diagnostics, lambda: self._map.frame, self._on_start
         )
         inputs = self._map, self._places, self._model
         self._requests = Requests(
@@ -127,7 +123,7 @@ class PlannerNode(ManagedNode):
         """Answer requests from now on."""
         # What requests are answered, also those under way; None while the node is active.
         self._refusal: Outcome | None = None
-        self._report.change()
+        self._diagnostics.change()
         self._replan.trigger()
 
     def deactivate(self) -> None:
@@ -139,14 +135,14 @@ class PlannerNode(ManagedNode):
         self._followed: Outcome | None = None
         self._newest: Outcome | None = None
         self._logged: tuple[object, ...] = ()
-        self._report.change()
+        self._diagnostics.change()
 
     def cleanup(self) -> None:
         """Free the map, the model and its fields."""
         super().cleanup()
         self.deactivate()
-        self._report.refused.clear()
-        self._report.note(NO_REQUEST)
+        self._diagnostics.refused.clear()
+        self._diagnostics.note(NO_REQUEST)
         self.after_jump_back.clear()
         for name in ("_places", "_display", "_map", "_requests"):
             vars(self).pop(name, None)  # not all are there, if `configure` failed
@@ -212,7 +208,7 @@ class PlannerNode(ManagedNode):
         self._plan_for(self._active.poses)
 
     def _on_model(self, message: UInt8MultiArray) -> None:
-        with self._report.taking("trainer/model"):
+        with self._diagnostics.receiving("trainer/model"):
             data = bytes_of("model", message)
             if (
                 message.layout != self._model.layout
@@ -241,12 +237,14 @@ class PlannerNode(ManagedNode):
     def _on_goals(self, message: PoseStamped | PoseArray) -> None:
         poses = message.poses if isinstance(message, PoseArray) else [message.pose]
         if not poses:
-            self._report.refuse("goal_poses", "the array has no pose; give one or more")
+            self._diagnostics.refuse(
+                "goal_poses", "the array has no pose; give one or more"
+            )
         elif self._refusal is not None:
-            self._report.note(self._refusal)
-            self._report.log(self._refusal)
+            self._diagnostics.note(self._refusal)
+            self._diagnostics.log(self._refusal)
         else:
-            self._report.accept("goal_poses")
+            self._diagnostics.ok("goal_poses")
             self._plan_for(
                 [PoseStamped(header=message.header, pose=pose) for pose in poses]
             )
@@ -260,7 +258,7 @@ class PlannerNode(ManagedNode):
             goals, self._requests.plan(start, goals, request.tolerance)
         )
         (response.plan,) = _paths(outcome, path_message)
-        self._report.log(outcome)
+        self._diagnostics.log(outcome)
         return response
 
     async def _plan_for_active_goal(self) -> None:
@@ -279,7 +277,7 @@ class PlannerNode(ManagedNode):
         logged = goals, outcome.goal, outcome.status, outcome.plan.method
         if self._logged != logged:
             self._logged = logged
-            self._report.log(outcome, paths=True)
+            self._diagnostics.log(outcome, paths=True)
 
     def _publish(self, outcome: Outcome, active: ActiveGoal) -> None:
         if active.is_news(outcome):
@@ -304,7 +302,7 @@ class PlannerNode(ManagedNode):
             # It gets the better path with its next request.
             self._improve_later(outcome)
             self._plan_publisher.publish(to_publish)
-        self._report.log(outcome)
+        self._diagnostics.log(outcome)
         return path, outcome
 
     async def _ask_other_planner(
@@ -330,8 +328,8 @@ class PlannerNode(ManagedNode):
                 "FAILED", f"the other planner could not be asked ({error!r})"
             )
         if isinstance(answer, Outcome):
-            self._report.note(answer)
-            self._report.log(answer)
+            self._diagnostics.note(answer)
+            self._diagnostics.log(answer)
         return answer
 
     def _improve_later(self, outcome: Outcome) -> None:
@@ -389,7 +387,7 @@ class PlannerNode(ManagedNode):
             remedy = "give a smaller map, or another model"
             outcome = Outcome("FAILED", f"the planning failed ({error!r}); {remedy}")
         if outcome is not UNCHANGED:
-            self._report.note(outcome)
+            self._diagnostics.note(outcome)
         frame = self._map.frame or (goals[0].header.frame_id if goals else "")
         if outcome.goal is not None:  # the map may be another one by now
             frame = outcome.goal.header.frame_id
@@ -422,15 +420,15 @@ class PlannerNode(ManagedNode):
         if llvm_was_used.is_set() and not self._model.loading:
             llvm_was_used.clear()
             self._worker.call(give_back)
-        if self._report.is_due():
+        if self._diagnostics.is_due():
             missing += ["the model is being loaded"] if self._model.loading else []
-            fatal = self._model.planner is None and "model" in self._report.refused
+            fatal = self._model.planner is None and "model" in self._diagnostics.refused
             values = {
                 "state": self.state,
                 **self._model.describe(self._settings.move_rule),
             }
             values |= self._map.describe() if is_configured else {}
-            self._report.publish(fatal, "; ".join(filter(None, missing)), values)
+            self._diagnostics.publish(fatal, "; ".join(filter(None, missing)), values)
 
 
 def _paths(outcome: Outcome, *makers: Callable[..., Any]) -> list[Any]:

@@ -22,7 +22,8 @@ from ddqn_planner.nodes.conversions import (
     unit_quaternion,
     with_unit_quaternion,
 )
-from ddqn_planner.nodes.report import Refusals, RequestError
+from ddqn_planner.nodes.diagnostics import Diagnostics
+from ddqn_planner.nodes.outcome import RequestError
 from ddqn_planner.nodes.runtime import STEADY, BaseNode, apt_install
 
 READ_PERIOD, TF_DEPTH = (
@@ -246,7 +247,7 @@ def listen(
     node: BaseNode,
     topic: str,
     depth: int,
-    refusals: Refusals,
+    diagnostics: Diagnostics,
     take: Callable[[PoseStamped], None],
 ) -> Subscription:
     """Hand each pose of a topic of `TYPES` to a function, whose ValueError refuses it."""
@@ -255,7 +256,7 @@ def listen(
 
     def on_message(message: Any) -> None:
         pose = getattr(message.pose, "pose", message.pose)
-        with refusals.taking(topic, often=is_odometry):
+        with diagnostics.receiving(topic, is_frequent=is_odometry):
             take(PoseStamped(header=message.header, pose=pose))
 
     quality = QoSProfile(depth=depth)
@@ -271,12 +272,12 @@ class Places(Frames):
     def __init__(
         self,
         node: BaseNode,
-        report: Refusals,
+        diagnostics: Diagnostics,
         frame: Callable[[], str],
         plan: Callable[[], None],
     ) -> None:
         super().__init__(node, lambda: float(node.value("transform_tolerance")))
-        self._report, self._map_frame, self._plan = report, frame, plan
+        self._diagnostics, self._map_frame, self._plan = diagnostics, frame, plan
         self._pose: PoseStamped | None = None
         self._subscription: Any = None
         self.topic = ""
@@ -290,12 +291,14 @@ class Places(Frames):
         if topic == self.topic:
             return
         self._node.destroy_subscription(self._subscription)
-        self._report.accept(self.topic)
+        self._diagnostics.ok(self.topic)
         self.topic, self._pose, self._heard_from = topic, None, time.monotonic()
         if topic == "tf":
             self.listen()
         else:
-            self._subscription = listen(self._node, topic, 10, self._report, self._take)
+            self._subscription = listen(
+                self._node, topic, 10, self._diagnostics, self._take
+            )
 
     def _forget_odometry(self) -> None:
         if self.topic == "odom":

@@ -1,8 +1,6 @@
-"""From a request to its outcome: with the map, the parameters, and the model, loaded here."""
+"""From a request to its outcome, with the map, the parameters and the model."""
 
-import gc
 import math
-import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -10,15 +8,12 @@ from functools import partial
 from types import SimpleNamespace
 from typing import Any, TypeVar
 
-import numpy as np
 from geometry_msgs.msg import PoseStamped
 from rclpy.task import Future
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
-from ddqn_planner.grid.map_changes import shift_between
-from ddqn_planner.model import find_model
-from ddqn_planner.model.certificate import NO_CERTIFICATE
+from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal, path_under_way
 from ddqn_planner.nodes.conversions import (
     cell_from_pose,
     frame_of,
@@ -27,218 +22,24 @@ from ddqn_planner.nodes.conversions import (
     poses_of,
 )
 from ddqn_planner.nodes.map_source import MapSource
+from ddqn_planner.nodes.model_source import ModelSource
+from ddqn_planner.nodes.outcome import ALL_GOALS, Outcome, RequestError
 from ddqn_planner.nodes.poses import Places
-from ddqn_planner.nodes.report import (
-    ALL_GOALS,
-    Outcome,
-    Report,
-    Request,
-    RequestError,
-    reached,
-    reason_of,
-)
+from ddqn_planner.nodes.reasons import reached, reason_of
 from ddqn_planner.nodes.retries import FAILURES, Retries
-from ddqn_planner.nodes.runtime import BaseNode, Worker
-from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest, PlanStatus
+from ddqn_planner.nodes.runtime import Worker
+from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest
 from ddqn_planner.planning.exact_paths import NO_PATH, ExactPath, exact_path
 from ddqn_planner.planning.path_check import LETHAL, invalid_poses
-from ddqn_planner.planning.paths import rest_of_path
-from ddqn_planner.planning.plan import PosePlan, joined
+from ddqn_planner.planning.plan import joined
 from ddqn_planner.planning.pose_paths import points_of
 from ddqn_planner.planning.pose_planner import PoseRequest
 from ddqn_planner.robot.footprint import read_footprint
-from ddqn_planner.robot.motions import HEADINGS
-from ddqn_planner.warm_up import warm_up
 
-HEADING = (
-    2 * math.pi / HEADINGS
-)  # radians that a robot turns until that is a reason to plan
-REST_AFTER = (
-    1.0  # seconds until the rest is compiled: what waits for the model is planned first
-)
 THE_GOAL = "the goal"  # what errors call one
-UNCHANGED = Outcome("UNCHANGED", "the active goal needs no new plan")
+
 
 T = TypeVar("T")
-
-
-@dataclass
-class ActiveGoal:
-    """Decides when to plan again, and what to publish; the table in docs/nodes.md has the rules."""
-
-    poses: list[
-        PoseStamped
-    ]  # the last ``goal_pose``, or ``goal_poses``: the nearest one counts
-    period: float  # seconds between looks if something changed
-    followed: Outcome | None = (
-        None  # the last one whose path was published for this goal
-    )
-    last: Outcome = UNCHANGED
-    next_look: float = 0.0
-
-    @property
-    def lacks_pose(self) -> bool:
-        """Whether it waits for TF or odometry."""
-        return bool(self.poses) and self.last.status in ("NO_START", "TF_ERROR")
-
-    def is_look_due(self, lacks_map: bool) -> bool:
-        """Return whether it is time to look if something changed; the next plan does then."""
-        stopped = (
-            lacks_map and self.last.request is not None
-        )  # a costmap: its path is taken back
-        return bool(self.poses) and (stopped or time.monotonic() >= self.next_look)
-
-    def is_due(self, planner: Planner, request: Request, header: Header) -> bool:
-        """Return whether there is a reason to plan."""
-        last, now = self.last, time.monotonic()
-        if looks := self.period == 0 or now >= self.next_look:
-            self.next_look = now + self.period
-        # A map that came again as it was is planned on, so that the diagnostics name the last one.
-        known = last.request and _inputs_of(last.request, last.map_header)
-        if known == _inputs_of(request, header):
-            return False
-        shown = last.status, last.header.frame_id
-        is_followed = shown == (PlanStatus.SUCCEEDED.name, header.frame_id)
-        return looks or not is_followed or not len(_rest(planner, request))
-
-    def is_news(self, outcome: Outcome) -> bool:
-        """Return whether to publish the path of an outcome, which may be empty."""
-        shown, new = ((it.status, it.header.frame_id) for it in (self.last, outcome))
-        self.last, self.next_look = outcome, time.monotonic() + self.period
-        has_path = len(outcome.plan.path) > 0
-        is_news = shown != new or (has_path and outcome.plan.extra_cost is None)
-        if is_news and has_path:
-            self.followed = outcome
-        return is_news
-
-
-def _inputs_of(request: Request, header: Header | None) -> tuple[Any, ...]:
-    """Return what a plan for the active goal depends on: map, place, and heading of the robot."""
-    yaws = request.start[2:]  # of a body
-    return (
-        request.grid,
-        header,
-        request.cells[0],
-        *(round(yaw / HEADING) for yaw in yaws),
-    )
-
-
-def path_under_way(last: Outcome, request: Request, frame: str) -> Any:
-    """Return the last path in cells of a request's map; none if it has another place or form."""
-    if frame != last.header.frame_id:
-        return ()
-    plan, before = last.plan, last.request  # with another model perhaps
-    if isinstance(request, PoseRequest):
-        return plan.poses if isinstance(plan, PosePlan) else ()
-    if not isinstance(before, PlanRequest) or before.simplified != request.simplified:
-        return ()
-    if (shift := shift_between(before.grid, request.grid)) is None:
-        return ()
-    cells = plan.path + np.array(shift, np.int32)
-    return cells if request.grid.contains((*cells[-1].tolist(),)) else ()
-
-
-def _rest(planner: Planner, request: Request) -> Any:
-    """Return what is left of the path under way, if it is free and the robot near it."""
-    way, grid = request.under_way, request.grid
-    if isinstance(request, PlanRequest):
-        return rest_of_path(way, request.start, grid, request.move_rule)
-    assert planner.pose_planner is not None
-    return planner.pose_planner.rest_of(way, request.start, grid)
-
-
-def read_model(model: str) -> tuple[Planner, str]:
-    """Return a model's planner and file."""
-    path = find_model(model)
-    return Planner.load(path), str(path)
-
-
-class ModelSource:
-    """Has the planner with the last model that could be loaded, and its file."""
-
-    def __init__(self, node: BaseNode, report: Report, worker: Worker) -> None:
-        self.planner: Planner | None = None
-        self.file = ""
-        self.layout: Any = None  # of the message that the model came in
-        self._node, self.report, self._worker = node, report, worker
-        # The first model, while it is being loaded.
-        self.loading: Future | None = None
-
-    def load(self) -> None:
-        """Begin to load the first model, and to compile what many requests need."""
-
-        def read() -> tuple[Planner | None, str]:
-            try:
-                planner, file = read_model(self._node.value("model"))
-                compiling = warm_up(planner, self._node.value("follow_trainer"))
-                gc.set_threshold(
-                    20_000
-                )  # to compile and to plan makes hardly any garbage
-                next(compiling)
-            except Exception as error:
-                return (
-                    None,
-                    f"{str(error) or repr(error)}; or set the parameter 'model'",
-                )
-            gc.freeze()  # a collection of all that would stop the node for 45 ms
-            rest = threading.Timer(REST_AFTER, next, [compiling])
-            rest.daemon = True  # no end of the process waits for it
-            rest.start()
-            return planner, file
-
-        self.loading = self._worker.call(read)
-
-    async def first(self) -> None:
-        """Wait for the first model, and use it unless another one was set since."""
-        if (loading := self.loading) is None:
-            return
-        planner, said = await loading
-        if self.loading is loading and planner is not None:
-            self.use(planner, said)
-        elif self.loading is loading:
-            self.loading = None
-            self.report.refuse("model", said)
-
-    def use(self, planner: Planner, file: str, layout: Any = None) -> None:
-        """Plan with it from now on."""
-        self.planner, self.file, self.layout, self.loading = planner, file, layout, None
-        self.report.accept("model")
-        self.report.change()
-        self._node.get_logger().info(f"planning with the model {file}")
-
-    def on_reload(self) -> tuple[bool, str]:
-        """Load the file of the model again."""
-        parameter = self._node.get_parameter("model")  # to set it loads the model
-        if reason := str(self._node.set_parameters([parameter])[0].reason):
-            self._node.get_logger().error(f"the model was not loaded again: {reason}")
-        return not reason, reason or f"loaded {self.file}"
-
-    def describe(self, rule: str) -> dict[str, str]:
-        """Return what the diagnostics say of it, with the value of the parameter ``move_rule``."""
-        description = {"model": self._node.value("model")}
-        if self.planner is None:
-            return description
-        metadata, network = self.planner.metadata, self.planner.network
-        if body := self.planner.pose_planner:
-            description["model footprint (m)"] = str(body.footprint.tolist())
-        return description | {
-            "model file": self.file,
-            "move rule": rule or metadata.move_rule.value,
-            "model move rule": metadata.move_rule.value,
-            "model sizes": ", ".join(
-                f"{key} {size}" for key, size in metadata.sizes.items()
-            ),
-            "model training steps": str(metadata.steps),
-            "model certificate": str(
-                network.certificate(metadata.move_rule) or NO_CERTIFICATE
-            ),
-        }
-
-    def forget(self) -> None:
-        """Free the model and its fields, with what `read` kept from collection."""
-        self.planner, self.file, self.loading = None, "", None
-        gc.unfreeze()
-        gc.collect()
 
 
 @dataclass
@@ -489,7 +290,7 @@ class Requests:
         await self.model.first()
         planner = self.model.planner
         if planner is None:
-            refused = self.model.report.refused["model"]
+            refused = self.model.diagnostics.refused["model"]
             raise RequestError("NO_MODEL", f"no model is loaded: {refused}")
         planner.fields.nbytes = self.settings.field_cache_bytes
         return header, await ready, planner

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from geometry_msgs.msg import PoseStamped
 
-from ddqn_planner.nodes.report import Outcome
+from ddqn_planner.nodes.outcome import Outcome
 from ddqn_planner.planning import PlanStatus
 
 # What another costmap of the same place may change.

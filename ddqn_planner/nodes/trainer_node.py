@@ -24,10 +24,10 @@ from ddqn_planner.files import as_path
 from ddqn_planner.grid import Cell, MoveRule, read_map_file
 from ddqn_planner.nodes import conversions, runtime
 from ddqn_planner.nodes.declared import NAMESPACES, Declared
+from ddqn_planner.nodes.diagnostics import Diagnostics
 from ddqn_planner.nodes.driving import NO_MAP, Driving, Float64, MapInFrame, explained
 from ddqn_planner.nodes.parameters import MOVE_RULES, OF_MAPS
 from ddqn_planner.nodes.poses import check_source, listen
-from ddqn_planner.nodes.report import Refusals
 from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Worker
 from ddqn_planner.resources import find_map
 from ddqn_planner.training.episodes import read_cells
@@ -95,7 +95,7 @@ class TrainerNode(BaseNode):
         self._has_begun = False
         super().__init__("trainer", PARAMETERS)
         self.map: MapInFrame | None = None
-        self.refusals = Refusals(self)
+        self.diagnostics = Diagnostics(self)
         self.worker = Worker(self)
         self.state, self.error, self.save_error = "idle", "", ""
         self._replaying: Timer | None = None
@@ -119,7 +119,7 @@ class TrainerNode(BaseNode):
         else:
             self._rewards = self.create_publisher(Float32, "~/average_reward", 100)
             for which, topic in (("start", "initialpose"), ("goal", "goal_pose")):
-                listen(self, topic, 10, self.refusals, partial(self._on_pose, which))
+                listen(self, topic, 10, self.diagnostics, partial(self._on_pose, which))
             # While the node answers already; only ~/start waits for it.
             self._imported = self.worker.call(import_training)
         services |= {"start": self._learner.start, "save": self._learner.save}
@@ -165,7 +165,7 @@ class TrainerNode(BaseNode):
                 at.x, at.y = grid.cell_to_world(cell)
 
     def _on_map(self, message: OccupancyGrid) -> None:
-        with self.refusals.taking("map"):
+        with self.diagnostics.receiving("map"):
             grid = conversions.grid_from_message(message, *map(self.value, OF_MAPS))
             self.map = MapInFrame(grid, message.header.frame_id)
             self.get_logger().info(f"map of {grid.width} x {grid.height} cells")
@@ -210,7 +210,7 @@ class TrainerNode(BaseNode):
         """Publish the state, what was refused and failed, and what is still missing."""
         values = self._learner.look()
         problems = [
-            *self.refusals.problems(),
+            *self.diagnostics.problems(),
             *filter(None, [self.save_error, self.error]),
         ]
         level = DiagnosticStatus.ERROR if problems else DiagnosticStatus.OK
@@ -219,7 +219,9 @@ class TrainerNode(BaseNode):
             level = max(level, DiagnosticStatus.WARN)
         what = "driving" if self._is_driving else "training"
         values = {"state": self.state, **values}
-        self.refusals.tell(what, level, "; ".join(problems) or self.state, values)
+        self.diagnostics.publish_status(
+            what, level, "; ".join(problems) or self.state, values
+        )
 
     def _on_stop(self) -> tuple[bool, str]:
         """Stop what the node does."""
@@ -299,7 +301,7 @@ class TrainerNode(BaseNode):
         except Exception as error:  # the node must survive any error
             return self.fail("the training cannot start", error)
         self.state, self.error, self.save_error = "training", "", ""
-        self.refusals.refused.clear()
+        self.diagnostics.refused.clear()
         self._run, self._run_map, self._first_step = run, place, run.trainer.steps
         run.on_saved = self._tell_saved
         self.get_logger().info(run.description)

@@ -191,10 +191,10 @@ def run_robot(
 
 WAITING = """
 import os, time
-from ddqn_planner.nodes import report
+from ddqn_planner.nodes import outcome
 from ddqn_planner.planning import Planner
 
-load, report.PATIENCE = Planner.load, {patience}
+load, outcome.PATIENCE = Planner.load, {patience}
 
 def wait_and_load(path):
     while os.path.basename(path) == "any_map.safetensors" and not os.path.exists({gate!r}):

@@ -29,8 +29,8 @@ from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.model import save_model
+from ddqn_planner.nodes.diagnostics import seconds
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
-from ddqn_planner.nodes.report import seconds
 from ddqn_planner.nodes.runtime import LATCHED
 
 START, GOAL = (0, 0), (5, 5)

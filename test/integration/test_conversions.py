@@ -38,8 +38,9 @@ from ddqn_planner.nodes.conversions import (
     rotation,
     with_unit_quaternion,
 )
+from ddqn_planner.nodes.diagnostics import Diagnostics
+from ddqn_planner.nodes.outcome import RequestError
 from ddqn_planner.nodes.poses import CheckedTransforms, Frames, Places, transformed
-from ddqn_planner.nodes.report import Refusals, RequestError
 
 HEADER = Header(frame_id="map")
 
@@ -349,7 +350,7 @@ NOW = 111  # seconds of the node's clock
 
 
 def new_node(source: str = "tf") -> Mock:
-    """Return what `Places` and `Refusals` ask of a node."""
+    """Return what `Places` and `Diagnostics` ask of a node."""
     values = {"start_source": source, "robot_frame": "odom", "transform_tolerance": 5.0}
     node = Mock(after_jump_back=[], value=values.__getitem__)
     node.create_subscription = lambda _, topic, *__: SimpleNamespace(topic_name=topic)
@@ -414,7 +415,7 @@ def test_a_newest_transform_beyond_the_tolerance_is_not_used(listening: Any) -> 
     for stamp, words in (late | dict.fromkeys((NOW - 2, NOW + 2, 0), "")).items():
         listening(stamp)
         node = new_node()
-        places = Places(node, Refusals(node), lambda: "map", lambda: None)
+        places = Places(node, Diagnostics(node), lambda: "map", lambda: None)
         goal_in_map = partial(places.to_map, "the goal", pose_at(0), "map")
         if words:
             why = f"(the newest is {words}, more than transform_tolerance, 5 s)"
@@ -442,7 +443,7 @@ def test_transforms_from_before_the_clock_jumped_back_are_forgotten(
 
 def test_a_set_start_outlives_time_and_a_jump_of_the_clock() -> None:
     node, pose = new_node("initialpose"), pose_at(NOW, "map")
-    places = Places(node, Refusals(node), lambda: "map", lambda: None)
+    places = Places(node, Diagnostics(node), lambda: "map", lambda: None)
     places._take(pose)
     for forget in node.after_jump_back:
         forget()

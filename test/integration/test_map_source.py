@@ -31,6 +31,7 @@ from ddqn_planner.nodes.conversions import (
     grid_from_message,
     occupancy_message,
 )
+from ddqn_planner.nodes.diagnostics import PlannerDiagnostics
 from ddqn_planner.nodes.map_source import (
     BODY_PARAMETERS,
     MAP_PARAMETERS,
@@ -38,8 +39,8 @@ from ddqn_planner.nodes.map_source import (
     MapSource,
     updated_values,
 )
+from ddqn_planner.nodes.outcome import Outcome, RequestError
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
-from ddqn_planner.nodes.report import Outcome, Report, RequestError
 from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
 from ddqn_planner.planning import PlanRequest
 
@@ -63,8 +64,8 @@ class Source(MapSource):
     """A source of maps which has what the test gives it, and says what the planner would know."""
 
     def __init__(self, node: BaseNode) -> None:
-        self.heard, self.report = 0, Report(node)
-        super().__init__(node, self.report, Worker(node), self._hear)
+        self.heard, self.diagnostics = 0, PlannerDiagnostics(node)
+        super().__init__(node, self.diagnostics, Worker(node), self._hear)
 
     def _hear(self) -> None:
         self.heard += 1
@@ -255,13 +256,13 @@ def test_after_updates_the_map_is_as_if_it_came_whole(
         assert (whole.frame, whole.grid().resolution) == (frame, moved[0])
         assert whole.grid().origin == pytest.approx(moved[1])
     whole._take(occupancy_message(values, *place, Header()))
-    assert "frame is ''" in whole.report.refused["map"]
+    assert "frame is ''" in whole.diagnostics.refused["map"]
     said = {"map stamp (s)": "11.000000000", "map updates applied": "10"}
     assert said.items() <= source.describe().items()
 
 
 def test_refused_updates_are_counted_and_change_nothing(source: Source) -> None:
-    refused = source.report.refused
+    refused = source.diagnostics.refused
     source._take_update(update())
     assert refused["map_updates"].startswith("an update came before a map")
     assert source.missing
@@ -333,7 +334,7 @@ def test_the_first_map_waits_for_directions_that_are_published(source: Source) -
     assert not source.heard
     assert source.on_directions(1) == (1, EAST)
     assert source.heard == 1
-    assert not source.report.refused
+    assert not source.diagnostics.refused
 
 
 @pytest.mark.usefixtures("published")
@@ -363,13 +364,13 @@ def test_the_map_of_another_map_server_waits_for_its_directions(
     try:
         wait_for("publisher", lambda: node.count_publishers("map_directions") > 0)
         assert source.on_map(2) == (1, EAST)
-        assert source.report.refused["map"]
+        assert source.diagnostics.refused["map"]
         set_before = source.heard
         source.apply_parameters({"robot_radius"})  # the map in use stays
         assert source.used() == (1, EAST)
         assert source.heard > set_before
         assert source.on_directions(2, WEST) == (2, WEST)
-        assert not source.report.refused
+        assert not source.diagnostics.refused
     finally:
         node.destroy_publisher(publisher)
         wait_for(
@@ -406,7 +407,7 @@ def test_directions_hold_where_they_overlap_a_map_whatever_the_stamps(
     ):  # also older than the map
         assert source.on_directions(stamp, value) == (10, value or None)
     assert source.heard == 4
-    assert not source.report.refused
+    assert not source.diagnostics.refused
 
 
 def test_directions_are_required_once(
@@ -446,7 +447,7 @@ def test_why_a_map_waits_for_directions_is_logged_once(
         logged.clear()
         for stamp in range(10, 16):
             source.on_map(stamp, **changes[stamp % len(changes)])
-            assert "map" in source.report.refused
+            assert "map" in source.diagnostics.refused
             now[0] += 0.5
         now[0] += 2.0
         source.look()
@@ -485,22 +486,22 @@ def test_directions_that_cannot_hold_are_named_or_their_map_is_refused(
 ) -> None:
     assert source.on_map(2, **changes) == (2, None)
     assert source.on_directions(1) == (2, None)
-    assert reason in source.report.refused["one-way zones"]
+    assert reason in source.diagnostics.refused["one-way zones"]
     set_parameters(require_directions=True)
     assert source.used() == NOTHING
     assert reason in source.missing
     assert source.on_map(3) == (3, EAST)
-    assert not source.report.refused
+    assert not source.diagnostics.refused
     assert source.on_map(4, **changes) == (3, EAST)
-    assert reason in source.report.refused["map"]
+    assert reason in source.diagnostics.refused["map"]
     assert source.on_directions(4, None) == (4, None)
-    assert not source.report.refused
+    assert not source.diagnostics.refused
     source.on_directions(5)
     set_parameters(require_directions=False)
     assert source.used() == (4, None)
-    assert reason in source.report.refused["one-way zones"]
+    assert reason in source.diagnostics.refused["one-way zones"]
     assert source.on_map(5) == (5, EAST)
-    assert not source.report.refused
+    assert not source.diagnostics.refused
 
 
 def test_maps_with_equal_zones_are_compared_by_their_patches(source: Source) -> None:
@@ -520,10 +521,10 @@ def test_malformed_directions_leave_those_before_them(source: Source) -> None:
     broken = directions_of(2)
     broken.data = broken.data[:-1]
     source._directions.take(broken)
-    assert "20" in source.report.refused["map_directions"]
+    assert "20" in source.diagnostics.refused["map_directions"]
     assert source.on_map(1) == (1, EAST)
     source.on_directions(1)
-    assert "map_directions" not in source.report.refused
+    assert "map_directions" not in source.diagnostics.refused
 
 
 def test_a_worker_leaves_out_what_was_given_up_before_its_turn(node: BaseNode) -> None:
@@ -598,7 +599,7 @@ def test_drives_are_planned_with_at_once(
         (UInt8MultiArray(data=data), "label ''"),
     ):
         finished(source.times.on_sent(bad))
-        assert reason in source.report.refused["experience"]
+        assert reason in source.diagnostics.refused["experience"]
     assert source.heard == 0
     np.testing.assert_array_equal(source.slowness(), expected)
     finished(source.times.on_sent(message_of(Experience(0.5))))
@@ -618,13 +619,13 @@ def test_a_file_is_planned_with_or_refused_or_none_is_set(
     set_parameters(experience=str(tmp_path))
     for problem in ("", "cannot be read"):
         finished(source.times.on_sent())
-        assert problem in source.report.refused.get("experience", "")
+        assert problem in source.diagnostics.refused.get("experience", "")
         assert source.slowness()[20, 60] > 2
         file.write_bytes(bytes(driven.data)[:-9])
     set_parameters(experience="")
     finished(source.times.on_sent())
     assert source.slowness() is None
-    assert "experience" not in source.report.refused
+    assert "experience" not in source.diagnostics.refused
     finished(source.times.on_sent(driven))
     assert source.slowness()[20, 60] > 2
 
@@ -661,7 +662,7 @@ def test_what_no_memory_was_left_for_is_refused_or_tried_again(
         source._take(changed)
         patch.setattr(source.times, "load", fail)
         finished(source.times.on_sent())
-        assert source.report.refused == dict.fromkeys(
+        assert source.diagnostics.refused == dict.fromkeys(
             ("map", "experience"), "MemoryError()"
         )
     assert source.used() == (1, None)
@@ -692,7 +693,7 @@ def test_the_expected_time_is_told_as_soon_as_the_worker_has_it(
 ) -> None:
     threads, gate, told = set[int](), threading.Event(), {"expected time (s)": "1.0"}
     monkeypatch.setattr(
-        source.report, "_on_change", lambda: threads.add(threading.get_ident())
+        source.diagnostics, "_on_change", lambda: threads.add(threading.get_ident())
     )
     monkeypatch.setattr(source.times, "describe", lambda _: gate.wait() and told)
     outcome = Outcome("SUCCEEDED", "a path")

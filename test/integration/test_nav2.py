@@ -36,8 +36,8 @@ from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes import nav2
 from ddqn_planner.nodes.nav2 import PREEMPTED, PathAction, Task, error_code, poses_of
 from ddqn_planner.nodes.other_planners import GivenUp
+from ddqn_planner.nodes.outcome import NOT_ACTIVE, Outcome, RequestError
 from ddqn_planner.nodes.planner_node import PlannerNode
-from ddqn_planner.nodes.report import NOT_ACTIVE, Outcome, RequestError
 from ddqn_planner.nodes.requests import check_request
 from ddqn_planner.nodes.runtime import SERVICE_QUALITY, unless
 from ddqn_planner.planning import Plan, PlanStatus

@@ -40,7 +40,7 @@ from std_srvs.srv import Trigger
 
 from ddqn_planner.model import find_model
 from ddqn_planner.nodes.conversions import bytes_message, rotation
-from ddqn_planner.nodes.report import seconds
+from ddqn_planner.nodes.diagnostics import seconds
 from ddqn_planner.nodes.runtime import LATCHED
 
 

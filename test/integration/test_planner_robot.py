@@ -288,7 +288,7 @@ class TransformListener:
 """As much of tf2_ros as the node uses, which is no package of PyPI: one transform, no tree."""
 
 
-PATIENT = "from ddqn_planner.nodes import report; report.PATIENCE = 3.0  # on a loaded machine"
+PATIENT = "from ddqn_planner.nodes import outcome; outcome.PATIENCE = 3.0  # on a loaded machine"
 
 
 @pytest.fixture(scope="module")

@@ -24,8 +24,8 @@ from std_msgs.msg import Header
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.map_source import Arrivals
 from ddqn_planner.nodes.nav2 import CANCELED, Task
+from ddqn_planner.nodes.outcome import NOT_ACTIVE, STOPPING, Outcome
 from ddqn_planner.nodes.planner_node import IDLE_PERIOD, PlannerNode
-from ddqn_planner.nodes.report import NOT_ACTIVE, STOPPING, Outcome
 from ddqn_planner.nodes.retries import Retries
 from ddqn_planner.nodes.runtime import FAREWELL
 from ddqn_planner.planning import Plan, PlanRequest, PlanStatus

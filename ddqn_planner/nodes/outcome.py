@@ -1,0 +1,76 @@
+"""The outcome of a request: a plan, or a status with its reason and a remedy."""
+
+import math
+import time
+from dataclasses import dataclass, field
+
+from geometry_msgs.msg import PoseStamped
+from std_msgs.msg import Header
+
+from ddqn_planner.planning import Plan, Planner, PlanRequest, PlanStatus
+from ddqn_planner.planning.exact_paths import NO_PATH, ExactPath
+from ddqn_planner.planning.plan import PosePlan
+from ddqn_planner.planning.pose_planner import PoseRequest
+
+Request = PlanRequest | PoseRequest
+
+# Seconds in which a new listener hears a first map, odometry or TF, at a load of 20.
+PATIENCE = 5.0
+ALL_GOALS = -1  # as in ComputePathThroughPoses
+
+
+class RequestError(ValueError):
+    """A request cannot be handed to the planner.
+
+    Parameters
+    ----------
+    status : str
+        For `Outcome.status`.
+    reason : str
+        What is wrong, and what to do.
+    listening_since : float
+        When the node began to listen to what is missing, by the steady clock. Just
+        after that the missing message `may_come`.
+    """
+
+    def __init__(
+        self, status: str, reason: str, listening_since: float = -math.inf
+    ) -> None:
+        super().__init__(reason)
+        self.status = status
+        self.may_come = time.monotonic() - listening_since < PATIENCE
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The answer to a request; without planner and request if it is not well-formed."""
+
+    status: str  # the name of a `PlanStatus`, or that of a `RequestError`
+    reason: str
+    planner: Planner | None = None
+    request: Request | None = None
+    plan: Plan = field(default_factory=lambda: Plan(PlanStatus.NO_PATH))
+    goal: PoseStamped | None = None  # in the map's frame
+    map_header: Header | None = None  # of the map that it was planned on
+    # Of a disc, between exact poses; empty for a body.
+    path: ExactPath = field(default=NO_PATH, compare=False)
+    is_dense: bool = False  # whether its path has a pose at least every cell
+    header: Header = field(default_factory=Header)  # of its path
+    # Of several goals, the index of the goal where the path ends.
+    last_reached: int = ALL_GOALS
+
+    @property
+    def length(self) -> float:
+        """Length of its path in cells."""
+        return self.plan.length if isinstance(self.plan, PosePlan) else self.path.length
+
+
+NO_REQUEST = Outcome("NO_REQUEST", "no plan was asked for yet")
+STOPPING = Outcome(
+    "NOT_ACTIVE", "the node is being stopped; start it again, and ask again"
+)
+NOT_ACTIVE = Outcome(
+    "NOT_ACTIVE",
+    "the node is not active; configure and activate it, "
+    "with a lifecycle manager or `ros2 lifecycle set`",
+)
