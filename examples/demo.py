@@ -10,7 +10,7 @@ import numpy as np
 from nav_msgs.msg import OccupancyGrid, Path
 
 from ddqn_planner.grid import MoveRule, path_length, read_map_file, shortest_distances
-from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.pictures import MAX_TEXT_WIDTH, draw_text, save_picture
 from ddqn_planner.resources import find_map
 

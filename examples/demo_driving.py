@@ -18,7 +18,7 @@ from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from ddqn_planner.experience.drives import ARRIVAL_DISTANCE
 from ddqn_planner.grid import Cell
 from ddqn_planner.nodes.driving import SLOWEST
-from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.planning import Planner
 
 sys.path.insert(0, str(FilePath(__file__).resolve().parents[1] / "experiments"))

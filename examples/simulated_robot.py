@@ -13,7 +13,9 @@ from rclpy.node import Node
 from std_msgs.msg import Header
 
 from ddqn_planner.experience.drives import ARRIVAL_DISTANCE
-from ddqn_planner.nodes.runtime import LATCHED, STEADY, spin_until_shutdown
+from ddqn_planner.nodes.clocks import STEADY
+from ddqn_planner.nodes.quality import LATCHED
+from ddqn_planner.nodes.spinning import spin_until_shutdown
 
 sys.path.insert(0, str(FilePath(__file__).resolve().parents[1] / "experiments"))
 from client import RobotPoses

@@ -18,7 +18,7 @@ from processes import claim_ros_domain, executable, run_script, running
 from tables import table
 
 from ddqn_planner import GridMap
-from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.nodes.quality import LATCHED
 
 CLEARS = 20
 FREQUENCIES = (2.0, 5.0)  # Hz

@@ -26,7 +26,7 @@ from tables import table
 from ddqn_planner.grid import OCCUPIED, MapFile
 from ddqn_planner.grid.noise import MAX_NEW_OBSTACLES, random_requests
 from ddqn_planner.model import load_model
-from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.training.environment import paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import Trainer

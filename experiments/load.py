@@ -24,7 +24,7 @@ from tables import report
 
 from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.nodes.nav2 import QUEUES
-from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.nodes.quality import LATCHED
 
 REQUESTS, CLIENTS, CHANGES, GOALS_PER_MAP = 10_000, 8, 50, 40
 WARM_UP = (

@@ -15,7 +15,7 @@ from tables import report
 
 from ddqn_planner import Planner
 from ddqn_planner.grid import read_map_file
-from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.resources import find_map
 
 PLANS, LARGE, RELOADS, FIRST_RELOADS = 8, 2000, 1500, 50

@@ -26,7 +26,7 @@ from tables import report
 from ddqn_planner import Planner
 from ddqn_planner.grid import OCCUPIED, MapFile, read_map_file
 from ddqn_planner.grid.noise import random_requests
-from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.resources import find_map
 
 BARE = [sys.executable, str(Path(__file__).with_name("bare_service.py"))]

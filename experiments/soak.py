@@ -28,7 +28,7 @@ from tables import report
 
 from ddqn_planner import MoveRule, Planner
 from ddqn_planner.grid import Cell
-from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.nodes.quality import LATCHED
 
 sys.path.insert(0, str(FilePath(__file__).resolve().parents[1] / "examples"))
 from simulated_robot import STEP, Robot

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
+from ddqn_planner.nodes.base_node import BaseNode
 from ddqn_planner.nodes.outcome import NO_REQUEST, Outcome
-from ddqn_planner.nodes.runtime import BaseNode
 
 PERIOD = 0.9  # seconds between diagnostics when nothing changes: until the next look
 

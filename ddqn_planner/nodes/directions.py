@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.one_way import forbidden_on
+from ddqn_planner.nodes.base_node import BaseNode
 from ddqn_planner.nodes.conversions import grid_from_message
 from ddqn_planner.nodes.diagnostics import PlannerDiagnostics
-from ddqn_planner.nodes.runtime import LATCHED, BaseNode
+from ddqn_planner.nodes.quality import LATCHED
 
 DIRECTIONS = "map_directions"
 PUBLISHER_WAIT = 1.0  # seconds for the first message of a publisher that was discovered

@@ -17,7 +17,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 from ddqn_planner.grid import MOVES, GridMap
 from ddqn_planner.nodes.conversions import occupancy_message
 from ddqn_planner.nodes.outcome import Outcome
-from ddqn_planner.nodes.runtime import LATCHED, Worker
+from ddqn_planner.nodes.quality import LATCHED
+from ddqn_planner.nodes.worker import Worker
 from ddqn_planner.planning import QField
 from ddqn_planner.planning.plan import PosePlan
 from ddqn_planner.robot.motions import turn_between

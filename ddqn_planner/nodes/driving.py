@@ -24,9 +24,10 @@ from ddqn_planner.experience.drives import (
     read_drives,
 )
 from ddqn_planner.grid import GridMap
+from ddqn_planner.nodes.clocks import STEADY
 from ddqn_planner.nodes.conversions import occupancy_message
 from ddqn_planner.nodes.poses import Frames, listen
-from ddqn_planner.nodes.runtime import LATCHED, STEADY
+from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.resources import with_remedy
 
 if TYPE_CHECKING:

@@ -15,8 +15,10 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from rclpy.timer import Timer
 
+from ddqn_planner.nodes.base_node import BaseNode
+from ddqn_planner.nodes.clocks import STEADY
 from ddqn_planner.nodes.declared import Parameters
-from ddqn_planner.nodes.runtime import STEADY, BaseNode, apt_install
+from ddqn_planner.nodes.ros_packages import apt_install
 
 BEAT_PERIOD, BEAT_TIMEOUT = (
     0.5,

@@ -15,9 +15,11 @@ from ddqn_planner.grid import OCCUPIED, Cell, GridMap, MapFile, MoveRule, read_m
 from ddqn_planner.grid.map_file import MapDataError, MapMetadataError, MapNotFoundError
 from ddqn_planner.grid.moves import shortest_path
 from ddqn_planner.grid.noise import scatter_obstacles
+from ddqn_planner.nodes.base_node import BaseNode
 from ddqn_planner.nodes.conversions import occupancy_message
 from ddqn_planner.nodes.declared import Declared
-from ddqn_planner.nodes.runtime import LATCHED, BaseNode, spin_until_shutdown
+from ddqn_planner.nodes.quality import LATCHED
+from ddqn_planner.nodes.spinning import spin_until_shutdown
 from ddqn_planner.resources import PACKAGE, find_map
 
 RESULTS: dict[type[Exception], int] = {

@@ -21,11 +21,14 @@ from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.boxes import boxes_of
 from ddqn_planner.grid.inflation import Inflation
 from ddqn_planner.nodes import conversions
+from ddqn_planner.nodes.base_node import BaseNode
 from ddqn_planner.nodes.conversions import MAP_PARAMETERS, grid_from_message
 from ddqn_planner.nodes.diagnostics import PlannerDiagnostics, seconds
 from ddqn_planner.nodes.directions import PUBLISHER_WAIT, Directions, Forbidden
 from ddqn_planner.nodes.outcome import NO_REQUEST, Outcome, RequestError
-from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker, apt_install
+from ddqn_planner.nodes.quality import LATCHED
+from ddqn_planner.nodes.ros_packages import apt_install
+from ddqn_planner.nodes.worker import Worker
 
 try:
     from map_msgs.msg import OccupancyGridUpdate

@@ -8,8 +8,9 @@ from rclpy.task import Future
 
 from ddqn_planner.model import find_model
 from ddqn_planner.model.certificate import NO_CERTIFICATE
+from ddqn_planner.nodes.base_node import BaseNode
 from ddqn_planner.nodes.diagnostics import PlannerDiagnostics
-from ddqn_planner.nodes.runtime import BaseNode, Worker
+from ddqn_planner.nodes.worker import Worker
 from ddqn_planner.planning import Planner
 from ddqn_planner.warm_up import warm_up
 

@@ -12,6 +12,7 @@ from rclpy.action.server import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 
+from ddqn_planner.nodes.base_node import BaseNode
 from ddqn_planner.nodes.other_planners import (
     ACTIONS,
     QUEUES,
@@ -20,7 +21,7 @@ from ddqn_planner.nodes.other_planners import (
     action_name,
 )
 from ddqn_planner.nodes.outcome import ALL_GOALS, Outcome
-from ddqn_planner.nodes.runtime import BaseNode, apt_install
+from ddqn_planner.nodes.ros_packages import apt_install
 from ddqn_planner.planning import PlanStatus
 
 # Returns the answer of another planner to a goal's handle, or the outcome if there is none.

@@ -10,8 +10,10 @@ from rclpy.action.client import ActionClient
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.task import Future
 
+from ddqn_planner.nodes.base_node import BaseNode
+from ddqn_planner.nodes.clocks import STEADY
 from ddqn_planner.nodes.outcome import Outcome
-from ddqn_planner.nodes.runtime import SERVICE_QUALITY, STEADY, BaseNode
+from ddqn_planner.nodes.quality import SERVICE_QUALITY
 
 GivenUp = Callable[[], Outcome | None]  # returns why a request is given up now, or None
 

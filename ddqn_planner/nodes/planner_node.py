@@ -16,6 +16,7 @@ from ddqn_planner.experience import Experience
 from ddqn_planner.memory import give_back, llvm_was_used, reuse_small_arrays
 from ddqn_planner.model import model_of
 from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal
+from ddqn_planner.nodes.clocks import STEADY
 from ddqn_planner.nodes.conversions import along, bytes_of, path_bytes, path_message
 from ddqn_planner.nodes.diagnostics import PlannerDiagnostics
 from ddqn_planner.nodes.display import FieldDisplay
@@ -33,15 +34,12 @@ from ddqn_planner.nodes.outcome import (
     RequestError,
 )
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
+from ddqn_planner.nodes.pending_requests import unless
 from ddqn_planner.nodes.poses import Places, check_source
+from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.nodes.requests import Requests
-from ddqn_planner.nodes.runtime import (
-    LATCHED,
-    STEADY,
-    Worker,
-    spin_until_shutdown,
-    unless,
-)
+from ddqn_planner.nodes.spinning import spin_until_shutdown
+from ddqn_planner.nodes.worker import Worker
 from ddqn_planner.planning import Planner
 from ddqn_planner.planning.plan import PosePlan
 from ddqn_planner.planning.segments import SAME_COST

@@ -15,6 +15,8 @@ from rclpy.subscription import Subscription
 from rclpy.time import Time
 
 from ddqn_planner.grid.rotations import Rotation
+from ddqn_planner.nodes.base_node import BaseNode
+from ddqn_planner.nodes.clocks import STEADY
 from ddqn_planner.nodes.conversions import (
     check_pose,
     quaternion,
@@ -24,7 +26,7 @@ from ddqn_planner.nodes.conversions import (
 )
 from ddqn_planner.nodes.diagnostics import Diagnostics
 from ddqn_planner.nodes.outcome import RequestError
-from ddqn_planner.nodes.runtime import STEADY, BaseNode, apt_install
+from ddqn_planner.nodes.ros_packages import apt_install
 
 READ_PERIOD, TF_DEPTH = (
     0.5,

@@ -27,7 +27,7 @@ from ddqn_planner.nodes.outcome import ALL_GOALS, Outcome, RequestError
 from ddqn_planner.nodes.poses import Places
 from ddqn_planner.nodes.reasons import reached, reason_of
 from ddqn_planner.nodes.retries import FAILURES, Retries
-from ddqn_planner.nodes.runtime import Worker
+from ddqn_planner.nodes.worker import Worker
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest
 from ddqn_planner.planning.exact_paths import NO_PATH, ExactPath, exact_path
 from ddqn_planner.planning.path_check import LETHAL, invalid_poses

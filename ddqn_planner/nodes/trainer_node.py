@@ -22,13 +22,17 @@ from ddqn_planner.experience import Experience
 from ddqn_planner.experience.experience import SPEEDS, WIDTHS
 from ddqn_planner.files import as_path
 from ddqn_planner.grid import Cell, MoveRule, read_map_file
-from ddqn_planner.nodes import conversions, runtime
+from ddqn_planner.nodes import conversions
+from ddqn_planner.nodes.base_node import BaseNode
+from ddqn_planner.nodes.clocks import STEADY
 from ddqn_planner.nodes.declared import NAMESPACES, Declared
 from ddqn_planner.nodes.diagnostics import Diagnostics
 from ddqn_planner.nodes.driving import NO_MAP, Driving, Float64, MapInFrame, explained
 from ddqn_planner.nodes.parameters import MOVE_RULES, OF_MAPS
 from ddqn_planner.nodes.poses import check_source, listen
-from ddqn_planner.nodes.runtime import LATCHED, STEADY, BaseNode, Worker
+from ddqn_planner.nodes.quality import LATCHED
+from ddqn_planner.nodes.spinning import spin_until_shutdown
+from ddqn_planner.nodes.worker import Worker
 from ddqn_planner.resources import find_map
 from ddqn_planner.training.episodes import read_cells
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -405,4 +409,4 @@ def import_training() -> None:
         import_module("ddqn_planner.training.run")
 
 
-main = partial(runtime.spin_until_shutdown, TrainerNode, PARAMETERS)
+main = partial(spin_until_shutdown, TrainerNode, PARAMETERS)

@@ -31,7 +31,7 @@ from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.model import save_model
 from ddqn_planner.nodes.diagnostics import seconds
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
-from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.nodes.quality import LATCHED
 
 START, GOAL = (0, 0), (5, 5)
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR

@@ -16,7 +16,7 @@ from nav_msgs.msg import Path as PathMessage
 from processes import running
 
 from ddqn_planner.grid import path_length
-from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.training.environment import Scenario
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -22,7 +22,7 @@ from ddqn_planner.grid import (
     shortest_distances,
 )
 from ddqn_planner.nodes.display import MAX_ARROWS, policy_message, value_message
-from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.planning import QField
 
 HEADER = Header(frame_id="map")

@@ -27,7 +27,7 @@ from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience.drives import read_drives
 from ddqn_planner.nodes.conversions import bytes_message, bytes_of
 from ddqn_planner.nodes.driving import NAVIGATION
-from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.nodes.quality import LATCHED
 
 VALUES = np.zeros((40, 100), dtype=np.int8)
 VALUES[16:26, 15:85] = 100

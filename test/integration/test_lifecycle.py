@@ -28,7 +28,7 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.utilities import try_shutdown
 
 from ddqn_planner.nodes.planner_node import PlannerNode
-from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.nodes.trainer_node import TrainerNode
 
 LABELS = ("configure", "activate", "deactivate", "cleanup", "shutdown")

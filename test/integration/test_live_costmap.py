@@ -14,7 +14,7 @@ from integration.robot import WARN, Robot, repeating
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import GridMap
-from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.nodes.quality import LATCHED
 
 DOORS = [(4, 30), (12, 30)]  # (x, y) of the cells in which a wall is open
 

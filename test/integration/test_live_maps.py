@@ -15,7 +15,7 @@ from nav_msgs.msg import OccupancyGrid
 from nav_msgs.srv import GetPlan, LoadMap
 
 from ddqn_planner.grid import GridMap, MapFile
-from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.nodes.quality import LATCHED
 
 EAST, WEST = 0b00111000, 0b10000011  # what lanes to the east and to the west forbid
 SHAPE = 3, 9

@@ -17,7 +17,7 @@ from nav_msgs.srv import GetMap, LoadMap
 from ddqn_planner.grid import GridMap, MapFile, read_map_file, scatter_obstacles
 from ddqn_planner.nodes.conversions import grid_from_message
 from ddqn_planner.nodes.map_server_node import known_path
-from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.resources import find_map, find_resource
 
 NAMESPACE = "/maps"

@@ -26,6 +26,7 @@ from std_msgs.msg import Header, UInt8MultiArray
 
 from ddqn_planner import Experience, GridMap, MoveRule, Planner
 from ddqn_planner.grid import inflate
+from ddqn_planner.nodes.base_node import BaseNode
 from ddqn_planner.nodes.conversions import (
     bytes_message,
     grid_from_message,
@@ -41,7 +42,8 @@ from ddqn_planner.nodes.map_source import (
 )
 from ddqn_planner.nodes.outcome import Outcome, RequestError
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
-from ddqn_planner.nodes.runtime import LATCHED, BaseNode, Worker
+from ddqn_planner.nodes.quality import LATCHED
+from ddqn_planner.nodes.worker import Worker
 from ddqn_planner.planning import PlanRequest
 
 EAST, WEST = 0b00111000, 0b10000011  # what lanes to the east and to the west forbid

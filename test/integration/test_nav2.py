@@ -37,9 +37,10 @@ from ddqn_planner.nodes import nav2
 from ddqn_planner.nodes.nav2 import PREEMPTED, PathAction, Task, error_code, poses_of
 from ddqn_planner.nodes.other_planners import GivenUp
 from ddqn_planner.nodes.outcome import NOT_ACTIVE, Outcome, RequestError
+from ddqn_planner.nodes.pending_requests import unless
 from ddqn_planner.nodes.planner_node import PlannerNode
+from ddqn_planner.nodes.quality import SERVICE_QUALITY
 from ddqn_planner.nodes.requests import check_request
-from ddqn_planner.nodes.runtime import SERVICE_QUALITY, unless
 from ddqn_planner.planning import Plan, PlanStatus
 
 FOUND = Outcome("SUCCEEDED", "a path", plan=Plan(PlanStatus.SUCCEEDED, ((0, 0),)))

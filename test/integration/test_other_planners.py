@@ -24,10 +24,10 @@ from rclpy.executors import (
 from unique_identifier_msgs.msg import UUID
 
 from ddqn_planner.nodes import nav2, other_planners
+from ddqn_planner.nodes.base_node import BaseNode
 from ddqn_planner.nodes.other_planners import OtherPlanners
 from ddqn_planner.nodes.outcome import Outcome
 from ddqn_planner.nodes.planner_node import PlannerNode
-from ddqn_planner.nodes.runtime import BaseNode
 
 REJECT, SUCCEED, ABORT, WAIT = range(4)
 """What the server does with a goal: the order of a Fibonacci sequence."""

@@ -308,7 +308,9 @@ def test_what_a_node_cannot_start_with_is_said_and_ends_with_1(
     for variable, value in environment.items():
         monkeypatch.setenv(variable, value)
     # Signals are pytest's here.
-    monkeypatch.setattr("ddqn_planner.nodes.runtime.StopSignal.listen", lambda *_: None)
+    monkeypatch.setattr(
+        "ddqn_planner.nodes.stop_signal.StopSignal.listen", lambda *_: None
+    )
     assert import_module(f"ddqn_planner.nodes.{name}_node").main() == 1
     log = capfd.readouterr().err
     assert re.search(f"cannot start: .*({reason})", log)

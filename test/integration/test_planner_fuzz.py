@@ -19,7 +19,7 @@ from std_msgs.msg import UInt8MultiArray
 
 from ddqn_planner.nodes.conversions import grid_from_message
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
-from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.nodes.quality import LATCHED
 
 TOPICS = st.sampled_from(["initialpose", "goal_pose", "goal_poses", "odom"])
 fuzz = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -41,7 +41,7 @@ from std_srvs.srv import Trigger
 from ddqn_planner.model import find_model
 from ddqn_planner.nodes.conversions import bytes_message, rotation
 from ddqn_planner.nodes.diagnostics import seconds
-from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.nodes.quality import LATCHED
 
 
 def test_goal_pose_is_answered_by_a_plan_a_value_and_diagnostics(robot: Robot) -> None:

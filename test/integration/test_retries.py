@@ -25,9 +25,9 @@ from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.map_source import Arrivals
 from ddqn_planner.nodes.nav2 import CANCELED, Task
 from ddqn_planner.nodes.outcome import NOT_ACTIVE, STOPPING, Outcome
+from ddqn_planner.nodes.pending_requests import FAREWELL
 from ddqn_planner.nodes.planner_node import IDLE_PERIOD, PlannerNode
 from ddqn_planner.nodes.retries import Retries
-from ddqn_planner.nodes.runtime import FAREWELL
 from ddqn_planner.planning import Plan, PlanRequest, PlanStatus
 
 CLEARS = 8

@@ -23,7 +23,7 @@ from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.nodes.conversions import grid_from_message
 from ddqn_planner.nodes.nav2 import Task
 from ddqn_planner.nodes.planner_node import PlannerNode
-from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.nodes.quality import LATCHED
 
 CELL, ORIGIN = 0.1, (-1.0, 2.0, 0.5)
 START, BESIDE, BEYOND = (

@@ -27,7 +27,7 @@ from std_srvs.srv import Trigger
 
 from ddqn_planner.grid import MOVES, GridMap, MapFile, MoveRule, legal_moves
 from ddqn_planner.model import load_model
-from ddqn_planner.nodes.runtime import LATCHED
+from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.nodes.trainer_node import PARAMETERS
 
 ENDLESS = {"steps": 10**9, "filters": 4, "learning_starts": 100}

@@ -1,0 +1,243 @@
+"""What the three nodes share: checked parameters, answered requests, topics."""
+
+import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from copy import copy
+from types import SimpleNamespace
+from typing import Any
+
+from rcl_interfaces import msg, srv
+from rclpy.clock import TimeJump
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.exceptions import ParameterException
+from rclpy.executors import await_or_execute
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.service import Service
+from rclpy.subscription import Subscription
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+
+from ddqn_planner.nodes.clocks import JUMP_BACK
+from ddqn_planner.nodes.declared import Parameters, read_all
+from ddqn_planner.nodes.overrides import (
+    QOS,
+    unread_names,
+    unread_qualities,
+    unread_sections,
+)
+from ddqn_planner.nodes.parameter_messages import parameters_from_messages
+from ddqn_planner.nodes.pending_requests import PendingRequests, unless
+from ddqn_planner.nodes.quality import SERVICE_QUALITY, overriding_options
+from ddqn_planner.nodes.topic_problems import topic_problems
+
+STOPPED = False, "the node is being stopped"  # of triggers that wait at a signal
+
+
+class BaseNode(Node):
+    """Node that checks its parameters and answers each request.
+
+    It logs why it does not receive messages.
+    """
+
+    def __init__(self, name: str, parameters: Parameters) -> None:
+        self._logged_problems: list[str] = []
+        self.after_jump_back: list[Callable[[], None]] = []
+        """Called when a bag loops or a simulator is reset."""
+        self.is_stopping = False
+        """A signal has come: requests that wait are to be refused."""
+        self._pending_requests = PendingRequests()
+        super().__init__(name)
+        self._jumps = self.get_clock().create_jump_callback(
+            JUMP_BACK, post_callback=self._on_jump
+        )
+        self._declared = parameters
+        self._declare(parameters)
+        self.check_parameters({name: self.value(name) for name in parameters})
+        self.add_on_set_parameters_callback(self._check)
+        for service in (srv.SetParameters, srv.SetParametersAtomically):
+            self.answer_with(service, self._on_set_parameters)
+
+    def _declare(self, parameters: Parameters) -> None:
+        """Declare parameters with the values of the command line and of its files."""
+        overrides = {
+            parameter.name: parameter.value
+            for parameter in self.handle.get_parameters(Parameter).values()
+        }
+        known_names = {*parameters, *self.list_parameters([], 0).names}
+        self._warn_of_unread(overrides, known_names)
+        self._qualities = [name for name in overrides if name.startswith(QOS)]
+        values = read_all(
+            parameters,
+            {name: overrides[name] for name in parameters if name in overrides},
+        )
+        for name, declared in parameters.items():
+            value = values.get(name, declared.default)
+            # With the override, rclpy ends with its own error for a whole number.
+            self.declare_parameter(
+                name, value, declared.descriptor(), ignore_override=True
+            )
+
+    def _warn_of_unread(self, overrides: dict[str, Any], known_names: set[str]) -> None:
+        node = self.get_fully_qualified_name()
+        unread_parameters = unread_names(overrides, known_names, node)
+        if unread_parameters:
+            self.get_logger().warning(unread_parameters)
+        for warning in unread_sections(sys.argv, known_names, node):
+            self.get_logger().warning(warning)
+
+    def tell_unread_qualities(self) -> None:
+        """Log once which qualities are for no subscription, after all are created."""
+        known_names = self.list_parameters([], 0).names
+        node = self.get_fully_qualified_name()
+        for warning in unread_qualities(self._qualities, known_names, node):
+            self.get_logger().warning(warning)
+        self._qualities = []
+
+    def _on_jump(self, jump: TimeJump) -> None:
+        seconds = jump.delta.nanoseconds / 1e9
+        change = f"jumped by {seconds:.6g} s" if seconds else "changed"
+        self.get_logger().warning(
+            f"the clock {change}: transforms and odometry are forgotten"
+        )
+        for forget in self.after_jump_back:
+            forget()
+
+    # Parameters
+
+    def _check(self, parameters: list[Parameter]) -> msg.SetParametersResult:
+        try:
+            self.check_parameters(
+                {parameter.name: parameter.value for parameter in parameters}
+            )
+        except (ValueError, OSError, RuntimeError, MemoryError) as error:
+            return _refusal(error)
+        return msg.SetParametersResult(successful=True)
+
+    def check_parameters(self, new: dict[str, Any]) -> None:
+        """Check new values beyond their types and ranges; an error refuses them all."""
+        declared = {
+            name: value for name, value in new.items() if name in self._declared
+        }
+        read_all(self._declared, declared)
+
+    def value(self, name: str) -> Any:
+        """Return the value of a parameter."""
+        return self.get_parameter(name).value
+
+    def settings(self) -> SimpleNamespace:
+        """Return the values that all parameters have now."""
+        return SimpleNamespace(**{name: self.value(name) for name in self._declared})
+
+    def _on_set_parameters(self, request: Any, response: Any) -> Any:
+        """Set parameters one by one or together.
+
+        rclpy's own answer to bad ones ends the node.
+        """
+        if isinstance(response, srv.SetParameters.Response):
+            response.results = [self._set([message]) for message in request.parameters]
+        else:
+            response.result = self._set(request.parameters)
+        return response
+
+    def _set(self, messages: list[msg.Parameter]) -> msg.SetParametersResult:
+        try:
+            parameters = parameters_from_messages(
+                messages,
+                self._declared,
+                self.has_parameter,
+                self.get_fully_qualified_name(),
+            )
+            return self.set_parameters_atomically(parameters)
+        except (ParameterException, ValueError) as error:
+            return _refusal(error)
+
+    # Requests
+
+    def answer_with(self, service_type: Any, callback: Callable[..., Any]) -> None:
+        """Answer a service of rclpy with another callback."""
+        for service in self.services:
+            if service.srv_type is service_type:
+                service.callback = callback
+
+    def answering(self) -> AbstractContextManager[None]:
+        """Count a request until it is answered; a node that stops waits until then."""
+        return self._pending_requests.counting()
+
+    @property
+    def is_answering(self) -> bool:
+        """Return whether a request waits, or its answer may not be sent yet."""
+        return self._pending_requests.are_open
+
+    def refuse_requests(self) -> None:
+        """Refuse the requests that wait, as the node is being stopped."""
+        self.is_stopping = True
+
+    def create_service(self, *arguments: Any, **options: Any) -> Service:
+        """Create a service with the queue of `SERVICE_QUALITY`."""
+        options.setdefault("qos_profile", SERVICE_QUALITY)
+        return super().create_service(*arguments, **options)
+
+    def create_trigger(
+        self, name: str, handler: Callable[[], Any], **options: Any
+    ) -> None:
+        """Create a service; its handler returns or awaits success and a message."""
+
+        async def answer(
+            _: Trigger.Request, response: Trigger.Response
+        ) -> Trigger.Response:
+            with self.answering():
+                response.success, response.message = await unless(
+                    await_or_execute(handler), lambda: self.is_stopping and STOPPED
+                )
+            return response
+
+        self.create_service(Trigger, name, answer, **options)
+
+    # Topics
+
+    def create_publisher(self, *arguments: Any, **options: Any) -> Publisher:
+        """Create a publisher without rclpy's events, a third of the cost of a wait."""
+        events = options.setdefault("event_callbacks", PublisherEventCallbacks())
+        events.use_default_callbacks = False
+        return super().create_publisher(*arguments, **options)
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **options: Any
+    ) -> Subscription:
+        """Create a subscription with the quality that parameters may override."""
+        name = self.resolve_topic_name(topic)
+        options["qos_overriding_options"] = overriding_options(name)
+        options["event_callbacks"] = SubscriptionEventCallbacks(
+            use_default_callbacks=False
+        )
+        quality = copy(qos_profile)  # rclpy writes the parameters' values into it
+        try:
+            return super().create_subscription(
+                msg_type, topic, callback, quality, **options
+            )
+        except RuntimeError as error:
+            parameter = f"qos_overrides.{name}.subscription"
+            remedy = f"give {parameter} values that ROS knows, or none"
+            raise RuntimeError(
+                f"cannot subscribe to {name} ({error}); {remedy}"
+            ) from None
+
+    def header(self, frame: str = "") -> Header:
+        """Return the header of a message about now."""
+        return Header(stamp=self.get_clock().now().to_msg(), frame_id=frame)
+
+    def topic_problems(self) -> list[str]:
+        """Return why the node does not receive messages; each reason is logged once."""
+        problems = list(topic_problems(self))
+        for problem in {*problems}.difference(self._logged_problems):
+            self.get_logger().warning(problem)
+        self._logged_problems = problems
+        return problems
+
+
+def _refusal(error: Exception) -> msg.SetParametersResult:
+    reason = str(error) or repr(error)
+    return msg.SetParametersResult(successful=False, reason=reason)

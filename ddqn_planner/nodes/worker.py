@@ -1,0 +1,55 @@
+"""A thread for calls that take long, so that the node goes on answering."""
+
+import queue
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+from rclpy.exceptions import InvalidHandle
+from rclpy.node import Node
+from rclpy.task import Task
+
+
+class Worker:
+    """Calls functions one after another in a daemon thread."""
+
+    def __init__(self, node: Node) -> None:
+        # A task alone does not wake an executor in another thread.
+        self._wake = node.create_guard_condition(lambda: None)
+        self._calls: queue.SimpleQueue[Task | None] = queue.SimpleQueue()
+        # The end of the process does not wait for a daemon thread.
+        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._thread.start()
+
+    def _work(self) -> None:
+        for task in iter(self._calls.get, None):
+            task()  # does nothing if the task was cancelled
+            with suppress(InvalidHandle):  # the node was destroyed meanwhile
+                self._wake.trigger()
+            del task  # it holds a map
+
+    def call(self, function: Callable[..., Any], *arguments: object) -> Task:
+        """Return the future of a call: its result, or the exception that it raised."""
+        task = Task(function, arguments)
+        self._calls.put(task)
+        return task
+
+    async def run(self, function: Callable[..., Any], *arguments: object) -> Any:
+        """Return the result of a call; cancel it if the caller is closed first."""
+        task = self.call(function, *arguments)
+        try:
+            return await task
+        finally:
+            task.cancel()
+
+    def close(self, patience: float | None = None) -> None:
+        """Accept no more calls, and wait for those that were made.
+
+        Parameters
+        ----------
+        patience
+            Seconds to wait at most; None: until all calls have ended.
+        """
+        self._calls.put(None)
+        self._thread.join(patience)
