@@ -1,4 +1,4 @@
-# make setup | demo | demo-driving | demo-training | test | test-fast | coverage | experiments-test | docs | lint | format | types | bench | body | faults | fuzz | load | soak | model | model-dilemma | robots
+# make setup | demo | demo-driving | demo-training | test | test-fast | coverage | experiments-test | docs | lint | format | types | constraints | bench | body | faults | fuzz | load | soak | model | model-dilemma | robots
 PYTHON ?= python3
 # What pip is asked for. PyPI's builds for Linux bring CUDA. The CPU build alone:
 # make setup TORCH="torch==2.13.0 --index-url https://download.pytorch.org/whl/cpu"
@@ -7,7 +7,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: setup demo demo-driving demo-training test test-fast coverage experiments-test docs lint format types bench body faults fuzz load soak model model-dilemma robots
+.PHONY: setup demo demo-driving demo-training test test-fast coverage experiments-test docs lint format types constraints bench body faults fuzz load soak model model-dilemma robots
 .DEFAULT_GOAL := help
 
 .PHONY: help
@@ -91,6 +91,10 @@ format: setup
 
 types: setup
 	$(BIN)/mypy
+
+# The versions of the libraries and tools in .venv; `PIP_CONSTRAINT=constraints.txt make setup` installs them.
+constraints: setup
+	$(BIN)/python tools/constraints.py > constraints.txt
 
 bench: $(VENV)/bench
 	$(BIN)/python experiments/speed.py; missed=$$?; $(BIN)/python experiments/node_speed.py $(MAP) && exit $$missed
