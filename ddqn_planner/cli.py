@@ -162,9 +162,7 @@ def _plan_cells(
     rule, optimum, value = plan.move_rule, None, None
     if plan.cells and grid.is_free(plan.cells[0]):
         no_costs = api.GridMap(grid.occupancy, forbidden=grid.forbidden)
-        optimum = path_length(
-            search(plan.cells[0], plan.cells[-1], no_costs, rule), rule
-        )
+        optimum = path_length(search(plan.cells[0], plan.cells[-1], no_costs, rule))
     if (
         options.picture
         and plan.cells

@@ -48,7 +48,7 @@ def show_path(client: Client, case: Case, children: Sequence[Popen[bytes]]) -> N
     print(
         f"{grid.width} x {grid.height} cells, path of {len(cells)} from {start} to {goal}"
     )
-    length = path_length(cells, rule)
+    length = path_length(cells)
     optimum = shortest_distances(grid, goal, rule)[start[::-1]]
     print(f"length {length:.2f} cells, optimum {optimum:.2f} under {rule.value}")
     field = wait_for("value field", fields.find, children)

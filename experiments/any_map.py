@@ -11,7 +11,7 @@ from tables import median_and_range, table
 from trainings import MOVE_RULE, SCENARIO, Settings, Training, rollouts
 
 from ddqn_planner import GridMap, MoveRule, Planner
-from ddqn_planner.grid import OCCUPIED, UNKNOWN, legal_moves, move_costs
+from ddqn_planner.grid import LENGTHS, OCCUPIED, UNKNOWN, legal_moves, move_costs
 from ddqn_planner.grid.noise import random_costs
 from ddqn_planner.model import AnyMapQNetwork
 from ddqn_planner.model.certificate import MOVE_RULES
@@ -112,11 +112,11 @@ def move_errors(planner: Planner) -> tuple[int, float]:
     grid = GridMap(cells == OCCUPIED, cost=cells)
     for rule in MOVE_RULES:
         legal_BA = legal_moves(grid.occupancy, rule)[:, 1::3, 1::3].reshape(8, -1).T
-        cost_BA = move_costs(grid.cost_multiplier, rule)[:, 1::3, 1::3].reshape(8, -1).T
+        cost_BA = move_costs(grid.cost_multiplier)[:, 1::3, 1::3].reshape(8, -1).T
         p_BA = network.success(network.features(patch_B9, rule))
         learned_BA = network.multiplier(network.features(costs_B9, rule))
         wrong += int(((p_BA > 0.5) != legal_BA).sum())
-        errors.append(np.abs(learned_BA / (cost_BA / rule.lengths) - 1)[legal_BA])
+        errors.append(np.abs(learned_BA / (cost_BA / LENGTHS) - 1)[legal_BA])
     return wrong, float(np.concatenate(errors).mean())
 
 

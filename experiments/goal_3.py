@@ -177,9 +177,7 @@ def report(settings: Settings) -> str:
                 )
         path = fixed_path(training)
         is_free = [all(map(scenario.grid.is_free, path)) for scenario in maps.scenarios]
-        lengths["one fixed path"] = np.where(
-            [is_free], path_length(path, MOVE_RULE), np.nan
-        )
+        lengths["one fixed path"] = np.where([is_free], path_length(path), np.nan)
         distances = (shortest_distances(s.grid, s.goal, MOVE_RULE) for s in test)
         optimum = np.array([d[SCENARIO.start[::-1]] for d in distances])
         for label, of_seeds in lengths.items():

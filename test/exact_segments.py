@@ -44,7 +44,7 @@ def share_within(cell: Cell, first: Cell, last: Cell) -> Fraction:
 def exact_cost(first: Cell, last: Cell, grid: GridMap, rule: MoveRule) -> float:
     """Return what a segment costs, legal or not."""
     vector = np.subtract(last, first)
-    length = np.abs(vector).max() if rule is MoveRule.UNIT else math.hypot(*vector)
+    length = math.hypot(*vector)
     found = shares(first, last)
     assert sum(found.values()) == 1
     x, y = np.transpose([*found])

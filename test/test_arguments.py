@@ -30,7 +30,7 @@ MAP = Path(__file__).parents[1] / "maps" / "dilemma.yaml"
 EXPERIENCE.record(np.arange(9.0), np.stack([np.arange(9) / 2, np.ones(9)], axis=1))
 
 CELLS = [(0, 0), (1, 1)]
-ON_MAP = {"move_rule": "unit", "method": "greedy", "simplified": False}
+ON_MAP = {"move_rule": "corner_cutting", "method": "greedy", "simplified": False}
 AT_START = {**ON_MAP, "start_clearing_radius": 0.0}
 OF_MAP = {"resolution": 1.0, "origin": (0.0, 0.0, 0.0), "forbidden": None}
 FLAGS = {"occupied_threshold": 65, "allow_unknown": False, "use_map_costs": False}
@@ -40,9 +40,9 @@ CALLS: dict[Callable[..., Any], dict[str, Any]] = {
     GridMap: {"occupancy": np.zeros(SHAPE), **OF_MAP, **LAYERS, **TIMES},
     GridMap.from_occupancy_values: {"values": np.zeros(SHAPE, int), **OF_MAP, **FLAGS},
     GRID.with_patch: {"occupancy": [[0]], "x": 0, "y": 0, **LAYERS},
-    GRID.labels: {"move_rule": "unit"},
-    GRID.legal_moves: {"move_rule": "unit"},
-    GRID.reachable: {"cells": CELLS, "move_rule": "unit", "backward": False},
+    GRID.labels: {"move_rule": "corner_cutting"},
+    GRID.legal_moves: {"move_rule": "corner_cutting"},
+    GRID.reachable: {"cells": CELLS, "move_rule": "corner_cutting", "backward": False},
     GRID.same_cells: {"other": GRID},
     GRID.contains: {"cell": (0, 0)},
     GRID.is_free: {"cell": (0, 0)},
@@ -71,17 +71,17 @@ CALLS: dict[Callable[..., Any], dict[str, Any]] = {
     },
     PLANNER.plan_nearest: {"grid": GRID, "start": (0, 0), "goals": CELLS, **AT_START},
     PLANNER.plan_through: {"grid": GRID, "start": (0, 0), "goals": CELLS, **AT_START},
-    PLANNER.q_field: {"grid": GRID, "goal": (3, 3), "move_rule": "unit"},
+    PLANNER.q_field: {"grid": GRID, "goal": (3, 3), "move_rule": "corner_cutting"},
     Plan: {
         "status": PlanStatus.SUCCEEDED,
         "path": CELLS,
         "method": "greedy",
-        "move_rule": "unit",
+        "move_rule": "corner_cutting",
     },
-    QField: {"goal": (0, 0), "q": Q, "legal": LEGAL, "move_rule": "unit"},
+    QField: {"goal": (0, 0), "q": Q, "legal": LEGAL, "move_rule": "corner_cutting"},
     QField((0, 0), Q, LEGAL).rollout: {"start": (0, 0)},
     PLANNER.q_field(GRID, (3, 3)).rollout: {"start": (0, 0)},
-    simplify: {"cells": CELLS, "grid": GRID, "move_rule": "unit"},
+    simplify: {"cells": CELLS, "grid": GRID, "move_rule": "corner_cutting"},
 }
 ARGUMENTS = [(call, name) for call, arguments in CALLS.items() for name in arguments]
 
@@ -149,7 +149,13 @@ ANY = [
         np.array([[2**63, 0]], np.uint64),
         Fraction(1, 2),
     ),
-    *(np.float32(1), np.int64(1), np.uint8(1), np.bool_(True), np.str_("unit")),
+    *(
+        np.float32(1),
+        np.int64(1),
+        np.uint8(1),
+        np.bool_(True),
+        np.str_("corner_cutting"),
+    ),
 ]
 
 
@@ -204,10 +210,10 @@ def test_cells_outside_the_map_and_fractions_are_refused(cell: Any) -> None:
     field = PLANNER.q_field(timed, (3, 3))
     calls: list[Callable[[], Any]] = [
         lambda: timed.is_obstacle(cell),
-        lambda: timed.reachable([(0, 0), cell], "unit"),
-        lambda: timed.reachable(np.array([cell]), "unit"),
+        lambda: timed.reachable([(0, 0), cell], "corner_cutting"),
+        lambda: timed.reachable(np.array([cell]), "corner_cutting"),
         lambda: EXPERIENCE.expected_time(timed, [(0, 0), cell]),
-        lambda: simplify([(0, 0), cell], timed, "unit"),
+        lambda: simplify([(0, 0), cell], timed, "corner_cutting"),
         lambda: field.rollout(cell),
     ]
     for call in calls:

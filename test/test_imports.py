@@ -32,7 +32,7 @@ from ddqn_planner.grid import legal_moves, move_costs
 from ddqn_planner.resources import find_map
 grid = inflate(load_map(find_map("dilemma")), 0.0)
 legal_moves(grid.occupancy, "robot_safe")
-move_costs(grid.cost_multiplier, "robot_safe")
+move_costs(grid.cost_multiplier)
 """
 
 

@@ -84,7 +84,7 @@ def calls(wrong: Any) -> Iterator[Any]:
     yield lambda: body().plan_poses(GRID, START, [wrong])
     yield lambda: body().plan_poses(GRID, START, GOAL, wrong)
     yield lambda: body().plan_poses(GRID, START, GOAL, bound=wrong)
-    yield lambda: GRID.reachable(wrong, "unit")
+    yield lambda: GRID.reachable(wrong, "corner_cutting")
     yield lambda: GRID.reachable([here], wrong)
     yield lambda: GRID.is_free(wrong)
     yield lambda: GRID.cell_to_world(wrong)
@@ -107,8 +107,8 @@ def calls(wrong: Any) -> Iterator[Any]:
     yield lambda: inflate(wrong, 0.1)
     yield lambda: inflate(GRID, wrong)
     yield lambda: inflate(GRID, 0.1, wrong)
-    yield lambda: simplify(wrong, GRID, "unit")
-    yield lambda: simplify([here, there], wrong, "unit")
+    yield lambda: simplify(wrong, GRID, "corner_cutting")
+    yield lambda: simplify([here, there], wrong, "corner_cutting")
     yield lambda: simplify([here, there], GRID, wrong)
     yield lambda: Experience(wrong)
     yield lambda: Experience(0.5, robot_width=wrong)
@@ -132,10 +132,14 @@ def calls(wrong: Any) -> Iterator[Any]:
     yield lambda: Scenario(GRID, here, wrong)
     yield lambda: Scenario(GRID, here, there, wrong)
     yield lambda: clearance(wrong)
-    yield lambda: scatter_obstacles(wrong, [here, there], MoveRule.UNIT, RANDOM)
-    yield lambda: scatter_obstacles(GRID, wrong, MoveRule.UNIT, RANDOM)
+    yield lambda: scatter_obstacles(
+        wrong, [here, there], MoveRule.CORNER_CUTTING, RANDOM
+    )
+    yield lambda: scatter_obstacles(GRID, wrong, MoveRule.CORNER_CUTTING, RANDOM)
     yield lambda: scatter_obstacles(GRID, [here, there], wrong, RANDOM)
-    yield lambda: scatter_obstacles(GRID, [here, there], MoveRule.UNIT, RANDOM, wrong)
+    yield lambda: scatter_obstacles(
+        GRID, [here, there], MoveRule.CORNER_CUTTING, RANDOM, wrong
+    )
 
 
 @pytest.mark.parametrize("wrong", [*KINDS, *LISTS], ids=lambda wrong: repr(wrong)[:20])
@@ -189,7 +193,7 @@ def test_no_path_is_sought_from_an_occupied_cell() -> None:
     with pytest.raises(
         ValueError, match=r"the cell \(30, 31\) is occupied; give free cells"
     ):
-        GRID.reachable([(1, 1), (30, 31)], "unit")
+        GRID.reachable([(1, 1), (30, 31)], "corner_cutting")
 
 
 def lattice() -> dict[str, Any]:
@@ -320,5 +324,7 @@ def test_a_path_far_beyond_the_map_takes_no_memory() -> None:
     far = [(0, 0), (2 * 10**9, 0)]
     poses = np.array([(*GRID.cell_to_world(cell), 0.0) for cell in (*far, (5, 0))])
     assert invalid_poses(poses, GRID).tolist() == [1]
-    request = PlanRequest(GRID, (0, 0), ((5, 0),), MoveRule.UNIT, under_way=far)
+    request = PlanRequest(
+        GRID, (0, 0), ((5, 0),), MoveRule.CORNER_CUTTING, under_way=far
+    )
     assert last_step(cells().steps(request)).goal == (5, 0)

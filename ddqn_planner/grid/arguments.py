@@ -36,7 +36,7 @@ class _ByHash(EnumMeta):
 
 
 class Choice(str, Enum, metaclass=_ByHash):
-    """An enum whose members can be given by value: ``MoveRule("unit")``."""
+    """An enum whose members can be given by value: ``MoveRule("robot_safe")``."""
 
     @classmethod
     def _missing_(cls, value: object) -> Choice:

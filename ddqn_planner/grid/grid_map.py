@@ -384,7 +384,7 @@ class GridMap:
             none if it is None else it
             for it, none in zip(layers, NO_LAYERS, strict=True)
         ]
-        return self.occupancy, *known, rule.cuts_corners, rule is MoveRule.UNIT
+        return self.occupancy, *known, rule.cuts_corners
 
     def reachable(
         self, cells: ArrayLike, move_rule: MoveRule | str, backward: bool = False

@@ -40,18 +40,17 @@ class MoveRule(Choice):
     """A diagonal move needs both side cells free (the rule of the MovingAI benchmark)."""
     CORNER_CUTTING = "corner_cutting"
     """A diagonal move needs only its target cell free (the paper's length 22.97 implies it)."""
-    UNIT = "unit"
-    """As corner cutting, but every move has length 1 (the rule of the MPD data)."""
 
     @property
     def cuts_corners(self) -> bool:
         """Whether a diagonal move may pass an occupied side cell."""
-        return self is not MoveRule.ROBOT_SAFE
+        return self is MoveRule.CORNER_CUTTING
 
-    @property
-    def lengths(self) -> NDArray[np.float64]:
-        """(8,) float64: the length of each action in cells under this rule."""
-        return np.ones(len(MOVES)) if self is MoveRule.UNIT else LENGTHS
+    @classmethod
+    def _missing_(cls, value: object) -> Choice:
+        if isinstance(value, str) and value == "unit":
+            raise ValueError("the move rule unit is gone; give corner_cutting")
+        return super()._missing_(value)
 
 
 def _shifted(padded: NDArray[Any], dx: int, dy: int) -> NDArray[Any]:
@@ -87,7 +86,6 @@ def neighbours(shape: tuple[int, int]) -> NDArray[np.int64]:
 
 def move_costs(
     multiplier: NDArray[np.float32],
-    move_rule: MoveRule | str,
     uphill: NDArray[np.uint8] | None = None,
 ) -> NDArray[np.float64]:
     """Return (8, H, W) float64: the length of each move times the mean multiplier of its cells."""
@@ -99,8 +97,7 @@ def move_costs(
     target = np.stack(
         [_shifted(padded[a % len(padded)], dx, dy) for a, (dx, dy) in moves]
     )
-    lengths = MoveRule(move_rule).lengths[:, None, None]
-    costs: NDArray[np.float64] = lengths * (each + target) / 2
+    costs: NDArray[np.float64] = LENGTHS[:, None, None] * (each + target) / 2
     return costs
 
 
@@ -112,13 +109,10 @@ def actions_along(vectors: NDArray[Any]) -> NDArray[np.int64]:
     return np.rint(eighths).astype(np.int64) % len(MOVES)
 
 
-def path_length(cells: Cells, move_rule: MoveRule | str = MoveRule.ROBOT_SAFE) -> float:
-    """Return the length in cells of straight segments, or of moves under `MoveRule.UNIT`."""
+def path_length(cells: Cells) -> float:
+    """Return the length in cells of a path of straight segments between cells."""
     steps = np.diff(np.asarray(cells, dtype=np.int64).reshape(-1, 2).T)
-    is_unit = MoveRule(move_rule) is MoveRule.UNIT
-    return float(
-        (np.abs(steps * 1.0).max(axis=0) if is_unit else np.hypot(*steps)).sum()
-    )
+    return float(np.hypot(*steps).sum())
 
 
 def positions(parts: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -170,7 +164,7 @@ def _dijkstra(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> Any:
     step = (MOVES[:, 1] * grid.width + MOVES[:, 0]).astype(np.int32)
     order = np.argsort(step)
     legal_NA = grid.legal_moves(move_rule)[order].reshape(len(MOVES), -1).T
-    costs = move_costs(grid.cost_multiplier, move_rule, grid.uphill)
+    costs = move_costs(grid.cost_multiplier, grid.uphill)
     cost_NA = costs[order].reshape(len(MOVES), -1).T
     next_NA = np.arange(len(legal_NA), dtype=np.int32)[:, None] + step[order]
     ends = np.cumsum(np.count_nonzero(legal_NA, axis=1), dtype=np.int32)
@@ -188,7 +182,7 @@ def _dijkstra(grid: GridMap, goal: Cell, move_rule: MoveRule | str) -> Any:
 @inlined
 def is_legal(x: int, y: int, action: int, of_map: Any) -> Any:  # pragma: no cover
     """Return whether a move between free cells is legal, see `GridMap.for_kernels`."""
-    occupancy, forbidden, _, _, _, cuts_corners, _ = of_map
+    occupancy, forbidden, _, _, _, cuts_corners = of_map
     if forbidden.size > 0 and forbidden[y, x] >> action & 1:
         return False
     to_x, to_y = x + MOVES[action, 0], y + MOVES[action, 1]

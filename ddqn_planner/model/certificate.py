@@ -22,7 +22,6 @@ Float64: TypeAlias = NDArray[np.float64]
 # I = inputs, C = 18 inputs for costs and unknown cells, U = outputs of a layer, B = a batch,
 # V = 101 values of a free cell: the costs 0 to 99, and last unknown.
 
-# One of each class: under `MoveRule.UNIT`, the same moves are legal as under the second.
 MOVE_RULES: Final = (MoveRule.ROBOT_SAFE, MoveRule.CORNER_CUTTING)
 CENTRE = 4  # the robot's cell in a patch
 COSTS = slice(9, 27)  # the inputs for costs and unknown cells

@@ -184,6 +184,7 @@ def _parse(values: object) -> ModelMetadata:
             )
     if not 0 <= values["gamma"] <= 1:
         raise ValueError(f"gamma is {values['gamma']}; it must lie in 0 to 1")
-    return ModelMetadata(
-        **{**values, "sizes": sizes, "move_rule": MoveRule(values["move_rule"])}
-    )
+    move_rule = values["move_rule"]
+    if move_rule == "unit":  # until version 0.9; the same moves are legal
+        move_rule = MoveRule.CORNER_CUTTING
+    return ModelMetadata(**{**values, "sizes": sizes, "move_rule": MoveRule(move_rule)})

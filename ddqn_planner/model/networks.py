@@ -8,7 +8,7 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import MOVES, OCCUPIED, UNKNOWN, Cell, GridMap, MoveRule
+from ddqn_planner.grid import LENGTHS, MOVES, OCCUPIED, UNKNOWN, Cell, GridMap, MoveRule
 from ddqn_planner.model.certificate import MOVE_RULES, Certificate, certify
 from ddqn_planner.model.move_costs import (
     MAX_MULTIPLIER,
@@ -262,7 +262,7 @@ class PropagationQNetwork(QNetwork):
         """Return costs that are sums over the two cells of a move, if they are proved to be."""
         if not self.certificate(move_rule).proved:
             return None
-        lengths_PA = np.where(legal_PA, move_rule.lengths, np.inf).astype(np.float32)
+        lengths_PA = np.where(legal_PA, LENGTHS, np.inf).astype(np.float32)
         costs = MoveCosts.of_table(lengths_PA)
         # The layer is linear, so that its output is a sum over the patch's cells.
         weight_AI, bias_A = self.tensors["prices.weight"], self.tensors["prices.bias"]
@@ -303,7 +303,7 @@ class PropagationQNetwork(QNetwork):
         for batch_B9 in np.split(patch_P9, range(BATCH, len(patch_P9), BATCH)):
             feature_BI = self.features(batch_B9, move_rule)
             multiplier_BA = np.minimum(self.multiplier(feature_BI), MAX_MULTIPLIER)
-            cost_BA = move_rule.lengths * self.tries(feature_BI)
+            cost_BA = LENGTHS * self.tries(feature_BI)
             cost_BA *= 1 if timed else multiplier_BA
             # Comparisons with NaN are false, and NumPy's minimum and maximum keep it.
             costs.append(np.where(multiplier_BA >= 1, cost_BA, np.inf))

@@ -64,7 +64,7 @@ def exact_path(
         begin = end
     path_points = np.vstack(parts)
     is_new = np.append(True, np.diff(path_points, axis=0).any(axis=1))
-    return ExactPath(path_points[is_new], _length(path_points, grid, move_rule))
+    return ExactPath(path_points[is_new], _length(path_points, grid))
 
 
 def dense(points: Float64, spacing: float) -> tuple[Float64, NDArray[np.int64]]:
@@ -174,9 +174,7 @@ def _touches_none(
     return True
 
 
-def _length(points: Float64, grid: GridMap, move_rule: MoveRule) -> float:
+def _length(points: Float64, grid: GridMap) -> float:
     """Return the length of a path of points in cells, see `path_length`."""
     steps = np.diff(_in_cells(points, grid), axis=0)
-    if move_rule is MoveRule.UNIT:
-        return float(np.abs(steps).max(axis=1, initial=0.0).sum())
     return float(np.hypot(*steps.T).sum())

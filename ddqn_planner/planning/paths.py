@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import compiled
-from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule
+from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import Cells, Occupancy
 from ddqn_planner.grid.moves import cells_along, is_legal
 from ddqn_planner.planning.field import Goals
@@ -45,8 +45,8 @@ def search(
         (x, y), end = end, np.zeros(shape, dtype=np.bool_)
         end[y, x] = True
     value = np.zeros(shape, np.float32) if value is None else value
-    lengths, layers = move_rule.lengths, grid.for_kernels(move_rule)
-    entered_by, found = _search(start, end, value, lengths, layers)
+    layers = grid.for_kernels(move_rule)
+    entered_by, found = _search(start, end, value, LENGTHS, layers)
     if found < 0:
         return ()
     cells = [(found % grid.width, found // grid.width)]

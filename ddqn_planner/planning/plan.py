@@ -161,7 +161,7 @@ class Plan:
     @property
     def length(self) -> float:
         """Length in cells under the plan's rule, see `path_length`."""
-        return path_length(self.path, self.move_rule)
+        return path_length(self.path)
 
 
 @dataclass(frozen=True, eq=False)

@@ -225,7 +225,7 @@ def world_of(
     bits[BORDER + bottom : BORDER + top] = np.packbits(
         line, axis=1, bitorder="little"
     ).view("<u8")
-    _, *layers, _, _ = grid.for_kernels(MoveRule.ROBOT_SAFE)
+    _, *layers, _ = grid.for_kernels(MoveRule.ROBOT_SAFE)
     if (costs := body_costs(grid)) is not None:
         layers[1] = costs
     return World(body, bits, tile, room, height, width, *layers)

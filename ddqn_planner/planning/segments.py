@@ -97,17 +97,15 @@ def _segment_costs(
 
 
 @inlined
-def _length(width: int, height: int, is_unit: bool) -> float:
+def _length(width: int, height: int) -> float:
     """Return the length of a segment over some columns and rows: what it costs at least."""
-    if is_unit:
-        return float(width if width > height else height)
     return math.sqrt(width * width + height * height)
 
 
 @inlined
 def multiplier_at(x: int, y: int, layers: Any) -> Any:
     """Return the cost multiplier of a cell, see `GridMap.cost_multiplier`."""
-    _, _, cost, slowness, _, _, _ = layers
+    _, _, cost, slowness, _, _ = layers
     column, row = np.uint64(x), np.uint64(y)
     multiplier = np.float64(MULTIPLIERS[cost[row, column]]) if cost.size else 1.0
     return multiplier * slowness[row, column] if slowness.size else multiplier
@@ -143,7 +141,7 @@ def _is_free(x: int, y: int, occupancy: Any) -> bool:
 @inlined
 def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -> float:
     """Return the cost of a segment, infinity if it is not legal from a share of it on."""
-    occupancy, forbidden, cost, slowness, uphill, cuts_corners, is_unit = layers
+    occupancy, forbidden, cost, slowness, uphill, cuts_corners = layers
     has_costs = cost.size + slowness.size > 0
     dx, dy = last_x - x, last_y - y
     step_x, step_y = (dx > 0) - (dx < 0), (dy > 0) - (dy < 0)
@@ -151,7 +149,7 @@ def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -
     # It lies between a diagonal move and one along its longer axis.
     takes = BITS[step_y + 1, step_x + 1]
     takes |= BITS[step_y * (height >= width) + 1, step_x * (width >= height) + 1]
-    length = _length(width, height, is_unit)
+    length = _length(width, height)
     # Positions on the segment count from 0 at its first point to `whole` at its last one: then all
     # crossings of edges of cells are whole numbers.
     width, height = width + (width == 0), height + (height == 0)
@@ -189,7 +187,7 @@ def _is_right_angle(
     x: int, y: int, at_x: int, at_y: int, to_x: int, to_y: int, layers: Any
 ) -> bool:
     """Return if a way is surely the least: a right angle around an occupied cell, no costs."""
-    occupancy, _, cost, slowness, _, cuts_corners, _ = layers
+    occupancy, _, cost, slowness, _, cuts_corners = layers
     dx, dy = x + to_x - 2 * at_x, y + to_y - 2 * at_y
     is_blocked = occupancy[at_y + (dy > 0) - (dy < 0), at_x + (dx > 0) - (dx < 0)]
     is_right = (x == at_x or to_x == at_x) and (y == at_y or to_y == at_y)
@@ -231,7 +229,7 @@ def _pull(path: Any, costs: Any, until: Any, backward: bool, layers: Any) -> int
             to_x, to_y = path[reached, 0] + dx, path[reached, 1] + dy
             is_equal = path[reached + 1, 0] == to_x and path[reached + 1, 1] == to_y
             reached += is_equal
-        least = (reached - first) * _length(abs(dx), abs(dy), layers[-1])
+        least = (reached - first) * _length(abs(dx), abs(dy))
         least = until[reached] - until[first] if until.size else least
         # How much longer it can be is found by doubling and halving. Half of 3 is 1, so that some
         # cells are passed over: with corners at the very last ones seen, a path is longer.
@@ -266,7 +264,7 @@ def _pull(path: Any, costs: Any, until: Any, backward: bool, layers: Any) -> int
 @in_place
 def _move_corners(path: Any, count: int, costs: Any, layers: Any) -> tuple[int, bool]:
     """Move or leave out corners while it costs less; return the cells left, and if any moved."""
-    occupancy, is_unit, is_better, corner = layers[0], layers[-1], False, 1
+    occupancy, is_better, corner = layers[0], False, 1
     moved_by = (
         -1
     )  # the action by which the corner has just moved: it alone is tried again
@@ -285,8 +283,8 @@ def _move_corners(path: Any, count: int, costs: Any, layers: Any) -> tuple[int, 
                 to_x, to_y = next_x, next_y
             elif not _is_free(to_x, to_y, occupancy):
                 to_x, to_y = to_x + MOVES[action, 0], to_y + MOVES[action, 1]
-            first = _length(abs(to_x - x), abs(to_y - y), is_unit)
-            second = _length(abs(next_x - to_x), abs(next_y - to_y), is_unit)
+            first = _length(abs(to_x - x), abs(to_y - y))
+            second = _length(abs(next_x - to_x), abs(next_y - to_y))
             if first + second < least and _is_free(to_x, to_y, occupancy):
                 if action >= 0:
                     second = _cost(to_x, to_y, next_x, next_y, 0.0, layers)

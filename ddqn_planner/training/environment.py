@@ -106,10 +106,7 @@ class GridVectorEnvironment:
         self.background, self.next_cell = np.stack(maps), neighbours(self.shape)
         tables, to_number = (len(maps), len(MOVES), -1), np.array([1, self.shape[1]])
         legal = [s.grid.legal_moves(s.move_rule) for s in scenarios]
-        reward = [
-            move_reward(s.grid, s.start, s.goal, s.move_rule, parameters)
-            for s in scenarios
-        ]
+        reward = [move_reward(s.grid, s.start, s.goal, parameters) for s in scenarios]
         self.legal = np.stack(legal).reshape(tables)
         self.free_reward = np.stack(reward).reshape(tables)
         collision = np.float32(parameters.obstacle_reward)

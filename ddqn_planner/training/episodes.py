@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ddqn_planner.files import Appender, as_path, read_rows, write_atomically
-from ddqn_planner.grid import Cell, MoveRule, path_length
+from ddqn_planner.grid import Cell, path_length
 
 HEADER = (
     b"episode,step,scenario,outcome,moves,length,total_reward,average_reward,cells\r\n"
@@ -51,20 +51,18 @@ def open_record(path: Path, episodes: int) -> Appender:
     return Appender(path)
 
 
-def record(episode: Episode, move_rule: MoveRule) -> bytes:
+def record(episode: Episode) -> bytes:
     """Return the row of an episode, its cells as ``x:y``."""
-    e, length = episode, round(path_length(episode.cells, move_rule), 4)
-    rewards = round(e.total_reward, 6), round(e.average_reward, 6)
-    cells = " ".join(f"{x}:{y}" for x, y in e.cells)
     row = (
-        e.number,
-        e.step,
-        e.scenario,
-        e.outcome.value,
-        e.moves,
-        length,
-        *rewards,
-        cells,
+        episode.number,
+        episode.step,
+        episode.scenario,
+        episode.outcome.value,
+        episode.moves,
+        round(path_length(episode.cells), 4),
+        round(episode.total_reward, 6),
+        round(episode.average_reward, 6),
+        " ".join(f"{x}:{y}" for x, y in episode.cells),
     )
     return f"{','.join(map(str, row))}\r\n".encode()
 

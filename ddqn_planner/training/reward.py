@@ -8,7 +8,6 @@ from ddqn_planner.grid import (
     MOVES,
     Cell,
     GridMap,
-    MoveRule,
     move_costs,
     neighbours,
 )
@@ -19,13 +18,12 @@ def move_reward(
     grid: GridMap,
     start: Cell,
     goal: Cell,
-    move_rule: MoveRule,
     parameters: HyperParameters,
 ) -> NDArray[np.float32]:
     """Return the reward R_t of each legal move, action a in (x, y) at ``[a, y, x]``: (8, H, W)."""
     if parameters.reward == "path_cost":
         # The best return is the cheapest path. It depends on the cells around the robot alone.
-        return -move_costs(grid.cost_multiplier, move_rule).astype(np.float32)
+        return -move_costs(grid.cost_multiplier).astype(np.float32)
     # R_t = α (d_re(t-1) - d_re(t)) + β (d_rs(t) - d_rs(t-1) - d(t, t-1)): d_re is the distance to
     # the end (the goal), d_rs that to the given start, and d(t, t-1) is the length of the move.
     y, x = np.mgrid[0 : grid.height, 0 : grid.width]

@@ -45,13 +45,11 @@ class TrainingRun(WorkFolder):
 
     def steps(self, every: int = SAVE_INTERVAL) -> Iterator[list[Episode]]:
         """Train until the end or "stop" is asked for, and save; yield as `Trainer.run` does."""
-        scenarios, until = self.trainer.scenarios, self.trainer.parameters.steps
+        until = self.trainer.parameters.steps
         with _memory_with_remedy():
             for finished in self.trainer.run(until, every):
                 for episode in finished:
-                    self._record.append(
-                        record(episode, scenarios[episode.scenario].move_rule)
-                    )
+                    self._record.append(record(episode))
                 due = (
                     self.trainer.steps // SAVE_INTERVAL
                     != self.saved_at // SAVE_INTERVAL

@@ -53,7 +53,7 @@ class PerfectNetwork:
         onward = distance[neighbours(grid.occupancy.shape)].reshape(
             -1, *grid.occupancy.shape
         )
-        q = -move_costs(grid.cost_multiplier, move_rule) - onward
+        q = -move_costs(grid.cost_multiplier) - onward
         return np.where(legal_moves(grid.occupancy, move_rule), q, self.bonus).astype(
             np.float32
         )

@@ -534,14 +534,16 @@ def test_changes_that_lie_apart_have_small_boxes() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [np.array([1, 2]), np.array(["unit"]), ["unit"], {}, None]
+    "wrong",
+    [np.array([1, 2]), np.array(["corner_cutting"]), ["corner_cutting"], {}, None],
 )
 def test_what_is_no_choice_is_named_whatever_its_kind(wrong: Any) -> None:
     with pytest.raises(
         ValueError, match=r"(?s)MoveRule .* is unknown; give one of robot_safe"
     ):
         MoveRule(wrong)
-    assert MoveRule(np.str_("unit")) is copy.deepcopy(MoveRule.UNIT) is MoveRule.UNIT
+    rule = MoveRule.CORNER_CUTTING
+    assert MoveRule(np.str_("corner_cutting")) is copy.deepcopy(rule) is rule
 
 
 @pytest.mark.parametrize(

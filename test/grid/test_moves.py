@@ -19,9 +19,11 @@ def test_a_rule_is_a_member_or_its_value() -> None:
     for rule in MoveRule:
         assert MoveRule(rule.value) is MoveRule(rule) is rule
     for wrong in ("nope", "", "ROBOT_SAFE", None):
-        message = f"{wrong!r} is unknown; give one of robot_safe, corner_c.*, unit"
+        message = f"{wrong!r} is unknown; give one of robot_safe, corner_cutting"
         with pytest.raises(ValueError, match=message):
             GridMap([[0]]).legal_moves(wrong)
+    with pytest.raises(ValueError, match="rule unit is gone; give corner_cutting"):
+        MoveRule("unit")
     with pytest.raises(
         ValueError, match="'nope' is unknown; give one of greedy, astar_fallback"
     ):
@@ -63,18 +65,11 @@ def test_neighbours_are_numbered_row_by_row_and_outside_comes_last(
     np.testing.assert_array_equal(neighbours(shape), expected, strict=True)
 
 
-def test_a_length_counts_moves_under_the_unit_rule_and_along_straight_segments() -> (
-    None
-):
+def test_a_length_is_that_of_straight_segments() -> None:
     for cells in ([(0, 0), (1, 1), (2, 2), (3, 2)], [(0, 0), (2, 2), (3, 2)]):
         assert path_length(cells) == pytest.approx(2 * 2**0.5 + 1)
-        assert path_length(cells, MoveRule.CORNER_CUTTING) == pytest.approx(
-            2 * 2**0.5 + 1
-        )
-        assert path_length(cells, MoveRule.UNIT) == 3
-    assert path_length([(0, 0), (-5, 3)], "unit") == 5
-    assert path_length([(0, 0), (1, -4)], "unit") == 4
-    assert path_length([], "unit") == path_length([(1, 1)]) == 0
+    assert path_length([(0, 0), (-3, 4)]) == 5
+    assert path_length([]) == path_length([(1, 1)]) == 0
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.1, 0.4, 0.5, 0.6, 1.0]), RULES)
@@ -117,7 +112,7 @@ def test_distances_and_paths_are_exact(
     distance = shortest_distances(grid, goal, rule)
     legal, cost = (
         grid.legal_moves(rule),
-        move_costs(grid.cost_multiplier, rule, grid.uphill),
+        move_costs(grid.cost_multiplier, grid.uphill),
     )
     assert distance[goal[1], goal[0]] == 0
     assert np.isinf(distance[grid.occupancy]).all()

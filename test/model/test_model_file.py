@@ -114,6 +114,15 @@ def save_as(path: Path, weights: QNetwork, /, **changes: object) -> None:
     path.write_bytes(content)
 
 
+def test_a_model_of_the_old_move_rule_unit_cuts_corners(
+    tmp_path: Path, network: QNetwork
+) -> None:
+    path = tmp_path / "model.safetensors"
+    save_as(path, network, move_rule="unit")
+    _, metadata = load_model(path)
+    assert metadata.move_rule is MoveRule.CORNER_CUTTING
+
+
 def test_wrong_metadata_is_refused_by_name(tmp_path: Path, network: QNetwork) -> None:
     path = tmp_path / "model.safetensors"
     for name, value, named in (

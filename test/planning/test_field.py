@@ -31,7 +31,12 @@ from strategies import (
 from ddqn_planner import GridMap, MoveRule, Plan, Planner, PlanStatus
 from ddqn_planner.grid import Cell, copies, grid_map, map_changes
 from ddqn_planner.grid.grid_map import LAYERS
-from ddqn_planner.grid.moves import MOVES, legal_moves, move_costs, shortest_distances
+from ddqn_planner.grid.moves import (
+    MOVES,
+    legal_moves,
+    move_costs,
+    shortest_distances,
+)
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.model import move_costs as move_costs_module
 from ddqn_planner.model.move_costs import MoveCosts
@@ -164,7 +169,7 @@ def test_values_keep_their_sense_at_any_distance() -> None:
     occupancy = np.zeros((501, 401), dtype=bool)
     occupancy[1::4, 1:] = occupancy[3::4, :-1] = True
     legal = legal_moves(occupancy, MoveRule.ROBOT_SAFE)
-    cost = np.where(legal, MoveRule.ROBOT_SAFE.lengths[:, None, None], np.inf)
+    cost = np.where(legal, np.hypot(*MOVES.T)[:, None, None], np.inf)
     patch_id = np.arange(occupancy.size, dtype=np.int32).reshape(occupancy.shape)
     q = propagate_values(patch_id, cost.reshape(8, -1).T.astype(np.float32), (0, 500))
     optimum = shortest_distances(GridMap(occupancy), (0, 500), MoveRule.ROBOT_SAFE)
@@ -334,7 +339,7 @@ def test_no_move_costs_more_than_the_highest_or_less_than_the_least(
     grid, _ = place
     costs = ANY_MAP.network.move_costs(grid, rule)
     assert costs is not None
-    exact = move_costs(grid.cost_multiplier, rule, grid.uphill)
+    exact = move_costs(grid.cost_multiplier, grid.uphill)
     legal = grid.legal_moves(rule)
     assert exact.max(initial=0, where=legal) <= 1.01 * costs.highest
     for first, bound in ((0, costs.straight), (1, costs.diagonal)):
@@ -706,7 +711,10 @@ def test_the_last_64_fields_are_kept_and_3_whatever_their_size() -> None:
 
 def test_fields_toward_other_goals_or_by_other_rules_are_not_repaired() -> None:
     grid = GridMap(np.zeros((9, 9)), cost=np.zeros((9, 9)))
-    for goal, rule in (((8, 8), MoveRule.ROBOT_SAFE), ((0, 0), MoveRule.UNIT)):
+    for goal, rule in (
+        ((8, 8), MoveRule.ROBOT_SAFE),
+        ((0, 0), MoveRule.CORNER_CUTTING),
+    ):
         planner = new_planner()
         _ = planner.q_field(grid, (0, 0), MoveRule.ROBOT_SAFE).value
         for changed in (grid, grid.with_patch([[True]], 4, 4)):

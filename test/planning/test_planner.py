@@ -92,7 +92,7 @@ def test_a_plan_is_the_cheapest(
         cost = cost_along(plan.cells, grid, rule)
         assert cost == pytest.approx(exact[start[::-1]], rel=2e-2)
         assert plan.cost is None or plan.cost == pytest.approx(cost)
-        assert plan.length == path_length(plan.cells, rule)
+        assert plan.length == path_length(plan.cells)
         simple = planner.plan(grid, start, goal, rule, method, simplified=True)
         straight = planner.q_field(grid, goal, rule).rollout(start, straight=True)
         assert simple.cells == simplify(straight.cells, grid, rule)
@@ -141,8 +141,12 @@ def test_a_request_off_the_free_cells_or_on_a_map_of_another_size_is_told_apart(
         ((1, 1), (2, 2), PlanStatus.START_OCCUPIED),
         ((0, 0), (1, 1), PlanStatus.GOAL_OCCUPIED),
     ):
-        plan = planner.plan(grid, start, goal, "unit")
-        assert (plan.status, plan.goal, plan.move_rule) == (status, None, MoveRule.UNIT)
+        plan = planner.plan(grid, start, goal, "corner_cutting")
+        assert (plan.status, plan.goal, plan.move_rule) == (
+            status,
+            None,
+            MoveRule.CORNER_CUTTING,
+        )
     larger = GridMap(np.zeros((4, 5)))
     assert (
         planner.plan(larger, (0, 0), (1, 1)).status is PlanStatus.MAP_SIZE_UNSUPPORTED
@@ -170,7 +174,7 @@ def test_a_plan_tells_how_long_field_and_rollout_took(
     assert plan.rollout_ms > 0
     # The time between two steps does not count.
     steps, began = (
-        planner.steps(PlanRequest(grid, (0, 0), ((3, 3),), "unit")),
+        planner.steps(PlanRequest(grid, (0, 0), ((3, 3),), "corner_cutting")),
         time.perf_counter(),
     )
     assert next(steps) is None
@@ -362,7 +366,7 @@ def test_plans_are_equal_whatever_time_they_took() -> None:
     others = (
         replace(PLAN, cost=2.6),
         replace(PLAN, goal=(0, 0)),
-        replace(PLAN, move_rule="unit"),
+        replace(PLAN, move_rule="corner_cutting"),
     )
     for other in (shorter, replace(PLAN, status=PlanStatus.NO_PATH), *others, CELLS):
         assert other != PLAN

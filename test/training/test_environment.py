@@ -38,10 +38,9 @@ def step_by_hand(
     if not (all(free) if rule is MoveRule.ROBOT_SAFE else free[0]):
         return cell, parameters.obstacle_reward, True
     if parameters.reward == "path_cost":
-        length = 1.0 if rule is MoveRule.UNIT else hypot(dx, dy)
         multiplier = scenario.grid.cost_multiplier
         mean = (multiplier[y, x] + multiplier[after[1], after[0]]) / 2
-        return after, -length * mean, after == scenario.goal
+        return after, -hypot(dx, dy) * mean, after == scenario.goal
     if after == scenario.goal:
         return after, parameters.goal_reward, True
     d_re, d_re_before = dist(after, scenario.goal), dist(cell, scenario.goal)

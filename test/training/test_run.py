@@ -55,7 +55,7 @@ def test_an_episode_is_a_row_of_the_curves(
             episode.average_reward, abs=1e-6
         )
         assert float(row["length"]) == pytest.approx(
-            path_length(episode.cells, rule), abs=1e-4
+            path_length(episode.cells), abs=1e-4
         )
     recorded = list(read_cells(tmp_path / "episodes.csv", every=3))
     assert recorded == [

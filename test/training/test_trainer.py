@@ -198,16 +198,20 @@ def test_an_episode_adds_up_its_own_rewards_alone(small: Scenario) -> None:
 
 
 def test_a_saved_model_plans_as_its_trainer(small: Scenario, tmp_path: Path) -> None:
-    small = replace(small, move_rule=MoveRule.UNIT)
+    small = replace(small, move_rule=MoveRule.CORNER_CUTTING)
     other = replace(small, grid=GridMap(np.zeros((4, 5))))
     trainer = Trainer([small, other], replace(QUICK, gamma=0.8), seed=3)
     train(trainer, 2)
     (tmp_path / "model.safetensors").write_bytes(trainer.model_bytes())
     network, found = load_model(tmp_path / "model.safetensors")
-    expected = trainer.planner().q_field(small.grid, small.goal, MoveRule.UNIT).q
-    assert (network.q_values(small.grid, small.goal, MoveRule.UNIT) == expected).all()
+    expected = (
+        trainer.planner().q_field(small.grid, small.goal, MoveRule.CORNER_CUTTING).q
+    )
+    assert (
+        network.q_values(small.grid, small.goal, MoveRule.CORNER_CUTTING) == expected
+    ).all()
     said = found.network, found.gamma, found.move_rule, found.seed, found.steps
-    assert said == ("paper", 0.8, MoveRule.UNIT, 3, 2)
+    assert said == ("paper", 0.8, MoveRule.CORNER_CUTTING, 3, 2)
     assert found.map_fingerprint == small.grid.fingerprint != other.grid.fingerprint
 
 

@@ -6,7 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import Place, grids_with_free_cell
 
-from ddqn_planner.grid import MoveRule, legal_moves, neighbours, shortest_distances
+from ddqn_planner.grid import (
+    LENGTHS,
+    MoveRule,
+    legal_moves,
+    neighbours,
+    shortest_distances,
+)
 from ddqn_planner.training.propagation import value_iteration
 
 
@@ -37,7 +43,7 @@ def test_without_discount_values_are_shortest_lengths(
     grid, goal = place
     shape = grid.occupancy.shape
     legal = legal_moves(grid.occupancy, rule).reshape(8, -1)
-    length = np.repeat(-rule.lengths[:, None], grid.occupancy.size, axis=1)
+    length = np.repeat(-LENGTHS[:, None], grid.occupancy.size, axis=1)
     number = goal[1] * grid.width + goal[0]
     return_AC = settled((legal, length), shape, number, collision=-1000.0)
     best = np.where(legal, return_AC, -np.inf).max(axis=0).reshape(shape)
