@@ -27,7 +27,8 @@ from tables import table
 from ddqn_planner import GridMap, Planner, load_map
 from ddqn_planner.cli import file_of
 from ddqn_planner.grid import MOVES, Cell, MoveRule
-from ddqn_planner.grid.moves import UPHILL, actions_along
+from ddqn_planner.grid.layers import UPHILL
+from ddqn_planner.grid.moves import actions_along
 from ddqn_planner.model import ModelMetadata, RobotNetwork, package_version
 from ddqn_planner.planning.plan import PosePlan
 from ddqn_planner.robot.footprint import read_footprint

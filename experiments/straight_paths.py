@@ -130,7 +130,7 @@ def measure_straight_paths(side: int, kinds: Sequence[str]) -> Iterator[bool]:
 
 def theta_star(grid: GridMap, start: Cell, goal: Cell) -> NDArray[np.int64]:
     """Return the path of Theta* (Daniel, Nash, Koenig and Felner 2010) by our rule and costs."""
-    return _theta_star(*start, *goal, MOVES, grid.for_kernels(RULE))
+    return _theta_star(*start, *goal, MOVES, grid.layers(RULE))
 
 
 @compiled
@@ -195,8 +195,7 @@ def optimum(occupancy: Occupancy, start: Cell, goal: Cell, finer: int = FINER) -
         ]
         corners = np.argwhere(~fine & np.any(is_corner, axis=0))[:, ::-1]
     return float(
-        _optimum(np.concatenate([ends, corners]), GridMap(fine).for_kernels(RULE))
-        / finer
+        _optimum(np.concatenate([ends, corners]), GridMap(fine).layers(RULE)) / finer
     )
 
 

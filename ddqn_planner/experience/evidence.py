@@ -20,7 +20,8 @@ from ddqn_planner.experience.prior import Prior
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
 from ddqn_planner.grid.grid_map import check_grid
-from ddqn_planner.grid.moves import MOVES, RISES
+from ddqn_planner.grid.layers import CLIMBED_SHARE
+from ddqn_planner.grid.moves import MOVES
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -111,9 +112,9 @@ def climbs_of(square: Int64, visits: NDArray[np.float32]) -> Climbs:
     told = visits[telling].astype(np.float64)
     (weight, log), (share, product) = (
         told.sum(axis=2).T[..., None],
-        (told @ RISES).swapaxes(0, 1),
+        (told @ CLIMBED_SHARE).swapaxes(0, 1),
     )
-    squared = told[:, 0] @ RISES**2 - share**2 / weight
+    squared = told[:, 0] @ CLIMBED_SHARE**2 - share**2 / weight
     product_with_log = product - share * log / weight
     of_driven = np.add.reduceat(np.hstack([squared, product_with_log]), begins)
     steps = np.append(0, MOVES @ ROW)  # to a square itself, and to those around it
@@ -200,7 +201,7 @@ class Evidence:
         weight = self.table[rows, 0]
         known = np.flatnonzero(weight >= KNOWN)
         steepest, rise = self.climbs.at(squares_of(self.table[rows, 5:]))
-        surprises = log - rise * RISES[toward, steepest]
+        surprises = log - rise * CLIMBED_SHARE[toward, steepest]
         surprises[known] -= self.flat[rows[known]] / weight[known]
         found = []
         for part in np.array_split(known, max(1, len(known) // PART)):
@@ -245,7 +246,7 @@ class Evidence:
         self.climbs = climbs_of(square, self.directed)
         # The sums of the log slowness, as if nobody had driven uphill.
         steepest, rise = self.climbs.at(square)
-        climbed = (self.directed[:, 0] * RISES[steepest]).sum(axis=1)
+        climbed = (self.directed[:, 0] * CLIMBED_SHARE[steepest]).sum(axis=1)
         self.flat = self.table[:, 1] - rise * climbed
         self.sums = (
             self.table[:, 0],

@@ -28,7 +28,8 @@ from ddqn_planner.grid.arguments import (
     numbers,
 )
 from ddqn_planner.grid.grid_map import Exploration
-from ddqn_planner.grid.moves import MOVES, UPHILL, actions_along, cells_along
+from ddqn_planner.grid.layers import UPHILL
+from ddqn_planner.grid.moves import MOVES, actions_along, cells_along
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]

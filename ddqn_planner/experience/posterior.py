@@ -12,7 +12,8 @@ from ddqn_planner.compiled import in_place
 from ddqn_planner.experience.prior import Prior, map_features
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
-from ddqn_planner.grid.moves import MOVES, STEEPER, UPHILL
+from ddqn_planner.grid.layers import STEEPNESS, UPHILL
+from ddqn_planner.grid.moves import MOVES
 
 if TYPE_CHECKING:
     from ddqn_planner.experience.evidence import Evidence
@@ -134,7 +135,7 @@ class Posterior:
         )
         self.slowness = np.exp(self.mean)
         toward, rise = evidence.climbs.at(self.square)
-        steps = np.minimum(np.rint(rise / STEEPER), STEEPEST).astype(np.int64)
+        steps = np.minimum(np.rint(rise / STEEPNESS), STEEPEST).astype(np.int64)
         codes = np.where(
             steps > 0, len(MOVES) * steps + (toward - self.turned) % len(MOVES), 0
         )

@@ -1,18 +1,10 @@
 """What the robot moves on: the grid map, the eight moves, shortest paths, map files and noise."""
 
 from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell
-from ddqn_planner.grid.grid_map import MAX_COST_MULTIPLIER, GridMap
+from ddqn_planner.grid.grid_map import GridMap
 from ddqn_planner.grid.inflation import clearance, inflate
+from ddqn_planner.grid.layers import MAX_COST_MULTIPLIER, legal_moves, move_costs
 from ddqn_planner.grid.map_file import MapFile, MapFileError, load_map, read_map_file
-from ddqn_planner.grid.moves import (
-    LENGTHS,
-    MOVES,
-    MoveRule,
-    legal_moves,
-    move_costs,
-    neighbours,
-    path_length,
-    shortest_distances,
-    shortest_path,
-)
+from ddqn_planner.grid.moves import LENGTHS, MOVES, MoveRule, neighbours, path_length
 from ddqn_planner.grid.noise import scatter_obstacles
+from ddqn_planner.grid.oracle import shortest_distances, shortest_path

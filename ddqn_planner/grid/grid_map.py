@@ -23,10 +23,17 @@ from ddqn_planner.grid.arguments import (
 )
 from ddqn_planner.grid.boxes import ORIGIN, Box
 from ddqn_planner.grid.copies import replaced
-from ddqn_planner.grid.moves import MoveRule, flood, legal_moves
-
-MAX_COST_MULTIPLIER = 5.0
-"""That of a cell of value 100 or unknown; as in Nav2's NavFn planner: 50 if free, at most 253."""
+from ddqn_planner.grid.flood import flood
+from ddqn_planner.grid.layers import (
+    NO_COST,
+    NO_FORBIDDEN,
+    NO_SLOWNESS,
+    NO_UPHILL,
+    Layers,
+    legal_moves,
+    multipliers_of,
+)
+from ddqn_planner.grid.moves import MoveRule
 
 LAYERS = (
     "occupancy",
@@ -48,14 +55,6 @@ MAX_CELLS_AWAY = (
 )  # float64 tells points so far away apart by less than 1/1000 of a cell
 MAX_YAW = 1e6  # radians, of an origin
 MAX_PATCHES = 512  # so many are known of a map, one after the other
-
-# Directions, costs, slowness and climbs of maps without. Not to be written to, as those of maps.
-NO_LAYERS = [
-    np.frombuffer(b"", dtype).reshape(0, 0) for dtype in ("u1", "i1", "f4", "u1")
-]
-
-# (101,): the multiplier of each cost, 0 to 100
-MULTIPLIERS = np.linspace(1, MAX_COST_MULTIPLIER, OCCUPIED + 1, dtype=np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -346,15 +345,15 @@ class GridMap:
     @cached_property
     def cost_multiplier(self) -> NDArray[np.float32]:
         """(H, W) float32: what a path costs per cell of its length: 1 to 5, times the slowness."""
+        slowness = self.slowness
         if self.cost is None:
-            return (
-                np.ones(self.occupancy.shape, "f4")
-                if self.slowness is None
-                else self.slowness
-            )
-        multiplier: NDArray[np.float32]
-        multiplier = MULTIPLIERS.take(self.cost, mode="wrap")  # -1 finds the last one
-        return multiplier if self.slowness is None else multiplier * self.slowness
+            if slowness is None:
+                return np.ones(self.occupancy.shape, np.float32)
+            return slowness
+        multiplier = multipliers_of(self.cost)
+        if slowness is not None:
+            multiplier = multiplier * slowness
+        return multiplier
 
     @cached_property
     def exploration(self) -> Exploration | None:
@@ -376,15 +375,17 @@ class GridMap:
         """Return which moves are legal in each cell, see `legal_moves`: (8, H, W) bool."""
         return legal_moves(self.occupancy, move_rule, self.forbidden)
 
-    def for_kernels(self, move_rule: MoveRule | str) -> tuple[Any, ...]:
-        """Return what compiled code asks of the map; empty arrays for missing layers."""
+    def layers(self, move_rule: MoveRule | str) -> Layers:
+        """Return the layers on which moves depend, for compiled code."""
         rule = MoveRule(move_rule)
-        layers = self.forbidden, self.cost, self.slowness, self.uphill
-        known = [
-            none if it is None else it
-            for it, none in zip(layers, NO_LAYERS, strict=True)
-        ]
-        return self.occupancy, *known, rule.cuts_corners
+        return Layers(
+            occupancy=self.occupancy,
+            forbidden=NO_FORBIDDEN if self.forbidden is None else self.forbidden,
+            cost=NO_COST if self.cost is None else self.cost,
+            slowness=NO_SLOWNESS if self.slowness is None else self.slowness,
+            uphill=NO_UPHILL if self.uphill is None else self.uphill,
+            cuts_corners=rule.cuts_corners,
+        )
 
     def reachable(
         self, cells: ArrayLike, move_rule: MoveRule | str, backward: bool = False
@@ -401,7 +402,7 @@ class GridMap:
         reached[array[:, 1], array[:, 0]] = True
         waiting, first = np.empty(reached.size, np.int64), np.flatnonzero(reached)
         waiting[: first.size] = first  # each cell waits at most once
-        flood(self.for_kernels(move_rule), backward, reached, waiting, first.size)
+        flood(self.layers(move_rule), backward, reached, waiting, first.size)
         return reached
 
     @cached_property

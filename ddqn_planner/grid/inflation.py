@@ -8,7 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Occupancy, as_mask, as_number
 from ddqn_planner.grid.boxes import Box, cells_in, hull, wider, within
-from ddqn_planner.grid.grid_map import MAX_COST_MULTIPLIER, GridMap, check_grid
+from ddqn_planner.grid.grid_map import GridMap, check_grid
+from ddqn_planner.grid.layers import MAX_COST_MULTIPLIER
 
 # Linear and exponential costs, with paths as long, kept no clearly greater distances.
 CLEARANCE_SCALE = 1.0

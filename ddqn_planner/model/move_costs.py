@@ -21,7 +21,7 @@ from ddqn_planner.grid import (
 from ddqn_planner.grid.boxes import ORIGIN, Box, wider, within
 from ddqn_planner.grid.copies import replaced
 from ddqn_planner.grid.grid_map import LAYERS
-from ddqn_planner.grid.moves import UPHILL
+from ddqn_planner.grid.layers import UPHILL
 
 # Shapes: C = cells of the padded map, P = patches, S = sets of actions, A = 8 actions, L = the 102
 # values of a cell: 0 for unknown, 1 to 100 for the costs 0 to 99, 101 for occupied.

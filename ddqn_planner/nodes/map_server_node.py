@@ -13,8 +13,8 @@ from rclpy.exceptions import NameValidationException
 
 from ddqn_planner.grid import OCCUPIED, Cell, GridMap, MapFile, MoveRule, read_map_file
 from ddqn_planner.grid.map_file import MapDataError, MapMetadataError, MapNotFoundError
-from ddqn_planner.grid.moves import shortest_path
 from ddqn_planner.grid.noise import scatter_obstacles
+from ddqn_planner.grid.oracle import shortest_path
 from ddqn_planner.nodes.base_node import BaseNode
 from ddqn_planner.nodes.conversions import occupancy_message
 from ddqn_planner.nodes.declared import Declared

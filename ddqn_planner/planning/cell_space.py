@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place, inlined, inner
 from ddqn_planner.grid import MOVES
-from ddqn_planner.grid.moves import UPHILL
+from ddqn_planner.grid.layers import UPHILL
 from ddqn_planner.model.move_costs import MARGIN, VALUES, MoveCosts
 
 # States. The distance of an open cell may fall; that of a closed one is the least. Until a cell is

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place
 from ddqn_planner.grid import GridMap, MoveRule
+from ddqn_planner.grid.layers import actions_of_segment
 from ddqn_planner.grid.moves import positions
-from ddqn_planner.planning.segments import BITS, Path
+from ddqn_planner.planning.segments import Path
 
 Float64 = NDArray[np.float64]
 Point = tuple[float, float]
@@ -121,10 +122,10 @@ def _is_clear(begin: Any, end: Any, grid: GridMap) -> bool:
 
     The cells of its ends need not be free: a robot may leave an obstacle.
     """
-    occupancy, forbidden, *_ = grid.for_kernels(MoveRule.ROBOT_SAFE)
+    layers = grid.layers(MoveRule.ROBOT_SAFE)
     (x, y), (to_x, to_y) = begin.tolist(), end.tolist()
     return _touches_none(
-        float(x), float(y), float(to_x), float(to_y), occupancy, forbidden
+        float(x), float(y), float(to_x), float(to_y), layers.occupancy, layers.forbidden
     )
 
 
@@ -142,11 +143,7 @@ def _touches_none(
     dy = to_y - y
     step_x = (dx > MARGIN) - (dx < -MARGIN)
     step_y = (dy > MARGIN) - (dy < -MARGIN)
-    # It lies between a diagonal move and one along its longer axis.
-    actions = BITS[step_y + 1, step_x + 1]
-    actions |= BITS[
-        step_y * (abs(dy) >= abs(dx)) + 1, step_x * (abs(dx) >= abs(dy)) + 1
-    ]
+    actions = actions_of_segment(step_x, step_y, abs(dx), abs(dy))
     left = min(x, to_x)
     right = max(x, to_x)
     bottom = min(y, to_y)

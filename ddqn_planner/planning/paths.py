@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import compiled
-from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap, MoveRule
+from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import Cells, Occupancy
-from ddqn_planner.grid.moves import cells_along, is_legal
+from ddqn_planner.grid.layers import Layers, cost_of_move, is_legal
+from ddqn_planner.grid.moves import cells_along
 from ddqn_planner.planning.field import Goals
 from ddqn_planner.planning.plan import ROUNDING, PlanRequest, PlanStatus
 from ddqn_planner.planning.segments import (
@@ -17,9 +18,7 @@ from ddqn_planner.planning.segments import (
     Path,
     cost_along,
     legal_segments,
-    multiplier_at,
     straightened,
-    uphill_at,
 )
 
 REACH = 5  # cells along an axis that a robot may be beside its path, and still come back to it
@@ -45,8 +44,7 @@ def search(
         (x, y), end = end, np.zeros(shape, dtype=np.bool_)
         end[y, x] = True
     value = np.zeros(shape, np.float32) if value is None else value
-    layers = grid.for_kernels(move_rule)
-    entered_by, found = _search(start, end, value, LENGTHS, layers)
+    entered_by, found = _search(start, end, value, grid.layers(move_rule))
     if found < 0:
         return ()
     cells = [(found % grid.width, found // grid.width)]
@@ -59,7 +57,7 @@ def search(
 
 @compiled
 def _search(
-    start: Cell, ends: Any, value: Any, lengths: Any, layers: Any
+    start: Cell, ends: Any, value: Any, layers: Layers
 ) -> tuple[NDArray[np.int8], int]:
     """Return the action by which each cell was entered, (H, W) int8, and the end's number or -1."""
     height, width = ends.shape
@@ -80,12 +78,8 @@ def _search(
             to_x, to_y = x + MOVES[action, 0], y + MOVES[action, 1]
             if not (0 <= to_x < width and 0 <= to_y < height) or visited[to_y, to_x]:
                 continue
-            if not layers[0][to_y, to_x] and is_legal(x, y, action, layers):
-                dx, dy = to_x - x, to_y - y
-                both = multiplier_at(x, y, layers) * uphill_at(x, y, dx, dy, layers)
-                there = uphill_at(to_x, to_y, dx, dy, layers)
-                both += multiplier_at(to_x, to_y, layers) * there
-                through = cost + lengths[action] * both / 2
+            if not layers.occupancy[to_y, to_x] and is_legal(x, y, action, layers):
+                through = cost + cost_of_move(x, y, action, layers)
                 order = through - value[to_y, to_x]
                 if np.isnan(order):
                     order = np.inf

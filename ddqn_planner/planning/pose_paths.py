@@ -8,11 +8,10 @@ from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place
 from ddqn_planner.grid import GridMap
-from ddqn_planner.grid.grid_map import MULTIPLIERS
-from ddqn_planner.grid.moves import UPHILL, actions_along
+from ddqn_planner.grid.layers import UPHILL, multipliers_of
+from ddqn_planner.grid.moves import ACTION_OF_STEP, actions_along
 from ddqn_planner.planning.plan import PlanStatus, PosePlan
 from ddqn_planner.planning.pose_world import body_costs, occupied_for_body
-from ddqn_planner.planning.segments import ACTIONS
 from ddqn_planner.robot.footprint import inside, outline
 from ddqn_planner.robot.motions import BEHIND, TURN, turn_between
 
@@ -98,7 +97,9 @@ def is_free(poses: Float64, grid: GridMap, body: Body) -> bool:
     if grid.forbidden is None:
         return True
     x, y = cells.T
-    leaves = ACTIONS[np.clip(np.diff(y), -1, 1) + 1, np.clip(np.diff(x), -1, 1) + 1]
+    leaves = ACTION_OF_STEP[
+        np.clip(np.diff(y), -1, 1) + 1, np.clip(np.diff(x), -1, 1) + 1
+    ]
     return not (grid.forbidden[y[:-1], x[:-1]] >> leaves & 1).any()
 
 
@@ -118,7 +119,7 @@ def cost_of_poses(poses: Float64, grid: GridMap) -> float:
     spent[length < 1e-6] = (turn * TURN / grid.resolution)[length < 1e-6]
     x, y = cells_of(path[:-1]).T
     if (cost := body_costs(grid)) is not None:
-        spent *= MULTIPLIERS.take(cost[y, x], mode="wrap")
+        spent *= multipliers_of(cost[y, x])
     if grid.slowness is not None:
         spent *= grid.slowness[y, x]
     if grid.uphill is not None:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place, inlined
+from ddqn_planner.grid.layers import has_costs
 from ddqn_planner.planning.pose_world import (
     SHIFT,
     TILE,
@@ -307,7 +308,7 @@ def take_back(
     if limit < kept or limit == np.inf:
         return limit
     # What costs more than a primitive beyond the limit is not reached from a closed state below it.
-    last = limit if world.cost.size + world.slowness.size == 0 else np.float32(np.inf)
+    last = limit if not has_costs(world.layers) else np.float32(np.inf)
     for cost in world.body.cost:
         last = max(last, limit + cost)
     for tile in tiles:

@@ -9,10 +9,9 @@ from ddqn_planner.compiled import in_place, inlined
 from ddqn_planner.grid import GridMap, MoveRule
 from ddqn_planner.grid.arguments import OCCUPIED
 from ddqn_planner.grid.boxes import Box
-from ddqn_planner.grid.grid_map import MULTIPLIERS
+from ddqn_planner.grid.layers import UPHILL, Layers, forbids, has_costs, multiplier_at
 from ddqn_planner.grid.map_changes import changed_cells
-from ddqn_planner.grid.moves import UPHILL, actions_along
-from ddqn_planner.planning.segments import ACTIONS
+from ddqn_planner.grid.moves import ACTION_OF_STEP, actions_along
 from ddqn_planner.robot.motions import HEADINGS, Motions, closer
 
 SHIFT: Final = 2  # so many bits tell where in its tile a cell lies, along a side
@@ -69,7 +68,7 @@ class Body(NamedTuple):
 
 
 class World(NamedTuple):
-    """A body on a map as kernels use it; empty arrays for layers that the map does not have."""
+    """A body on a map as kernels use it."""
 
     body: Body
     bits: NDArray[
@@ -83,10 +82,7 @@ class World(NamedTuple):
     ]  # by tile: whether the body may pass one of its cells, likewise
     height: int
     width: int
-    forbidden: NDArray[np.uint8]  # (H, W)
-    cost: NDArray[np.int8]  # (H, W)
-    slowness: NDArray[np.float32]  # (H, W)
-    uphill: NDArray[np.uint8]  # (H, W)
+    layers: Layers
 
 
 def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
@@ -173,7 +169,9 @@ def _passed(
     x, y = np.diff(cells[begins], axis=0).T
     moved = way[np.append(begins[1:], len(way) - 1)] - way[begins]
     moves = np.where(moved.any(axis=1), actions_along(moved), 8)
-    return np.column_stack([cells[begins], [*ACTIONS[y + 1, x + 1], 8], moves]), share
+    return np.column_stack(
+        [cells[begins], [*ACTION_OF_STEP[y + 1, x + 1], 8], moves]
+    ), share
 
 
 def occupied_for_body(grid: GridMap) -> NDArray[np.bool_]:
@@ -225,10 +223,11 @@ def world_of(
     bits[BORDER + bottom : BORDER + top] = np.packbits(
         line, axis=1, bitorder="little"
     ).view("<u8")
-    _, *layers, _ = grid.for_kernels(MoveRule.ROBOT_SAFE)
-    if (costs := body_costs(grid)) is not None:
-        layers[1] = costs
-    return World(body, bits, tile, room, height, width, *layers)
+    layers = grid.layers(MoveRule.ROBOT_SAFE)
+    costs = body_costs(grid)
+    if costs is not None:
+        layers = layers._replace(cost=costs)
+    return World(body, bits, tile, room, height, width, layers)
 
 
 def differences(old: GridMap, new: GridMap) -> NDArray[np.int64] | None:
@@ -281,24 +280,18 @@ def is_far(x: int, y: int, world: Any) -> bool:
 @inlined
 def cost_of(x: int, y: int, number: int, world: Any) -> Any:
     """Return the cost of a primitive that the body has room for, infinite if it is forbidden."""
-    body, total = world.body, np.float32(0)
-    if world.cost.size + world.slowness.size + world.forbidden.size == 0:
+    body = world.body
+    layers = world.layers
+    if not has_costs(layers) and layers.forbidden.size == 0:
         return body.cost[number]
+    total = np.float32(0)
     for place in range(body.first_passed[number], body.first_passed[number + 1]):
         column, line = x + body.passed[place, 0], y + body.passed[place, 1]
-        if (
-            world.forbidden.size > 0
-            and world.forbidden[line, column] >> body.passed[place, 2] & 1
-        ):
+        if forbids(column, line, body.passed[place, 2], layers):
             return np.float32(np.inf)
-        factor = np.float32(1)
-        if world.cost.size > 0:
-            factor = MULTIPLIERS[world.cost[line, column]]
-        if world.slowness.size > 0:
-            factor *= world.slowness[line, column]
-        part = body.share[place] * factor
-        if world.uphill.size > 0:
-            part *= UPHILL[world.uphill[line, column], body.passed[place, 3]]
+        part = body.share[place] * multiplier_at(column, line, np.float32(1), layers)
+        if layers.uphill.size > 0:
+            part *= UPHILL[layers.uphill[line, column], body.passed[place, 3]]
         total += part
     # Rounded, the shares may be less than 1 together; what counts on the least cost relies on it.
     return body.cost[number] * max(total, np.float32(1))

@@ -1,26 +1,28 @@
 """Straight segments between cells, and paths of few of them: string pulling, in compiled code."""
 
 import math
-from functools import partial
 from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.compiled import in_place, inlined, inner
+from ddqn_planner.compiled import in_place, inlined
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import Cells, cells_inside
-from ddqn_planner.grid.grid_map import MULTIPLIERS, check_grid
-from ddqn_planner.grid.moves import UPHILL
+from ddqn_planner.grid.grid_map import check_grid
+from ddqn_planner.grid.layers import (
+    Layers,
+    actions_of_segment,
+    has_costs,
+    multiplier_at,
+    uphill_at,
+)
 
 Path: TypeAlias = NDArray[np.int32]  # (N, 2): cells, joined by moves or by segments
 LONG: Final = 400  # cells: a longer path is pulled once, as twice saves less than 0.1 %
 SAME_COST: Final = (
     1 + 1e-9
 )  # a path may cost so much more, and still as much: sums are rounded
-ACTIONS = np.full((3, 3), 8)  # the action by which a step is taken, 8 for none
-ACTIONS[MOVES[:, 1] + 1, MOVES[:, 0] + 1] = np.arange(8)
-BITS = (1 << ACTIONS).astype(np.uint8)  # that action in a set of them
 
 
 def simplify(
@@ -53,7 +55,7 @@ def simplify(
 
 def straightened(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> Path:
     """Do the work of `simplify` for a path of one cell or more."""
-    layers, least, best = grid.for_kernels(move_rule), np.inf, np.asarray(path)
+    layers, least, best = grid.layers(move_rule), np.inf, np.asarray(path)
     # Without costs, nothing between two cells costs less than a segment.
     until = (
         np.cumsum(_segment_costs(path, layers, 1.0)) if grid.has_costs else np.empty(0)
@@ -74,7 +76,7 @@ def straightened(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> Path:
 
 def cost_along(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> float:
     """Return what a path of segments costs, legal or not: each cell counts by its share of it."""
-    return float(_segment_costs(path, grid.for_kernels(move_rule), 1.0).sum())
+    return float(_segment_costs(path, grid.layers(move_rule), 1.0).sum())
 
 
 def legal_segments(
@@ -83,12 +85,10 @@ def legal_segments(
     """Return which segments are legal, see `simplify`, the first one from a share of it on."""
     begins = np.zeros(len(path))
     begins[1:2] = begin
-    return _segment_costs(path, grid.for_kernels(move_rule), begins)[1:] < np.inf
+    return _segment_costs(path, grid.layers(move_rule), begins)[1:] < np.inf
 
 
-def _segment_costs(
-    path: Cells, layers: tuple[Any, ...], begins: Any
-) -> NDArray[np.float64]:
+def _segment_costs(path: Cells, layers: Layers, begins: Any) -> NDArray[np.float64]:
     """Return 0 and the cost of each segment, see `_cost`, which begins at a share of it."""
     # With 64 bits, whatever is computed with a cell has its type, and numba compiles once for it.
     cells, costs = np.array(path, np.int64), np.full(len(path), begins)
@@ -103,32 +103,6 @@ def _length(width: int, height: int) -> float:
 
 
 @inlined
-def multiplier_at(x: int, y: int, layers: Any) -> Any:
-    """Return the cost multiplier of a cell, see `GridMap.cost_multiplier`."""
-    _, _, cost, slowness, _, _ = layers
-    column, row = np.uint64(x), np.uint64(y)
-    multiplier = np.float64(MULTIPLIERS[cost[row, column]]) if cost.size else 1.0
-    return multiplier * slowness[row, column] if slowness.size else multiplier
-
-
-@partial(
-    inner, _nrt=False
-)  # not inlined: what few maps need must not slow the others down
-def uphill_at(x: int, y: int, dx: int, dy: int, layers: Any) -> Any:
-    """Return the factor of a way's cost in a cell, see `GridMap.uphill`: between two actions'."""
-    uphill = layers[4]
-    if uphill.size == 0:
-        return 1.0
-    code, width, height = uphill[np.uint64(y), np.uint64(x)], abs(dx), abs(dy)
-    step_x, step_y = (dx > 0) - (dx < 0), (dy > 0) - (dy < 0)
-    diagonal = UPHILL[code, ACTIONS[step_y + 1, step_x + 1]]
-    straight = ACTIONS[step_y * (height >= width) + 1, step_x * (width >= height) + 1]
-    shorter, longer = (width, height) if width < height else (height, width)
-    share = shorter / longer if longer > 0 else 0.0
-    return share * diagonal + (1 - share) * UPHILL[code, straight]
-
-
-@inlined
 def _is_free(x: int, y: int, occupancy: Any) -> bool:
     """Return whether a cell lies on the map and is free."""
     return (
@@ -139,16 +113,16 @@ def _is_free(x: int, y: int, occupancy: Any) -> bool:
 
 
 @inlined
-def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -> float:
+def _cost(
+    x: int, y: int, last_x: int, last_y: int, begin: float, layers: Layers
+) -> float:
     """Return the cost of a segment, infinity if it is not legal from a share of it on."""
-    occupancy, forbidden, cost, slowness, uphill, cuts_corners = layers
-    has_costs = cost.size + slowness.size > 0
+    occupancy, forbidden, _, _, uphill, cuts_corners = layers
+    costs_differ = has_costs(layers)
     dx, dy = last_x - x, last_y - y
     step_x, step_y = (dx > 0) - (dx < 0), (dy > 0) - (dy < 0)
     width, height = abs(dx), abs(dy)
-    # It lies between a diagonal move and one along its longer axis.
-    takes = BITS[step_y + 1, step_x + 1]
-    takes |= BITS[step_y * (height >= width) + 1, step_x * (width >= height) + 1]
+    takes = actions_of_segment(step_x, step_y, width, height)
     length = _length(width, height)
     # Positions on the segment count from 0 at its first point to `whole` at its last one: then all
     # crossings of edges of cells are whole numbers.
@@ -170,34 +144,32 @@ def _cost(x: int, y: int, last_x: int, last_y: int, begin: float, layers: Any) -
             blocked |= occupancy[row, np.uint64(x + step_x)]
             blocked |= occupancy[np.uint64(y + step_y), column]
         legal = until <= ignored or not blocked
-        if has_costs:
-            part = (until - at) * multiplier_at(x, y, layers)
+        if costs_differ:
+            part = (until - at) * multiplier_at(x, y, np.float64(1), layers)
             total += part * uphill_at(x, y, dx, dy, layers) if uphill.size else part
         at = until
         if at_column == until:
             x, at_column = x + step_x, at_column + 2 * height
         if at_row == until:
             y, at_row = y + step_y, at_row + 2 * width
-    length *= total / whole if has_costs else 1.0
+    length *= total / whole if costs_differ else 1.0
     return length if legal else np.inf
 
 
 @inlined
 def _is_right_angle(
-    x: int, y: int, at_x: int, at_y: int, to_x: int, to_y: int, layers: Any
+    x: int, y: int, at_x: int, at_y: int, to_x: int, to_y: int, layers: Layers
 ) -> bool:
     """Return if a way is surely the least: a right angle around an occupied cell, no costs."""
-    occupancy, _, cost, slowness, _, cuts_corners = layers
+    occupancy = layers.occupancy
     dx, dy = x + to_x - 2 * at_x, y + to_y - 2 * at_y
     is_blocked = occupancy[at_y + (dy > 0) - (dy < 0), at_x + (dx > 0) - (dx < 0)]
     is_right = (x == at_x or to_x == at_x) and (y == at_y or to_y == at_y)
-    return (
-        is_right and is_blocked and cost.size + slowness.size == 0 and not cuts_corners
-    )
+    return is_right and is_blocked and not has_costs(layers) and not layers.cuts_corners
 
 
 @in_place
-def _costs(path: Any, costs: Any, layers: Any) -> None:
+def _costs(path: Any, costs: Any, layers: Layers) -> None:
     """Do the work of `_segment_costs`; cells may lie outside the map, where none is legal."""
     height, width = layers[0].shape
     costs[0] = 0.0
@@ -219,7 +191,7 @@ def _costs(path: Any, costs: Any, layers: Any) -> None:
 
 
 @in_place
-def _pull(path: Any, costs: Any, until: Any, backward: bool, layers: Any) -> int:
+def _pull(path: Any, costs: Any, until: Any, backward: bool, layers: Layers) -> int:
     """Keep cells far along the path that are seen from the one before; return how many."""
     first, number, last = 0, 0, path.shape[0] - 1
     while first < last:
@@ -262,7 +234,9 @@ def _pull(path: Any, costs: Any, until: Any, backward: bool, layers: Any) -> int
 
 
 @in_place
-def _move_corners(path: Any, count: int, costs: Any, layers: Any) -> tuple[int, bool]:
+def _move_corners(
+    path: Any, count: int, costs: Any, layers: Layers
+) -> tuple[int, bool]:
     """Move or leave out corners while it costs less; return the cells left, and if any moved."""
     occupancy, is_better, corner = layers[0], False, 1
     moved_by = (

@@ -10,7 +10,9 @@ from strategies import RULES, Data, Place, grids_uphill, grids_with_directions
 
 from ddqn_planner import GridMap, MoveRule
 from ddqn_planner.grid import LENGTHS, MOVES, neighbours, shortest_path
-from ddqn_planner.grid.moves import move_costs, path_length, shortest_distances
+from ddqn_planner.grid.layers import move_costs
+from ddqn_planner.grid.moves import path_length
+from ddqn_planner.grid.oracle import shortest_distances
 from ddqn_planner.planning import PlanMethod
 from ddqn_planner.planning.segments import cost_along
 

@@ -14,7 +14,8 @@ from strategies import Place, grids_with_costs, grids_with_free_cell
 
 from ddqn_planner import MoveRule
 from ddqn_planner.grid import MAX_COST_MULTIPLIER, OCCUPIED, UNKNOWN
-from ddqn_planner.grid.moves import MOVES, shortest_distances
+from ddqn_planner.grid.moves import MOVES
+from ddqn_planner.grid.oracle import shortest_distances
 from ddqn_planner.model import ModelMetadata, PropagationQNetwork, load_model
 from ddqn_planner.model.certificate import (
     MAX_FILTERS,

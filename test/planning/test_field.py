@@ -31,13 +31,10 @@ from strategies import (
 from ddqn_planner import GridMap, MoveRule, Plan, Planner, PlanStatus
 from ddqn_planner.grid import Cell, copies, grid_map, map_changes
 from ddqn_planner.grid.grid_map import LAYERS
-from ddqn_planner.grid.moves import (
-    MOVES,
-    legal_moves,
-    move_costs,
-    shortest_distances,
-)
+from ddqn_planner.grid.layers import legal_moves, move_costs
+from ddqn_planner.grid.moves import MOVES
 from ddqn_planner.grid.noise import random_requests
+from ddqn_planner.grid.oracle import shortest_distances
 from ddqn_planner.model import move_costs as move_costs_module
 from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning import cell_space as kernels

@@ -1,0 +1,56 @@
+"""Which cells paths lead to, in compiled code."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.compiled import in_place
+from ddqn_planner.grid.layers import Layers, is_legal
+from ddqn_planner.grid.moves import MOVES
+
+HALF_TURN = 4  # action ^ 4 is the opposite one
+
+
+@in_place
+def flood(
+    layers: Layers,
+    backward: Any,
+    reached: NDArray[np.bool_],
+    waiting: NDArray[np.int64],
+    count: Any,
+) -> None:  # pragma: no cover
+    """Mark all cells to which paths lead from the waiting cells, or backward, from which.
+
+    Parameters
+    ----------
+    layers : Layers
+    backward : bool
+        Whether paths lead to the waiting cells instead.
+    reached : (H, W) bool
+        True in the waiting cells; the other cells that are reached are marked.
+    waiting : (H * W,) int64
+        A stack of cells, y * W + x, from which no moves have been made yet.
+    count : int
+        How many cells are on the stack.
+    """
+    height, width = reached.shape
+    while count > 0:
+        count -= 1
+        y = waiting[count] // width
+        x = waiting[count] % width
+        for action in range(8):
+            next_x = x + MOVES[action, 0]
+            next_y = y + MOVES[action, 1]
+            if not (0 <= next_x < width and 0 <= next_y < height):
+                continue
+            if reached[next_y, next_x] or layers.occupancy[next_y, next_x]:
+                continue
+            if backward:  # the opposite move leads from the next cell to this one
+                legal = is_legal(next_x, next_y, action ^ HALF_TURN, layers)
+            else:
+                legal = is_legal(x, y, action, layers)
+            if legal:
+                reached[next_y, next_x] = True
+                waiting[count] = next_y * width + next_x
+                count += 1
