@@ -124,7 +124,6 @@ RVIZ_TOPICS = {
     "/plan": "plan",
     "/planner/value": f"{PLANNER}/value",
     "/planner/value_updates": f"{PLANNER}/value_updates",
-    "/planner/policy": f"{PLANNER}/policy",
     "/trainer/episode": "trainer/episode",
     "/initialpose": "initialpose",
     "/goal_pose": "goal_pose",

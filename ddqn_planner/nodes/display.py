@@ -1,8 +1,7 @@
-"""What RViz shows: a Q field's value as a map, its policy as arrows, a body along its path."""
+"""Messages for RViz: the value of a Q field as a map, a body's outlines along a path."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from geometry_msgs.msg import Point
@@ -14,178 +13,245 @@ from rclpy.node import Node
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from ddqn_planner.grid import MOVES, GridMap
+from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import occupancy_message
 from ddqn_planner.nodes.outcome import Outcome
 from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.nodes.worker import Worker
-from ddqn_planner.planning import QField
+from ddqn_planner.planning import PlanRequest, QField
 from ddqn_planner.planning.plan import PosePlan
 from ddqn_planner.robot.motions import turn_between
 
-MAX_ARROWS = 10_000  # more take longer to make than a plan, and are too small to see
-LINE_WIDTH = 0.06  # in cells; larger arrows have wider lines
-APART, TURN, BODY_LINE = (
-    0.25,
-    0.5,
-    0.01,
-)  # metres: between two bodies, a radian's, a line's width
-HEIGHT = 0.01  # metres above the map, so that the map does not hide the arrows
+Float64 = NDArray[np.float64]
+
+OUTLINE_SPACING = 0.25  # metres of a path between two outlines
+METRES_PER_RADIAN = 0.5  # of a turn, when the path between two outlines is measured
+LINE_WIDTH = 0.01  # metres
+HEIGHT = 0.01  # metres above the map, so that the map does not hide the lines
 COLOUR = ColorRGBA(r=0.13, g=0.13, b=0.23, a=0.9)
 
-# Tail, tip and the ends of the two barbs of an arrow toward +x, in cells: complex numbers as
-# points, since to turn is to multiply.
-ARROW = np.array([-0.35, 0.35, 0.1 + 0.175j, 0.1 - 0.175j])
-DIRECTIONS = np.exp(1j * np.arctan2(MOVES[:, 1], MOVES[:, 0]))
+
+class Picture(NamedTuple):
+    """What the topics show of an outcome; empty when its goal is gone."""
+
+    outcome: Outcome
+    header: Header
+    is_empty: bool
+
+    @property
+    def subject(self) -> tuple[object, ...]:
+        """What differs between two pictures.
+
+        The goal is part of it, as two goals may have the same field.
+        """
+        request = self.outcome.request
+        plan = self.outcome.plan
+        grid = None if request is None else request.grid
+        planner = None if self.is_empty else self.outcome.planner
+        path: object = plan if isinstance(plan, PosePlan) else None
+        move_rule = request.move_rule if isinstance(request, PlanRequest) else None
+        return planner, grid, plan.goal, self.outcome.goal, path, move_rule
+
+
+class Topic(NamedTuple):
+    """A topic of the display, and how its messages are made."""
+
+    name: str
+    message_type: type
+    is_for_bodies: bool  # whether it shows the plans of robots with a body
+    make_message: Callable[[Picture], object]
+    make_empty_message: Callable[[Picture], object]
 
 
 class FieldDisplay:
-    """Publishes what subscribers ask for: ``~/value``, ``~/policy``, ``~/footprints``."""
+    """Publishes ``~/value`` and ``~/footprints`` while somebody subscribes to them."""
 
-    # Its worker, which publishes, has no other calls: neither requests nor maps wait for a field
-    # that is only shown.
+    # Its worker, which publishes, has no other calls: neither requests nor maps wait
+    # for a field that is only shown.
     def __init__(self, node: Node, worker: Worker) -> None:
-        self._logger, self._worker = node.get_logger(), worker
-        self._shown: Outcome | None = None
-        # Of what each topic showed when it was published last, the header; None for nothing.
-        self._published: dict[str, Header | None] = dict.fromkeys(LAYERS)
+        self._logger = node.get_logger()
+        self._worker = worker
+        self._picture: Picture | None = None
+        # By topic, the picture that was published last; None for an empty one.
+        self._published: dict[str, Picture | None] = {
+            topic.name: None for topic in TOPICS
+        }
         matched = PublisherEventCallbacks(matched=self._look)
         self._publishers = {
-            name: node.create_publisher(
-                kind, f"~/{name}", LATCHED, event_callbacks=matched
+            topic.name: node.create_publisher(
+                topic.message_type,
+                f"~/{topic.name}",
+                LATCHED,
+                event_callbacks=matched,
             )
-            for name, (kind, _) in LAYERS.items()
+            for topic in TOPICS
         }
 
     def show(self, outcome: Outcome) -> None:
-        """Show the field of an outcome from now on; none if it has none, as of another goal."""
-        last = self._shown
-        if outcome.plan.goal is None and last is not None:
-            outcome = replace(last, planner=None, header=outcome.header)
-        if outcome.plan.goal and (last is None or _key(outcome) != _key(last)):
-            self._shown = outcome
+        """Show an outcome from now on; an empty picture if it has no goal."""
+        last = self._picture
+        if outcome.plan.goal is not None:
+            picture = Picture(outcome, outcome.header, is_empty=False)
+        elif last is not None:
+            picture = Picture(last.outcome, outcome.header, is_empty=True)
+        else:
+            return
+        if last is None or picture.subject != last.subject:
+            self._picture = picture
             self._look()
 
     def _look(self, _: object = None) -> None:
         self._worker.call(self._publish)
 
     def _publish(self) -> None:
-        for name, publisher in self._publishers.items():
-            if (shown := self._shown) is None:
+        for topic in TOPICS:
+            picture = self._picture
+            if picture is None:
                 return
-            if isinstance(shown.plan, PosePlan) != (name == "footprints"):
-                shown = replace(shown, planner=None)
-            visible = shown.header if shown.planner is not None else None
             try:
-                # What is latched is cleared even if nobody subscribes now.
-                is_asked_for = visible is None or publisher.get_subscription_count() > 0
-                if visible is not self._published[name] and is_asked_for:
-                    self._published[name] = visible
-                    publisher.publish(LAYERS[name][1](shown))
+                self._update(topic, picture)
             except InvalidHandle:  # cleaned up meanwhile
                 return
-            except (
-                Exception
-            ) as error:  # as when no memory is left: the node must survive
-                self._logger.error(
-                    f"no {name} is shown ({error!r}); give a smaller map"
-                )
+            # As when no memory is left: the node must survive.
+            except Exception as error:
+                reason = f"no {topic.name} is shown ({error!r})"
+                self._logger.error(f"{reason}; give a smaller map")
 
-
-def _key(outcome: Outcome) -> tuple[object, ...]:
-    """Return what is shown of an outcome: another goal is, though its field may be the same."""
-    request, plan = outcome.request, outcome.plan
-    way = plan if isinstance(plan, PosePlan) else getattr(request, "move_rule", None)
-    return outcome.planner, request and request.grid, plan.goal, outcome.goal, way
-
-
-def _field_of(outcome: Any) -> tuple[QField | None, GridMap, Header]:
-    """Return the field of an outcome, which is computed, its map, and the header."""
-    request, planner, goal = outcome.request, outcome.planner, outcome.plan.goal
-    field = (
-        planner.q_field(request.grid, goal, request.move_rule)
-        if planner is not None
-        else None
-    )
-    return field, request.grid, outcome.header
+    def _update(self, topic: Topic, picture: Picture) -> None:
+        """Publish a picture on a topic, unless the topic shows it already."""
+        has_body = isinstance(picture.outcome.plan, PosePlan)
+        is_empty = picture.is_empty or has_body != topic.is_for_bodies
+        visible = None if is_empty else picture
+        publisher = self._publishers[topic.name]
+        # A latched picture is cleared even if nobody subscribes now.
+        is_wanted = is_empty or publisher.get_subscription_count() > 0
+        if visible is self._published[topic.name] or not is_wanted:
+            return
+        # First, so that a picture that cannot be made is not tried again each time.
+        self._published[topic.name] = visible
+        make = topic.make_empty_message if is_empty else topic.make_message
+        publisher.publish(make(picture))
 
 
 def value_message(field: QField | None, grid: GridMap, header: Header) -> OccupancyGrid:
-    """Make a map message of a value field: 0 the lowest value, 100 the goal's, -1 for no value."""
+    """Make a map message of a value field.
+
+    Parameters
+    ----------
+    field
+        A field on the map, or None for a message without values.
+    grid
+        The map.
+    header
+        The header of the message.
+
+    Returns
+    -------
+    The message: 100 at the goal, 0 at the lowest value, -1 without a value.
+    """
     percent = np.full(grid.occupancy.shape, -1, dtype=np.int8)
-    if (
-        field is not None
-        and (known := np.isfinite(field.value) & ~grid.occupancy).any()
-    ):
-        values = field.value[known]
-        percent[known] = np.rint(
-            np.interp(values, (values.min(), values.max()), (0, 100))
-        )
+    if field is not None:
+        has_value = np.isfinite(field.value) & ~grid.occupancy  # (H, W)
+        values = field.value[has_value]  # (N,)
+        if len(values):
+            limits = (values.min(), values.max())
+            percent[has_value] = np.rint(np.interp(values, limits, (0, 100)))
     return occupancy_message(percent, grid.resolution, grid.origin, header)
 
 
-def policy_message(field: QField | None, grid: GridMap, header: Header) -> MarkerArray:
-    """Make a message with an arrow for each greedy action; without any, it deletes the last one."""
-    policy = np.full(grid.occupancy.shape, -1)
-    if field is not None:
-        policy[:] = field.policy
-        policy[field.goal[1], field.goal[0]] = -1
-    step = 1  # if there are too many arrows, those of each k-th row and column, k times as large
-    while np.count_nonzero(policy[::step, ::step] >= 0) > MAX_ARROWS:
-        step += 1
-    rows, columns = step * np.array(np.nonzero(policy[::step, ::step] >= 0))
-    x, y = grid.centres(columns, rows)
-    size, turn = step * grid.resolution, np.exp(1j * grid.origin[2])
-    arrows = (x + 1j * y)[:, None] + size * turn * ARROW * DIRECTIONS[
-        policy[rows, columns], None
-    ]
-    # From tail to tip, and from there along both barbs.
-    return _lines("policy", arrows, (0, 1, 1, 2, 1, 3), LINE_WIDTH * size, header)
+def outlines_along(poses: Float64, footprint: Float64) -> Float64:
+    """Return a body's outlines along a path.
+
+    Parameters
+    ----------
+    poses : (N, 3) float64
+        Metres and radians, in the map's frame.
+    footprint : (K, 2) float64
+        The body's corners, metres, in its own frame.
+
+    Returns
+    -------
+    (M, K, 2) float64
+        Corners in the map's frame: of the first pose, and of the first pose after each
+        `OUTLINE_SPACING` of the path.
+    """
+    x, y, yaw = poses.T
+    turns = np.abs(turn_between(yaw[:-1], yaw[1:]))  # (N - 1,) radians
+    steps = np.hypot(np.diff(x), np.diff(y)) + turns * METRES_PER_RADIAN
+    intervals = np.cumsum(steps) // OUTLINE_SPACING  # the number of each step's end
+    is_first = np.diff(intervals, prepend=0) > 0
+    x, y, yaw = poses[np.append(True, is_first)].T[..., None]  # (M, 1) each
+    ahead, aside = footprint.T  # (K,) each
+    corner_x = x + (np.cos(yaw) * ahead - np.sin(yaw) * aside)  # (M, K)
+    corner_y = y + (np.sin(yaw) * ahead + np.cos(yaw) * aside)
+    return np.stack([corner_x, corner_y], axis=-1)
 
 
-def footprint_message(outcome: Any) -> MarkerArray:
-    """Make a message with a body's outlines along its path; without one, it deletes the last."""
-    if outcome.planner is None:
-        return _lines("footprints", np.empty((0, 0)), (), BODY_LINE, outcome.header)
-    x, y, yaw = outcome.plan.poses.T
-    turn = np.abs(turn_between(yaw[:-1], yaw[1:]))
-    passed = np.cumsum(np.hypot(np.diff(x), np.diff(y)) + turn * TURN) // APART
-    at = np.append(True, np.diff(passed, prepend=0) > 0)
-    corners = outcome.planner.pose_planner.footprint @ [1, 1j]
-    outlines = (x + 1j * y)[at, None] + np.exp(1j * yaw)[at, None] * corners
-    sides = [
-        corner % len(corners) for n in range(len(corners)) for corner in (n, n + 1)
-    ]
-    return _lines("footprints", outlines, sides, BODY_LINE, outcome.header)
-
-
-def _lines(
-    name: str, shapes: NDArray[Any], ends: Sequence[int], width: float, header: Header
-) -> MarkerArray:
-    """Return a marker with lines between the corners of each shape; none deletes the last one."""
-    marker = Marker(header=header, ns=name, type=Marker.LINE_LIST, color=COLOUR)
-    marker.action = Marker.ADD if len(shapes) else Marker.DELETE
-    marker.pose.position.z, marker.pose.orientation.w, marker.scale.x = (
-        HEIGHT,
-        1.0,
-        width,
-    )
-    for shape in shapes:
-        # The lines share their points, because most of the time goes into making messages.
-        corners = [*map(_point, shape.real.tolist(), shape.imag.tolist())]
-        marker.points.extend([corners[end] for end in ends])
+def footprint_message(outlines: Float64, header: Header) -> MarkerArray:
+    """Make a message with the lines of outlines (M, K, 2)."""
+    marker = _marker(header, Marker.ADD)
+    for outline in outlines.tolist():
+        # The lines share their points, because most of the time goes into making
+        # messages.
+        corners = [_point(x, y) for x, y in outline]
+        for number, corner in enumerate(corners):
+            next_corner = corners[(number + 1) % len(corners)]
+            marker.points.extend([corner, next_corner])
     return MarkerArray(markers=[marker])
+
+
+def _marker(header: Header, action: int) -> Marker:
+    marker = Marker(header=header, ns="footprints", type=Marker.LINE_LIST, color=COLOUR)
+    marker.action = action
+    marker.pose.position.z = HEIGHT
+    marker.pose.orientation.w = 1.0
+    marker.scale.x = LINE_WIDTH
+    return marker
 
 
 def _point(x: float, y: float) -> Point:
     point = Point()  # faster than Point(x=x, y=y)
-    point.x, point.y = x, y
+    point.x = x
+    point.y = y
     return point
 
 
-LAYERS: dict[str, tuple[Any, Callable[[Outcome], Any]]] = {
-    "value": (OccupancyGrid, lambda outcome: value_message(*_field_of(outcome))),
-    "policy": (MarkerArray, lambda outcome: policy_message(*_field_of(outcome))),
-    "footprints": (MarkerArray, footprint_message),
-}
-"""Each topic's type, and the function that makes its messages."""
+def _value_message(picture: Picture) -> OccupancyGrid:
+    """Make the message of a field, which is computed now."""
+    planner = picture.outcome.planner
+    request = picture.outcome.request
+    goal = picture.outcome.plan.goal
+    assert planner is not None
+    assert isinstance(request, PlanRequest)
+    assert goal is not None
+    field = planner.q_field(request.grid, goal, request.move_rule)
+    return value_message(field, request.grid, picture.header)
+
+
+def _empty_value_message(picture: Picture) -> OccupancyGrid:
+    request = picture.outcome.request
+    assert request is not None
+    return value_message(None, request.grid, picture.header)
+
+
+def _footprint_message(picture: Picture) -> MarkerArray:
+    planner = picture.outcome.planner
+    plan = picture.outcome.plan
+    assert planner is not None
+    assert planner.pose_planner is not None
+    assert isinstance(plan, PosePlan)
+    outlines = outlines_along(plan.poses, planner.pose_planner.footprint)
+    return footprint_message(outlines, picture.header)
+
+
+def _empty_footprint_message(picture: Picture) -> MarkerArray:
+    """Make a message that deletes the last outlines."""
+    return MarkerArray(markers=[_marker(picture.header, Marker.DELETE)])
+
+
+TOPICS = (
+    Topic("value", OccupancyGrid, False, _value_message, _empty_value_message),
+    Topic(
+        "footprints", MarkerArray, True, _footprint_message, _empty_footprint_message
+    ),
+)

@@ -322,7 +322,7 @@ CLASSES = {  # of rviz_default_plugins
     "geometry_msgs/PoseStamped": "SetGoal",
     "geometry_msgs/PoseWithCovarianceStamped": "SetInitialPose",
 }
-SHOWN = {"/map", "/plan", "/planner/value", "/planner/policy", "/trainer/episode"}
+SHOWN = {"/map", "/plan", "/planner/value", "/trainer/episode"}
 SET = {"/initialpose", "/goal_pose"}
 
 
