@@ -4,15 +4,13 @@
 # allocates, slices, and `min`, `max` and `int`. So arrays are passed in, empty ones for none.
 
 import math
-from functools import partial
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.compiled import in_place, inlined, inner
+from ddqn_planner.compiled import in_place, inlined
 from ddqn_planner.grid import MOVES
-from ddqn_planner.grid.layers import UPHILL
 from ddqn_planner.model.move_costs import MARGIN, VALUES, MoveCosts
 
 # States. The distance of an open cell may fall; that of a closed one is the least. Until a cell is
@@ -50,29 +48,14 @@ class Known(NamedTuple):
     closed_is_final: bool = True
 
 
-# Not inlined: what few maps need must not slow the others down.
-@partial(inner, _nrt=False)
-def _uphill(cell: Any, after: Any, action: Any, multiplier: Any, uphill: Any) -> Any:
-    """Return the multipliers of an action's cells where it may lead uphill, added."""
-    here = np.float64(multiplier[cell]) * UPHILL[np.uint64(uphill[cell]), action]
-    return (
-        here + np.float64(multiplier[after]) * UPHILL[np.uint64(uphill[after]), action]
-    )
-
-
 # Kernels take the first fields of `MoveCosts` as a plain tuple, which numba knows sooner.
 @inlined
 def cost_of(cell: int, action: int, costs: Any) -> Any:
     """Return the cost of a move, infinite if it is not possible. See `MoveCosts`."""
-    patch, table, value, terms, multiplier, uphill, width = costs
+    patch, table, value, terms, multiplier, width = costs
     cost = table[ACTIONS * np.uint64(patch[np.uint64(cell)]) + np.uint64(action)]
     after = np.uint64(cell + MOVE_Y[action] * width + MOVE_X[action])
     if multiplier.size > 0:
-        if uphill.size > 0:
-            both = _uphill(
-                np.uint64(cell), after, np.uint64(action), multiplier, uphill
-            )
-            return np.float64(cost) * both / 2
         return cost * (np.float64(multiplier[np.uint64(cell)]) + multiplier[after]) / 2
     if terms.size > 0:
         place = np.uint64(action) * OF_ACTION
@@ -117,7 +100,7 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
         how = start, bounds, buckets, limit, offsets
         queue = opened, order, bucket, used
         taken, visited, is_stopped, is_unread = _grow(
-            distance, state, queue, how, costs[:7], closable
+            distance, state, queue, how, costs[:6], closable
         )
         left = [bucket[slot, : used[slot]] for slot in used.nonzero()[0]]
         opened = np.concatenate([opened[taken:], *left])
@@ -182,7 +165,7 @@ def _grow(
     Return how many open cells were taken, how many cells were visited, whether it stopped early,
     and whether that was for a cell that is not closable.
     """
-    patch, table, value, terms, _, _, width = costs
+    patch, table, value, terms, _, width = costs
     opened, order, bucket, used = queue
     start, bounds, buckets, limit, offsets = how
     start_y, start_x = start // width, start % width
@@ -286,7 +269,7 @@ def take_back(
         np.empty(changed.size + 8 * limit, np.int32),
     )
     waiting[: changed.size] = changed
-    number = _take_back(known.distance, known.state, changed, lost, waiting, costs[:7])
+    number = _take_back(known.distance, known.state, changed, lost, waiting, costs[:6])
     opened = np.concatenate([known.opened, waiting[: max(number, 0)]])
     return Known(known.distance, known.state, opened, False) if number >= 0 else None
 

@@ -203,7 +203,7 @@ class DistanceField(QField):
                 1.01 * distance[number]
             )  # no move costs less than 1; sums are rounded
             path = np.empty((min(most, distance.size), 2), np.int32)
-            length = kernels.roll_out(distance, number, path, toward, self.costs[:7])
+            length = kernels.roll_out(distance, number, path, toward, self.costs[:6])
         return Plan(PlanStatus.SUCCEEDED, path[:length], move_rule=self.move_rule)
 
     def take_over(self, old: DistanceField, start: Cell | None = None) -> bool:
@@ -242,7 +242,7 @@ class DistanceField(QField):
         """Return what a kernel writes for each cell of the whole field: (..., H, W)."""
         with self._lock:
             self.grow()
-            write(self.known.distance, layer, self.costs[:7])
+            write(self.known.distance, layer, self.costs[:6])
         return layer.reshape(*layer.shape[:-1], -1, self.costs.width)[..., 1:-1, 1:-1]
 
     @cached_property
