@@ -79,6 +79,17 @@ def inlined(function: Function) -> Function:
     return function
 
 
+def specialised(function: Function, **parts: Callable[..., Any]) -> Function:
+    """Compile an algorithm that makes no array, with its abstract functions replaced.
+
+    So one algorithm serves several data structures, and calls none of them indirectly.
+    `parts` are compiled functions, by the names that the algorithm's module gives them.
+    """
+    scope = {**function.__globals__, **parts}
+    code = function.__code__
+    return in_place(cast(Function, FunctionType(code, scope, function.__name__)))
+
+
 @cache
 def _import_numba() -> Any:
     """Import numba without scipy.linalg, which takes 0.2 s and no function here needs."""

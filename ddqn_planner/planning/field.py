@@ -15,8 +15,8 @@ from ddqn_planner.grid.arguments import cell_inside, numbers
 from ddqn_planner.grid.map_changes import changed_cells
 from ddqn_planner.model import PropagationQNetwork, QNetwork
 from ddqn_planner.model.move_costs import MoveCosts
-from ddqn_planner.planning import cell_space as kernels
-from ddqn_planner.planning.cell_space import Known
+from ddqn_planner.planning import cell_space, wavefront
+from ddqn_planner.planning.cell_space import Known, step_costs
 from ddqn_planner.planning.plan import Plan, PlanStatus
 
 Goals: TypeAlias = tuple[
@@ -159,10 +159,10 @@ class DistanceField(QField):
     def known(self) -> Known:
         """What is known, at first the goals alone."""
         cells = self.costs.patch.size
-        distance, state = np.zeros(cells), np.zeros(cells, np.uint8)
+        distance, mark = np.zeros(cells), np.zeros(cells, np.uint8)
         roots = np.array([self._number(goal) for goal in self.goals], np.int32)
-        distance[roots], state[roots] = kernels.AT_GOAL, kernels.OPEN
-        return Known(distance, state, roots)
+        distance[roots], mark[roots] = cell_space.AT_GOAL, wavefront.OPEN
+        return Known(distance, mark, roots)
 
     def _number(self, cell: Any) -> Any:
         """Return the number of a cell, or of each of many (arrays), on the padded map."""
@@ -180,7 +180,9 @@ class DistanceField(QField):
         with self._lock:
             done = _is_final(self.known, number)
             if not done:
-                self.known, done = kernels.grow(self._take(), self.costs, number, limit)
+                self.known, done = cell_space.grow(
+                    self._take(), self.costs, number, limit
+                )
         return done
 
     def is_known(self, start: Cell) -> bool:
@@ -196,14 +198,16 @@ class DistanceField(QField):
         number, toward = self._number(start), self.goal if straight else start
         with self._lock:
             self.grow(start)
-            distance, state, *_ = self.known
-            if state[number] != kernels.CLOSED:
+            known = self.known
+            if known.mark[number] != wavefront.CLOSED:
                 return Plan(PlanStatus.NO_PATH, move_rule=self.move_rule)
             most = 2 + int(
-                1.01 * distance[number]
+                1.01 * known.distance[number]
             )  # no move costs less than 1; sums are rounded
-            path = np.empty((min(most, distance.size), 2), np.int32)
-            length = kernels.roll_out(distance, number, path, toward, self.costs[:6])
+            path = np.empty((min(most, known.distance.size), 2), np.int32)
+            length = cell_space.roll_out(
+                known.distance, number, path, *toward, step_costs(self.costs)
+            )
         return Plan(PlanStatus.SUCCEEDED, path[:length], move_rule=self.move_rule)
 
     def take_over(self, old: DistanceField, start: Cell | None = None) -> bool:
@@ -228,7 +232,7 @@ class DistanceField(QField):
             self.costs.read(0, self.grid.height)
             taken = old._take()
             while (
-                repaired := kernels.take_back(taken, self.costs, changed, limit)
+                repaired := cell_space.take_back(taken, self.costs, changed, limit)
             ) is None:
                 limit *= 4
                 if start and limit <= most and not self.grow(start, VISITS * limit):
@@ -242,14 +246,14 @@ class DistanceField(QField):
         """Return what a kernel writes for each cell of the whole field: (..., H, W)."""
         with self._lock:
             self.grow()
-            write(self.known.distance, layer, self.costs[:6])
+            write(self.known.distance, layer, step_costs(self.costs))
         return layer.reshape(*layer.shape[:-1], -1, self.costs.width)[..., 1:-1, 1:-1]
 
     @cached_property
     def q(self) -> NDArray[np.float32]:  # type: ignore[override]
         """(8, H, W) float32: Q(s, a); -inf where no path to the goal begins with the action."""
         return self._layer(
-            kernels.q_of, np.full((8, self.costs.patch.size), -np.inf, np.float32)
+            cell_space.write_q, np.full((8, self.costs.patch.size), -np.inf, np.float32)
         )
 
     @cached_property
@@ -261,7 +265,7 @@ class DistanceField(QField):
     def value(self) -> NDArray[np.float32]:
         """(H, W) float32: the greatest Q of a legal move, and at the goal the greatest of all."""
         value = self._layer(
-            kernels.value_of, np.full(self.costs.patch.size, -np.inf, np.float32)
+            cell_space.write_value, np.full(self.costs.patch.size, -np.inf, np.float32)
         )
         greatest = value.max()
         for x, y in self.goals:
@@ -272,7 +276,7 @@ class DistanceField(QField):
     def policy(self) -> NDArray[np.int8]:
         """(H, W) int8: the action of a rollout in each cell; -1 without one."""
         return self._layer(
-            kernels.policy_of, np.full(self.costs.patch.size, -1, np.int8)
+            cell_space.write_policy, np.full(self.costs.patch.size, -1, np.int8)
         )
 
     @property
@@ -287,7 +291,7 @@ class DistanceField(QField):
 
 def _is_final(known: Known, number: int) -> bool:
     """Return whether no more of a field is needed to know the distance of a cell."""
-    closed = known.state[number] == kernels.CLOSED
+    closed = known.mark[number] == wavefront.CLOSED
     return bool(not known.opened.size or (known.closed_is_final and closed))
 
 

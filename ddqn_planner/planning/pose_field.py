@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ddqn_planner.grid import GridMap
-from ddqn_planner.planning import pose_space as kernels
+from ddqn_planner.planning import pose_space, wavefront
 from ddqn_planner.planning.pose_paths import SAME, Way
-from ddqn_planner.planning.pose_space import Aim, Search, heap_of
+from ddqn_planner.planning.pose_space import Aim, Search
 from ddqn_planner.planning.pose_world import (
     SHIFT,
     TILE,
@@ -20,6 +20,8 @@ from ddqn_planner.planning.pose_world import (
     World,
     occupied_for_body,
 )
+from ddqn_planner.planning.queues import make_heap
+from ddqn_planner.planning.wavefront import DONE, Progress, Target
 
 NO_RESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)  # not in all versions of Python
 HEAP = 2**18  # entries that a heap has room for, at least
@@ -62,26 +64,29 @@ class PoseField:
         self.visits, tiles = 0, world.tile.size
         self._aim, self._heap, self._least = (
             aim._replace(number=-1),
-            heap_of(0),
+            make_heap(0),
             math.inf,
         )
-        states = tiles << kernels.TILE_BITS
+        states = tiles << pose_space.TILE_BITS
         self._distance, self._mark = (
             _untouched(states, np.float32),
             _untouched(states, np.uint8),
         )
         self._touched = np.zeros(tiles, np.bool_)
         x, y, heading = goals.T
-        numbers = kernels.number_of(x, y, heading, world)
-        self._mark[numbers] = kernels.OPEN
-        self._touched[numbers >> kernels.TILE_BITS] = True
+        numbers = pose_space.number_of(x, y, heading, world)
+        self._mark[numbers] = wavefront.OPEN
+        self._touched[numbers >> pose_space.TILE_BITS] = True
 
     def reach(self, start: State, bound: float, limit: int) -> float | None:
         """Grow until the cost from a start is known within a bound, or known not to exist.
 
         Return the bound that is proved, or None if more states than the limit must be visited.
         """
-        number, bound = int(kernels.number_of(*start, self.world)), min(bound, ANY_PATH)
+        number, bound = (
+            int(pose_space.number_of(*start, self.world)),
+            min(bound, ANY_PATH),
+        )
         if number != self._aim.number:
             known = self._aim if start[:2] == self._aim[:2] else NOWHERE
             self._aim = known._replace(x=start[0], y=start[1], number=number)
@@ -104,13 +109,23 @@ class PoseField:
                 1.0 if self._aim.weight > 1 else 1 / bound,
                 min(limit, UNGUIDED),
             )
-            visits, done = kernels.grow(self._search, bound * self._least, share, most)
+            target = Target(number, share, bound * self._least, most)
+            progress = self._spread(target)
+            visits, done = progress.visits, progress.reason == DONE
             limit, self.visits = limit - visits, self.visits + visits
             if (
                 self._proved() > bound * SAME and visits < most
             ):  # or else the heap is full
                 self._order(1.0 if done else self._aim.weight)
         return proved
+
+    def _spread(self, target: Target) -> Progress:
+        """Close states until the cost of a target is known well enough."""
+        search = self._search
+        progress: Progress = pose_space.spread_over_poses(
+            search.distance, search.mark, search.heap, target, None, search
+        )
+        return progress
 
     @property
     def _search(self) -> Search:
@@ -120,7 +135,7 @@ class PoseField:
     def _cost(self) -> float:
         """Return the least cost that was found from the start, infinite before."""
         number = self._aim.number
-        is_known = number >= 0 and self._mark[number] != kernels.UNREACHED
+        is_known = number >= 0 and self._mark[number] != wavefront.UNREACHED
         return float(self._distance[number]) if is_known else math.inf
 
     def _proved(self) -> float:
@@ -133,9 +148,9 @@ class PoseField:
     def _order(self, weight: float) -> None:
         """Begin a round: what is open or waits is ordered toward the start."""
         tiles = np.flatnonzero(self._touched)
-        self._heap = heap_of((len(tiles) << kernels.TILE_BITS) + HEAP)
+        self._heap = make_heap((len(tiles) << pose_space.TILE_BITS) + HEAP)
         self._aim = self._aim._replace(weight=weight)
-        self._least = kernels.order(self._search, tiles)
+        self._least = pose_space.order(self._search, tiles)
 
     def _can_leave(self) -> bool:
         """Return whether primitives lead from the start to more than a few states."""
@@ -143,30 +158,34 @@ class PoseField:
             _untouched(self._mark.size, np.uint8),
             np.empty(UNGUIDED, np.int64),
         )
-        return kernels.leads_to(self._aim.number, mark, queue, self.world) == len(queue)
+        return pose_space.leads_to(self._aim.number, mark, queue, self.world) == len(
+            queue
+        )
 
     def _look_at_map(self, shift: int) -> None:
         """Look at tiles of 2**shift cells of a side for what is left to the start."""
         world = self.world
         rows, columns = -(-world.height >> shift), -(-world.width >> shift)
         room = world.room if shift == SHIFT else np.zeros((rows, columns), np.uint8)
-        left = np.empty((rows + 1, columns + 1), np.float32)
-        self._aim = self._aim._replace(left=left, shift=shift)
+        remaining = np.empty((rows + 1, columns + 1), np.float32)
+        self._aim = self._aim._replace(remaining=remaining, shift=shift)
         x, y, _ = self.goals.T >> shift
-        is_goal = np.zeros(left.shape, np.bool_)
+        is_goal = np.zeros(remaining.shape, np.bool_)
         is_goal[y, x] = True
         box = np.array([x.min(), y.min(), x.max(), y.max()])
-        heap = heap_of(8 * left.size + 4)  # each corner opens its neighbours once
-        kernels.look(self._search._replace(heap=heap), room, is_goal, box)
+        heap = make_heap(
+            8 * remaining.size + 4
+        )  # each corner opens its neighbours once
+        pose_space.look(self._search._replace(heap=heap), room, is_goal, box)
 
     def rollout(self, start: State) -> NDArray[np.float64] | None:
         """Return poses to a goal: x and y in cells, yaw, what is spent, (4, N); None if no way."""
-        number, body = int(kernels.number_of(*start, self.world)), self.world.body
-        if self._mark[number] == kernels.UNREACHED:
+        number, body = int(pose_space.number_of(*start, self.world)), self.world.body
+        if self._mark[number] == wavefront.UNREACHED:
             return None
         most = int(self._distance[number] / body.cost.min()) + 1
         way = np.empty((4, 1 + most * int(np.diff(body.first_pose).max())))
-        return way[:, : kernels.follow(self._search, number, most, way)]
+        return way[:, : pose_space.follow(self._search, number, most, way)]
 
     def repaired(
         self, grid: GridMap, world: World, cells: NDArray[np.int64]
@@ -184,16 +203,18 @@ class PoseField:
             np.flatnonzero(is_near.ravel() & self._touched),
             np.flatnonzero(self._touched),
         )
-        cost, room = self._cost(), len(tiles) << kernels.TILE_BITS
+        cost, room = self._cost(), len(tiles) << pose_space.TILE_BITS
         self._least = min(self._least, cost)
         if opens or self._heap.size[0] + room > self._heap.keys.size:
             self._aim = NOWHERE if opens else self._aim._replace(number=-1)
-            self._heap = heap_of(room)
+            self._heap = make_heap(room)
         kept = LOST * cost if cost < math.inf else 0.0
-        lost = kernels.take_back(self._search, near, tiles, kept)
+        lost = pose_space.least_unsupported(self._search, near)
         if lost < kept:
             return PoseField(self.goals, grid, world, self._aim)
+        if lost < math.inf:
+            pose_space.take_back(self._search, tiles, lost)
         if opens:
             mark = self._mark.reshape(world.tile.size, -1)
-            mark[near] = np.minimum(mark[near], kernels.OPEN)
+            mark[near] = np.minimum(mark[near], wavefront.OPEN)
         return self

@@ -37,7 +37,7 @@ from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.grid.oracle import shortest_distances
 from ddqn_planner.model import move_costs as move_costs_module
 from ddqn_planner.model.move_costs import MoveCosts
-from ddqn_planner.planning import cell_space as kernels
+from ddqn_planner.planning import cell_space, queues, wavefront
 from ddqn_planner.planning import field as fields
 from ddqn_planner.planning.field import DistanceField, QField, network_field
 from ddqn_planner.planning.segments import cost_along
@@ -82,7 +82,9 @@ def test_no_path_depends_on_the_past(place: Place, rule: MoveRule, data: Data) -
         limit, straight = data.draw(st.integers(0, 30)), data.draw(st.booleans())
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(
-                kernels, "CAPACITY", data.draw(st.sampled_from((0.0, kernels.CAPACITY)))
+                cell_space,
+                "CAPACITY",
+                data.draw(st.sampled_from((0.0, cell_space.CAPACITY))),
             )
             while not grown.grow(start, limit):  # each call visits more cells
                 pass
@@ -157,7 +159,7 @@ def test_no_cell_is_lost_where_many_are_at_one_distance(
     whole = fresh_field(grid, (30, 30), MoveRule.ROBOT_SAFE)
     _ = whole.value
     for more in range(16):
-        monkeypatch.setattr(kernels, "CAPACITY", more / 62)
+        monkeypatch.setattr(cell_space, "CAPACITY", more / 62)
         assert_same(fresh_field(grid, (30, 30), MoveRule.ROBOT_SAFE), whole)
 
 
@@ -276,8 +278,11 @@ def test_a_map_made_of_others_is_as_new(
             grid = grid.with_patch([[not grid.occupancy[y, x]]], x, y, cost)
         elif data.draw(st.booleans()):
             slowness = (1 + random.random(grid.occupancy.shape)).astype(np.float32)
+            uphill = (
+                random.integers(0, 96, slowness.shape, np.uint8) if seed % 2 else None
+            )
             kept = grid.slowness if seed % 3 and grid.slowness is not None else slowness
-            grid = grid.with_layers(slowness=kept, seconds_per_cell=1.0)
+            grid = grid.with_layers(slowness=kept, seconds_per_cell=1.0, uphill=uphill)
         else:
             grid = data.draw(changed_maps(grid))
         maps.append(grid)
@@ -295,7 +300,7 @@ def test_a_map_made_of_others_is_as_new(
         costs, new = (one.fields.costs(grid, rule) for one in (planner, new_planner()))
         assert costs is not None
         assert new is not None
-        for layer in ("patch", "value", "multiplier"):
+        for layer in ("patch", "value", "multiplier", "uphill"):
             np.testing.assert_array_equal(getattr(costs, layer), getattr(new, layer))
         if data.draw(st.booleans(), label="compare"):
             assert_same(
@@ -333,7 +338,7 @@ def test_no_move_costs_more_than_the_highest_or_less_than_the_least(
     grid, _ = place
     costs = ANY_MAP.network.move_costs(grid, rule)
     assert costs is not None
-    exact = move_costs(grid.cost_multiplier)
+    exact = move_costs(grid.cost_multiplier, grid.uphill)
     legal = grid.legal_moves(rule)
     assert exact.max(initial=0, where=legal) <= 1.01 * costs.highest
     for first, bound in ((0, costs.straight), (1, costs.diagonal)):
@@ -416,7 +421,8 @@ def test_a_field_that_is_interrupted_anywhere_is_as_a_new_one(
 
 def run_until(line: int, step: Callable[[], object]) -> None:
     """Run a step, and fail where so many lines of the field's code were run, if it gets there."""
-    files = {module.__file__ for module in (fields, kernels)}
+    modules = fields, cell_space, queues, wavefront
+    files = {module.__file__ for module in modules}
     left = line
 
     def trace(frame: FrameType, event: str, _: object) -> Any:
@@ -432,8 +438,8 @@ def run_until(line: int, step: Callable[[], object]) -> None:
 
     before = sys.gettrace()
     with pytest.MonkeyPatch.context() as patch, suppress(MemoryError):
-        for name in ("_grow", "_take_back"):
-            patch.setattr(kernels, name, getattr(kernels, name).__wrapped__)
+        for name in ("spread_over_cells", "_lose_unsupported", "_reopen"):
+            patch.setattr(cell_space, name, getattr(cell_space, name).__wrapped__)
         sys.settrace(trace)
         try:
             step()
@@ -515,7 +521,7 @@ def grown_by_rows(
     """A plan for which patches are read row by row, as on a large map."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(move_costs_module, "LARGE", 0)
-        patch.setattr(kernels, "MARGIN", 0)
+        patch.setattr(cell_space, "MARGIN", 0)
         return planner.plan(grid, start, goal, rule)
 
 
@@ -545,7 +551,7 @@ def test_where_rows_are_read_ends_lie_in_the_first_and_the_last_rows(
     ends = [(x, y) for x, y in grid.free_cells() if y in rows]
     at_once = [new_planner().q_field(grid, goal) for goal in ends]
     monkeypatch.setattr(move_costs_module, "LARGE", 0)
-    monkeypatch.setattr(kernels, "MARGIN", margin)
+    monkeypatch.setattr(cell_space, "MARGIN", margin)
     for goal, field_at_once in zip(ends, at_once, strict=True):
         by_rows = new_planner().q_field(grid, goal)
         for start in ends[::-1]:
@@ -560,7 +566,7 @@ def test_where_rows_are_read_several_patches_lie_between_two_requests(
     # Rows that the costs of a map read for its second patch must be in what the first one changed.
     height, width, goal = 60, 12, (0, 0)
     random = np.random.default_rng(seed)
-    monkeypatch.setattr(kernels, "MARGIN", 0)
+    monkeypatch.setattr(cell_space, "MARGIN", 0)
     for _ in range(20):
         cells = random.random((height, width)) < 0.3
         cells[0, 0] = False
