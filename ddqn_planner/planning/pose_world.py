@@ -12,7 +12,7 @@ from ddqn_planner.grid.boxes import Box
 from ddqn_planner.grid.layers import UPHILL, Layers, forbids, has_costs, multiplier_at
 from ddqn_planner.grid.map_changes import changed_cells
 from ddqn_planner.grid.moves import ACTION_OF_STEP, actions_along
-from ddqn_planner.robot.motions import HEADINGS, Motions, closer
+from ddqn_planner.robot.motions import HEADINGS, Motions, dense_poses
 
 SHIFT: Final = 2  # so many bits tell where in its tile a cell lies, along a side
 TILE: Final = 1 << SHIFT  # cells of a side
@@ -159,7 +159,7 @@ def _passed(
     poses: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the cells that the origin passes, with two actions, 8 for none; and its shares."""
-    way = closer(poses, FINE, 0.0)[:, :2]
+    way = dense_poses(poses, FINE, 0.0)[:, :2]
     middle, length = (way[1:] + way[:-1]) / 2, np.hypot(*np.diff(way, axis=0).T)
     if not length.any():
         middle, length = way[:1], np.ones(1)

@@ -1,4 +1,4 @@
-"""Proves which cells forbid a robot's primitives, for all patterns of occupied cells."""
+"""Proves which cells forbid a robot's primitives, whatever cells are occupied."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class BodyCertificate:
 
     @property
     def proved(self) -> bool:
-        """Whether occupied cells forbid a primitive just where it sweeps one of them."""
+        """Whether a primitive is forbidden just where it sweeps an occupied cell."""
         return self.weak == self.forbidden == 0
 
     def __str__(self) -> str:

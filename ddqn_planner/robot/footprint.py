@@ -8,21 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid.arguments import as_number, numbers
-from ddqn_planner.robot.motions import Motions, closer
+from ddqn_planner.robot.motions import Motions, Poses, dense_poses
 
 Corners = NDArray[np.float64]  # (K, 2), metres from the robot's origin
+Points = NDArray[np.float64]  # (N, 2)
 
-CORNERS: Final = 24  # of the polygon around a circle
+CIRCLE_CORNERS: Final = 24  # of the polygon around a circle
 MAX_CORNERS: Final = 1000
-FARTHEST: Final = 100.0  # metres from the robot's origin to a corner, at most
-SAME: Final = 1e-6  # metres: nearer corners are the same one
-THINNEST: Final = (
-    1e-4  # metres: a body whose corners lie so near to one line has no area
-)
-SHARP: Final = (
-    2 / 3
-)  # cosine of half the angle of a corner that is cut where the body is padded
-SHARPEST: Final = 1e-3
+MAX_DISTANCE: Final = 100.0  # metres from the robot's origin to a corner
+SAME_CORNER: Final = 1e-6  # metres: corners at this distance are the same
+MIN_THICKNESS: Final = 1e-4  # metres: a thinner body has no area
+# Cosine of half the angle by which the outline turns in a corner: where the body is
+# padded, corners that turn more are cut.
+MIN_COSINE: Final = 2 / 3
+SMALLEST_COSINE: Final = 1e-3  # of a concave corner, so that it can be divided by
 MAX_DEPTH: Final = 4  # of open brackets, and the text around them
 MARGIN: Final = 0.1  # cells by which the swept cells are those of a larger body
 MAX_REACH: Final = 120  # cells that a primitive may sweep to each side
@@ -34,24 +33,30 @@ NUMBER: Final = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 TOKEN: Final = re.compile(rf"\s*(?:([\[(])|([\])])|(,)|({NUMBER.pattern})(?![\w.]))")
 
 
-def read_footprint(footprint: Any, padding: float = 0.0) -> Corners:
-    """Return a polygon's corners, (K, 2) metres, of a radius or of points, as Nav2 takes them.
+# From a radius or points to a polygon
 
-    The polygon may be concave, the origin may lie outside of it, and parts of its outline may
-    touch, but no two sides may cross. Corners that repeat the one before are left out.
+
+def read_footprint(footprint: Any, padding: float = 0.0) -> Corners:
+    """Return a polygon's corners, (K, 2) metres, of a radius or of points.
+
+    The forms are those that Nav2 takes. The polygon may be concave, the origin may lie
+    outside of it, and parts of its outline may touch, but no two sides may cross.
+    Corners that repeat the one before are left out.
 
     Parameters
     ----------
     footprint : str, number, or sequence of points
-        A radius, at least three points (x, y), or a string of either: ``"[[0.3, 0.2], ...]"``.
+        A radius, at least three points (x, y), or a string of either:
+        ``"[[0.3, 0.2], ...]"``.
     padding : float
-        Metres by which each side moves outward. A rectangle around the origin becomes what Nav2's
-        footprint_padding makes of it.
+        Metres by which each side moves outward. A rectangle around the origin becomes
+        the same as by Nav2's footprint_padding.
 
     Raises
     ------
     ValueError
-        If it is neither, has fewer than three different corners or no area, or sides cross.
+        If it is neither, has fewer than three different corners or no area, or if sides
+        cross.
     """
     padding = as_number("padding", padding, 0, 10, "0 to 10 metres")
     try:
@@ -61,45 +66,50 @@ def read_footprint(footprint: Any, padding: float = 0.0) -> Corners:
         raise ValueError(
             f"the footprint is {_short(footprint)} ({error}); {REMEDY}"
         ) from None
+    _check_polygon(corners, _short(footprint))
+    if padding == 0:
+        return corners
+    padded = _without_repeats(_padded(corners, padding))
+    if not _is_padded(padded, corners, padding):
+        problem = f"a padding of {padding:g} m closes a gap in the footprint"
+        raise ValueError(
+            f"{problem} {_short(footprint)}; give less, or points with that room"
+        )
+    return padded
+
+
+def _check_polygon(corners: Corners, text: str) -> None:
+    """Raise a ValueError, with the text of the footprint, if it is no polygon."""
     if len(corners) < 3:
-        problem = f"the footprint {_short(footprint)} has fewer than three or more points that"
+        problem = f"the footprint {text} has fewer than three or more points that"
         raise ValueError(f"{problem} differ; {REMEDY}")
     centred = corners - corners.mean(axis=0)
-    if np.linalg.svd(centred, compute_uv=False)[1] < THINNEST:
-        problem = f"the corners of the footprint {_short(footprint)} lie on one line"
+    thickness = np.linalg.svd(centred, compute_uv=False)[1]
+    if thickness < MIN_THICKNESS:
+        problem = f"the corners of the footprint {text} lie on one line"
         raise ValueError(f"{problem}; give points around an area")
     if _sides_cross(corners):
-        problem = f"sides of the footprint {_short(footprint)} cross"
+        problem = f"sides of the footprint {text} cross"
         raise ValueError(f"{problem}; give the points in their order around the body")
-    if padding > 0:
-        padded = _without_repeats(_padded(corners, padding))
-        if not _is_padded(padded, corners, padding):
-            problem = f"a padding of {padding:g} m closes a gap in the footprint"
-            raise ValueError(
-                f"{problem} {_short(footprint)}; give less, or points with that room"
-            )
-        corners = padded
-    return corners
 
 
 def _short(footprint: Any) -> str:
-    text = repr(footprint.tolist() if isinstance(footprint, np.ndarray) else footprint)
+    """Return the text of a footprint in an error, cut if it is long."""
+    if isinstance(footprint, np.ndarray):
+        footprint = footprint.tolist()
+    text = repr(footprint)
     return text if len(text) <= 200 else f"{text[:197]}..."
 
 
 def _parsed(text: str) -> Any:
-    """Return the number or the nested lists of a text in which commas may be left out."""
+    """Return the number or the nested lists of a text; commas may be left out."""
     text = text.strip(" \t\r\n'\"")
     if NUMBER.fullmatch(text):
         return float(text)
     lists: list[list[Any]] = [[]]  # those that are open, the innermost at the end
     position = 0
     while position < len(text):
-        token = TOKEN.match(text, position)
-        if token is None:
-            raise ValueError(
-                f"{text[position : position + 20]!r} is neither bracket nor number"
-            )
+        token = _token_at(text, position)
         opens, closes, _, number = token.groups()
         if opens:
             lists.append([])
@@ -120,19 +130,29 @@ def _parsed(text: str) -> Any:
     return lists[0][0]
 
 
+def _token_at(text: str, position: int) -> re.Match[str]:
+    """Return the bracket, comma or number that begins at a position of a text."""
+    token = TOKEN.match(text, position)
+    if token is None:
+        beginning = text[position : position + 20]
+        raise ValueError(f"{beginning!r} is neither bracket nor number")
+    return token
+
+
 def _is_scalar(value: Any) -> bool:
     return not isinstance(value, (list, tuple)) and np.ndim(value) == 0
 
 
 def _around_circle(value: Any) -> Corners:
-    """Return the polygon around a circle."""
-    value = value[()] if isinstance(value, np.ndarray) else value
-    radius = as_number(
-        "the radius", value, 1e-3, FARTHEST, f"0.001 to {FARTHEST:g} metres"
-    )
-    turn = 2 * math.pi * (np.arange(CORNERS) + 0.5) / CORNERS
-    around = np.column_stack([np.cos(turn), np.sin(turn)])
-    return around * (radius / math.cos(math.pi / CORNERS))
+    """Return the polygon around a circle of some radius."""
+    if isinstance(value, np.ndarray):
+        value = value[()]
+    remedy = f"0.001 to {MAX_DISTANCE:g} metres"
+    radius = as_number("the radius", value, 1e-3, MAX_DISTANCE, remedy)
+    angle = 2 * math.pi * (np.arange(CIRCLE_CORNERS) + 0.5) / CIRCLE_CORNERS
+    directions = np.column_stack([np.cos(angle), np.sin(angle)])
+    distance = radius / math.cos(math.pi / CIRCLE_CORNERS)
+    return directions * distance
 
 
 def _points(value: Any) -> Corners:
@@ -143,10 +163,9 @@ def _points(value: Any) -> Corners:
             f"it has shape {points.shape}, and not three or more points (x, y)"
         )
     points = points.astype(np.float64)
-    if not (np.abs(points) <= FARTHEST).all():  # or NaN
-        raise ValueError(
-            f"its coordinates are no numbers from {-FARTHEST:g} to {FARTHEST:g} metres"
-        )
+    if not (np.abs(points) <= MAX_DISTANCE).all():  # or NaN
+        limits = f"{-MAX_DISTANCE:g} to {MAX_DISTANCE:g} metres"
+        raise ValueError(f"its coordinates are no numbers from {limits}")
     points = _without_repeats(points)
     if len(points) > MAX_CORNERS:
         raise ValueError(
@@ -156,141 +175,226 @@ def _points(value: Any) -> Corners:
 
 
 def _without_repeats(points: Corners) -> Corners:
-    """Return points without those that repeat the one before; the first comes after the last."""
-    kept: list[Any] = []
+    """Return points without those that repeat the one before, around the polygon."""
+    corners: list[NDArray[np.float64]] = []
     for point in points:
-        if not kept or math.dist(point, kept[-1]) > SAME:
-            kept.append(point)
-    while len(kept) > 1 and math.dist(kept[0], kept[-1]) <= SAME:
-        kept.pop()
-    return np.array(kept, dtype=np.float64).reshape(-1, 2)
+        if not corners or math.dist(point, corners[-1]) > SAME_CORNER:
+            corners.append(point)
+    # The first corner comes after the last one.
+    while len(corners) > 1 and math.dist(corners[0], corners[-1]) <= SAME_CORNER:
+        corners.pop()
+    return np.array(corners, dtype=np.float64).reshape(-1, 2)
+
+
+# Polygons
+
+
+def _cross(first: Points, second: Points) -> NDArray[np.float64]:
+    """Return the cross products of vectors (..., 2): above 0 for a turn to the left."""
+    product: NDArray[np.float64] = (
+        first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
+    )
+    return product
 
 
 def _sides_cross(corners: Corners) -> bool:
     """Return whether a side leads from one side of another to its other side."""
-    begin = corners @ (1, 1j)
-    end = np.roll(begin, -1)
+    starts = corners
+    ends = np.roll(corners, -1, axis=0)
+    # (K, K): for each side (column), the ends of which sides (rows) it parts.
+    # Sides that meet in a corner, touch, or lie on one line do not part their ends.
+    parted = _side_of(starts, starts, ends) * _side_of(ends, starts, ends) < 0
+    return bool((parted & parted.T).any())
 
-    def left_of(corner: Any) -> Any:
-        """Return for each side (column) on which side of it the corners (rows) lie: -1, 0, 1."""
-        along, there = end - begin, corner[:, None] - begin
-        area = (along.conj() * there).imag  # cross product
-        return np.where(np.abs(area) <= 1e-9 * np.abs(along), 0, np.sign(area))
 
-    # Sides that meet in a corner, touch, or lie on one line do not part the ends of each other.
-    parts = left_of(begin) * left_of(end) < 0
-    return bool((parts & parts.T).any())
+def _side_of(points: Points, starts: Points, ends: Points) -> NDArray[np.float64]:
+    """Return where points (rows) lie beside lines (columns): (N, K).
+
+    It is 1 to the left, -1 to the right, and 0 on the line.
+    """
+    along = ends - starts  # (K, 2)
+    to_point = points[:, None] - starts  # (N, K, 2)
+    area = _cross(along, to_point)
+    tolerance = 1e-9 * np.hypot(along[:, 0], along[:, 1])
+    return np.where(np.abs(area) <= tolerance, 0, np.sign(area))
 
 
 def _padded(corners: Corners, padding: float) -> Corners:
-    """Return a polygon of which each side moved outward; corners that stick out far are cut."""
-    points = corners @ (1, 1j)
-    next_point = np.roll(points, -1)
-    direction = (next_point - points) / np.abs(next_point - points)
-    area = float((points.conj() * next_point).imag.sum())
-    to_outside = -1j if area > 0 else 1j
-    padded: list[complex] = []
-    for point, before, after in zip(
-        points, np.roll(direction, 1), direction, strict=True
+    """Return a polygon of which each side moved outward; sharp corners are cut."""
+    sides = np.roll(corners, -1, axis=0) - corners
+    directions = sides / np.hypot(sides[:, 0], sides[:, 1])[:, None]
+    double_area = float(_cross(corners, np.roll(corners, -1, axis=0)).sum())
+    orientation = math.copysign(1, double_area)  # 1: counter-clockwise
+    padded: list[NDArray[np.float64]] = []
+    for corner, direction_in, direction_out in zip(
+        corners, np.roll(directions, 1, axis=0), directions, strict=True
     ):
-        turn = (before.conjugate() * after).imag * area
-        cosine = (
-            abs(before + after) / 2
-        )  # of half the angle by which the outline turns here
-        if cosine > SHARP or turn < 0:
-            mitre = to_outside * (before + after) / (2 * max(cosine, SHARPEST) ** 2)
-            padded.append(point + padding * mitre)
-            continue
-        # Cut as far beyond the corner as the sides move.
-        beyond = (before - after) / abs(before - after)
-        aside = beyond / to_outside * (1 - cosine) / math.sqrt(1 - cosine**2)
-        padded += [
-            point + padding * (beyond - aside),
-            point + padding * (beyond + aside),
-        ]
-    return np.column_stack([np.real(padded), np.imag(padded)])
+        offsets = _corner_offsets(direction_in, direction_out, orientation)
+        padded += [corner + padding * offset for offset in offsets]
+    return np.array(padded)
+
+
+def _corner_offsets(
+    direction_in: NDArray[np.float64],
+    direction_out: NDArray[np.float64],
+    orientation: float,
+) -> list[NDArray[np.float64]]:
+    """Return where a corner moves if its sides move outward by 1.
+
+    Parameters
+    ----------
+    direction_in, direction_out : (2,) float64
+        The directions of the sides before and after the corner.
+    orientation : float
+        1 if the polygon is counter-clockwise, -1 if it is clockwise.
+
+    Returns
+    -------
+    list of (2,) float64
+        One offset, or two where the corner is cut.
+    """
+    total = direction_in + direction_out
+    # The cosine of half the angle by which the outline turns.
+    cosine = math.hypot(total[0], total[1]) / 2
+    is_concave = _cross(direction_in, direction_out) * orientation < 0
+    if cosine > MIN_COSINE or is_concave:
+        outward = _turned_outward(total, orientation)
+        return [outward / (2 * max(cosine, SMALLEST_COSINE) ** 2)]
+    # The cut is as far beyond the corner as the sides move.
+    difference = direction_in - direction_out
+    beyond = difference / math.hypot(difference[0], difference[1])
+    aside = -_turned_outward(beyond, orientation)
+    aside = aside * (1 - cosine) / math.sqrt(1 - cosine**2)
+    return [beyond - aside, beyond + aside]
+
+
+def _turned_outward(
+    vector: NDArray[np.float64], orientation: float
+) -> NDArray[np.float64]:
+    """Return a vector (2,) along the outline, turned by 90 degrees to its outside."""
+    x, y = vector
+    return np.array([orientation * y, -orientation * x])
 
 
 def _is_padded(padded: Corners, corners: Corners, padding: float) -> bool:
-    """Return whether a polygon contains all that is within the padding of another."""
-    if _sides_cross(padded) or inside(padded, corners).any():
+    """Return whether a polygon contains all points within the padding of another."""
+    if _sides_cross(padded):
         return False
-    gaps = _distances(padded, corners).min(), _distances(corners, padded).min()
-    return bool(inside(corners, padded).all() and min(gaps) > padding * (1 - 1e-6))
+    if inside(padded, corners).any() or not inside(corners, padded).all():
+        return False
+    gap = min(_distances(padded, corners).min(), _distances(corners, padded).min())
+    return bool(gap > padding * (1 - 1e-6))
 
 
-def _distances(points: Corners, corners: Corners) -> NDArray[np.float64]:
+def _distances(points: Points, corners: Corners) -> NDArray[np.float64]:
     """Return how far points (N, 2) are from each side of a polygon, (N, K)."""
-    along = np.roll(corners, -1, axis=0) - corners
-    there = points[:, None] - corners
-    share = ((there * along).sum(axis=2) / (along * along).sum(axis=1)).clip(0, 1)
-    away: NDArray[np.float64] = there - share[..., None] * along
-    return np.hypot(away[..., 0], away[..., 1])
+    sides = np.roll(corners, -1, axis=0) - corners  # (K, 2)
+    to_points = points[:, None] - corners  # (N, K, 2)
+    dot_products = (to_points * sides).sum(axis=2)
+    share_of_side = (dot_products / (sides * sides).sum(axis=1)).clip(0, 1)
+    from_nearest = to_points - share_of_side[..., None] * sides
+    distances: NDArray[np.float64] = np.hypot(
+        from_nearest[..., 0], from_nearest[..., 1]
+    )
+    return distances
 
 
-def inside(points: NDArray[np.float64], corners: Corners) -> NDArray[np.bool_]:
-    """Return around which points (N, 2) a polygon's outline leads: that is its inside."""
+def inside(points: Points, corners: Corners) -> NDArray[np.bool_]:
+    """Return which points (N, 2) lie in a polygon: its outline leads around them."""
     winding = np.zeros(len(points), dtype=np.int64)
     x, y = points.T
-    for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        if y0 != y1:
-            is_left = ((y0 > y) != (y1 > y)) & (
-                x < x0 + (y - y0) / (y1 - y0) * (x1 - x0)
-            )
-            winding += np.where(is_left, 1 if y1 > y0 else -1, 0)
+    ends = np.roll(corners, -1, axis=0)
+    for (x0, y0), (x1, y1) in zip(corners, ends, strict=True):
+        if y0 == y1:
+            continue
+        crosses_row = (y0 > y) != (y1 > y)
+        x_of_side = x0 + (y - y0) / (y1 - y0) * (x1 - x0)
+        direction = 1 if y1 > y0 else -1
+        winding += np.where(crosses_row & (x < x_of_side), direction, 0)
     is_inside: NDArray[np.bool_] = winding != 0
     return is_inside
 
 
-def outline(corners: NDArray[np.float64], spacing: float) -> NDArray[np.float64]:
-    """Return points along the sides of a polygon, (M, 2)."""
-    sides = zip(corners, np.roll(corners, -1, axis=0), strict=True)
-    counted = ((a, b, math.ceil(math.dist(a, b) / spacing)) for a, b in sides)
-    return np.concatenate(
-        [np.linspace(a, b, count, endpoint=False) for a, b, count in counted]
-    )
+def outline(corners: Corners, spacing: float) -> Points:
+    """Return points along the sides of a polygon, (M, 2), at most a spacing apart."""
+    parts = []
+    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        count = math.ceil(math.dist(start, end) / spacing)
+        parts.append(np.linspace(start, end, count, endpoint=False))
+    return np.concatenate(parts)
 
 
-def swept_cells(corners: NDArray[np.float64], motions: Motions) -> NDArray[np.bool_]:
-    """Return (P, S, S) bool: the cells that the body touches on each primitive, S // 2 the first's.
+def placed(corners: Corners, poses: Poses) -> NDArray[np.float64]:
+    """Return the corners (K, 2) of a body at poses (N, 3), in metres: (N, K, 2)."""
+    x, y, yaw = poses.T[..., None]  # (N, 1) each
+    u, v = corners.T  # (K,) each
+    cos = np.cos(yaw)
+    sin = np.sin(yaw)
+    return np.stack([cos * u - sin * v + x, sin * u + cos * v + y], axis=-1)
 
-    All that lies within `MARGIN` of the body counts, so that what lies between two poses does.
+
+# The cells that a body sweeps
+
+
+def swept_cells(corners: Corners, motions: Motions) -> NDArray[np.bool_]:
+    """Return the cells that the body touches on each primitive: (P, S, S) bool.
+
+    The robot starts in the middle, at S // 2. All cells within `MARGIN` of the body
+    count, so that those between two poses count, too.
+
+    Raises
+    ------
+    ValueError
+        If a primitive sweeps cells that are too far away.
     """
     body = corners / motions.resolution
-    far = float(np.hypot(*body.T).max())
-    ways = [float(np.hypot(*poses[:, :2].T).max()) for poses in motions.poses]
-    reach = math.ceil(far + max(ways)) + 1
-    if reach > MAX_REACH:
-        problem = f"the body sweeps {reach} cells to a side; at most {MAX_REACH} can be learned"
-        raise ValueError(
-            f"{problem}: give a coarser resolution than {motions.resolution} m"
-        )
+    radius = float(np.hypot(body[:, 0], body[:, 1]).max())
+    reach = _reach(radius, motions)
     edge = outline(body, MARGIN)
-    square = MARGIN * np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)])
-    cells = np.arange(-reach, reach + 1.0)
-    centres = np.stack(np.meshgrid(cells, cells), axis=-1).reshape(-1, 2)
-    swept = np.zeros((len(motions.poses), len(cells), len(cells)), dtype=np.bool_)
+    side = 2 * reach + 1
+    swept = np.zeros((len(motions.poses), side, side), dtype=np.bool_)
     for mask, poses in zip(swept, motions.poses, strict=True):
-        for x, y, yaw in closer(poses, MARGIN, far):
-            turn = np.array(
-                [[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]]
-            )
-            around = (edge @ turn + (x, y))[:, None] + square
-            column, row = np.rint(around).astype(np.int64).reshape(-1, 2).T + reach
-            mask[row, column] = True
-        for x, y, yaw in poses:
-            turn = np.array(
-                [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
-            )
-            mask |= inside((centres - (x, y)) @ turn, body).reshape(mask.shape)
+        # The inside of the body passes a cell no sooner than its outline does.
+        _mark_touched(mask, edge, dense_poses(poses, MARGIN, radius))
+        _mark_covered(mask, body, poses)
     return swept
 
 
-def placed(
-    corners: NDArray[np.float64], poses: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the corners (K, 2) of a body at poses (N, 3), in metres: (N, K, 2)."""
-    x, y, yaw = poses.T[..., None]
-    u, v = corners.T
-    turned = np.cos(yaw) * u - np.sin(yaw) * v, np.sin(yaw) * u + np.cos(yaw) * v
-    return np.stack([turned[0] + x, turned[1] + y], axis=-1)
+def _reach(radius: float, motions: Motions) -> int:
+    """Return how many cells to a side a body of some radius (cells) may sweep."""
+    distances = []
+    for poses in motions.poses:
+        distances.append(float(np.hypot(poses[:, 0], poses[:, 1]).max()))
+    reach = math.ceil(radius + max(distances)) + 1
+    if reach > MAX_REACH:
+        problem = f"the body sweeps {reach} cells to a side; at most {MAX_REACH} can be"
+        remedy = f"give a coarser resolution than {motions.resolution} m"
+        raise ValueError(f"{problem} learned: {remedy}")
+    return reach
+
+
+def _mark_touched(mask: NDArray[np.bool_], edge: Points, poses: Poses) -> None:
+    """Mark the cells within `MARGIN` of the outline of a body at some poses."""
+    square = MARGIN * np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)])
+    reach = len(mask) // 2
+    for x, y, yaw in poses:
+        cos = math.cos(yaw)
+        sin = math.sin(yaw)
+        turned = edge @ np.array([[cos, sin], [-sin, cos]])  # by yaw
+        points = (turned + np.array([x, y]))[:, None] + square  # (M, 4, 2)
+        cells = np.rint(points).astype(np.int64).reshape(-1, 2) + reach
+        mask[cells[:, 1], cells[:, 0]] = True
+
+
+def _mark_covered(mask: NDArray[np.bool_], body: Points, poses: Poses) -> None:
+    """Mark the cells whose centres lie inside a body at some poses."""
+    reach = len(mask) // 2
+    coordinates = np.arange(-reach, reach + 1.0)
+    centres = np.stack(np.meshgrid(coordinates, coordinates), axis=-1).reshape(-1, 2)
+    for x, y, yaw in poses:
+        cos = math.cos(yaw)
+        sin = math.sin(yaw)
+        turned = (centres - np.array([x, y])) @ np.array(
+            [[cos, -sin], [sin, cos]]
+        )  # by -yaw
+        mask |= inside(turned, body).reshape(mask.shape)

@@ -1,53 +1,58 @@
-"""Motion primitives: what a robot with a heading can do next, made here or read from a lattice."""
+"""Motion primitives: what a robot with a heading can do next.
+
+They are made here, or read from a state lattice of Nav2.
+"""
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.files import as_path, read_file
 from ddqn_planner.grid.arguments import Choice, as_number, as_whole, numbers
 
-Array = NDArray[np.float64]
+Float64 = NDArray[np.float64]
+Poses = NDArray[np.float64]  # (N, 3): x and y in cells, yaw in radians
 
-# As in Nav2's lattices (Pivtoraiko and Kelly 2005), a robot that drives straight ahead passes
-# through the centres of cells: the headings are not evenly spaced.
+# As in Nav2's lattices (Pivtoraiko and Kelly 2005), a robot that drives straight ahead
+# passes through the centres of cells: the headings are not evenly spaced.
 QUARTER: Final = np.array([(1, 0), (2, 1), (1, 1), (1, 2)])
-TURNED: Final = QUARTER[:, ::-1] * (-1, 1)
-DIRECTIONS: Final = np.concatenate([QUARTER, TURNED, -QUARTER, -TURNED])
+TURNED_QUARTER: Final = QUARTER[:, ::-1] * (-1, 1)
+# (16, 2): the cells (dx, dy) from one centre to the next along each heading.
+DIRECTIONS: Final = np.concatenate([QUARTER, TURNED_QUARTER, -QUARTER, -TURNED_QUARTER])
 HEADINGS: Final = len(DIRECTIONS)
 
-MAX_LATTICE_BYTES = 2**26  # Nav2's own files have up to 1 MB
+# The headings of straight primitives, from the robot's own one.
+AHEAD: Final = 0
+SIDEWAYS: Final = (4, 12)
+DIAGONALLY: Final = (2, 14)
+
 STRIDE = 0.4  # metres of a long step straight ahead
-BEHIND = 2.0  # what a metre counts that is not driven ahead; Nav2's reverse_penalty
-TURN = 0.5  # metres that a turn on the spot by one radian counts
-CELL_SIZES: Final = (
-    0.001,
-    10.0,
-)  # metres: with finer cells a body covers too many to be learned
-MOST_CELLS: Final = 100  # of a turning radius
-FARTHEST: Final = (
-    100.0  # metres from the begin of a lattice's primitive, and of its length
-)
-MOST_TURNED: Final = 100.0  # radians of a yaw in a lattice
-MOST_POSES: Final = 10_000  # of a lattice's primitive
-OFF_CENTRE: Final = (
-    0.01  # cells by which a lattice's primitive may miss the centre of a cell
-)
-LEAST_LENGTH: Final = (
-    0.9  # of the straight distance: a shorter trajectory_length is wrong
-)
-LEAST_COST: Final = 1e-6
-OF_GENERATOR: Final = "give a file of Nav2's lattice generator"
-SPACING, ANGLE = (
-    0.5,
-    math.radians(5),
-)  # between the poses of a primitive: at most so many cells
+BEHIND = 2.0  # cost of a metre that is not driven ahead; Nav2's reverse_penalty
+TURN = 0.5  # metres driven ahead that cost as much as a turn by one radian
+# Between two poses of a primitive, at most.
+SPACING = 0.5  # cells
+ANGLE = math.radians(5)
+
+CELL_SIZES: Final = (0.001, 10.0)  # metres: a body covers too many finer cells
+MAX_TURNING_RADIUS: Final = 100  # cells
+
+MAX_LATTICE_BYTES = 2**26  # Nav2's own files have up to 1 MB
+MAX_DISTANCE: Final = 100.0  # metres from the start of a lattice's primitive
+MAX_YAW: Final = 100.0  # radians in a lattice
+MAX_POSES: Final = 10_000  # of a lattice's primitive
+MAX_OFF_CENTRE: Final = 0.01  # cells from a lattice's end to the centre of its cell
+# Of the straight distance: a shorter trajectory_length is wrong.
+MIN_LENGTH_SHARE: Final = 0.9
+MIN_COST: Final = 1e-6
+SAME_POSE: Final = 1e-6  # cells and radians
+GENERATOR_REMEDY: Final = "give a file of Nav2's lattice generator"
 
 
 class Motion(Choice):
@@ -60,85 +65,263 @@ class Motion(Choice):
 
 @dataclass(frozen=True, eq=False)
 class Motions:
-    """P motion primitives: from a heading, so many cells further, to a heading."""
+    """P motion primitives: from a heading, over some cells, to a heading."""
 
     resolution: float  # metres per cell
-    angles: Array  # (16,) the yaw of each heading, radians
-    start: NDArray[np.int64]  # (P,) the heading before
-    end: NDArray[np.int64]  # (P,) and after
+    angles: Float64  # (16,) the yaw of each heading, radians
+    start: NDArray[np.int64]  # (P,) the first heading
+    end: NDArray[np.int64]  # (P,) the last heading
     offset: NDArray[np.int64]  # (P, 2) cells, x and y
-    cost: NDArray[np.float32]  # (P,) what it counts, in cells of its length
-    poses: tuple[
-        Array, ...
-    ]  # P times (n, 3): x, y in cells from where it begins, and the yaw
+    cost: NDArray[np.float32]  # (P,) as that of so many cells driven ahead
+    poses: tuple[Poses, ...]  # P times (N, 3), from the cell where the primitive begins
 
 
-def turn_between(before: Any, after: Any) -> Any:
-    """Return by how many radians to turn, from -pi to pi, counter-clockwise positive."""
-    return (np.asarray(after) - before + math.pi) % (2 * math.pi) - math.pi
+class Primitive(NamedTuple):
+    """One motion primitive."""
+
+    start: int  # heading
+    end: int  # heading
+    poses: Poses
+    cost: float  # as that of so many cells driven ahead
+
+
+def turn_between(start_yaw: ArrayLike, end_yaw: ArrayLike) -> Float64:
+    """Return the turn between two yaws: -pi to pi, counter-clockwise positive."""
+    turn: Float64 = np.asarray(end_yaw) - np.asarray(start_yaw)
+    return (turn + math.pi) % (2 * math.pi) - math.pi
+
+
+# Primitives that are made
 
 
 def make_motions(
     motion: Motion | str, turning_radius: float, resolution: float
 ) -> Motions:
-    """Make primitives: ahead, bends, behind; turns on the spot, or sideways, where it can."""
+    """Make the primitives of a robot.
+
+    It drives ahead, behind and in bends. A differential robot turns on the spot; an
+    omnidirectional one also drives sideways and diagonally.
+
+    Parameters
+    ----------
+    motion : Motion
+    turning_radius : float
+        In metres, 0 to 100 cells; of a car at least one cell.
+    resolution : float
+        Metres per cell.
+
+    Raises
+    ------
+    ValueError
+        If there is no such motion, or a number is out of its range.
+    """
     motion = Motion(motion)
-    cell = _cell_size("the resolution", resolution)
+    cell_size = _cell_size("the resolution", resolution)
+    radius = _radius_in_cells(motion, turning_radius, cell_size)
+    angles = np.arctan2(DIRECTIONS[:, 1], DIRECTIONS[:, 0]) % (2 * math.pi)
+    primitives: list[Primitive] = []
+    for heading in range(HEADINGS):
+        primitives += _straight_primitives(motion, heading, angles, cell_size)
+        for end in ((heading - 1) % HEADINGS, (heading + 1) % HEADINGS):
+            bend = _driven_ahead(heading, end, _bend(heading, end, angles, radius))
+            primitives += [bend, _driven_behind(bend)]
+            if motion is not Motion.ACKERMANN:
+                primitives.append(_turn_on_the_spot(heading, end, angles, cell_size))
+    return _motions(cell_size, angles, primitives)
+
+
+def _cell_size(name: str, metres: Any) -> float:
+    smallest, largest = CELL_SIZES
+    remedy = f"metres per cell, {smallest:g} to {largest:g}"
+    return as_number(name, metres, smallest, largest, remedy)
+
+
+def _radius_in_cells(motion: Motion, turning_radius: float, cell_size: float) -> float:
     metres = as_number(
         "the turning radius", turning_radius, 0, math.inf, "metres, 0 or more"
     )
-    radius = metres / cell
+    radius = metres / cell_size
     if motion is Motion.ACKERMANN and radius < 1:
         problem = (
             f"the turning radius is {turning_radius} m; a car cannot turn on the spot"
         )
-        raise ValueError(f"{problem}: give at least the resolution, {cell} m")
-    if radius > MOST_CELLS:
-        most = f"{MOST_CELLS} cells of {cell:g} m, {MOST_CELLS * cell:g} m"
+        raise ValueError(f"{problem}: give at least the resolution, {cell_size} m")
+    if radius > MAX_TURNING_RADIUS:
+        largest = MAX_TURNING_RADIUS * cell_size
+        limit = f"{MAX_TURNING_RADIUS} cells of {cell_size:g} m, {largest:g} m"
         raise ValueError(
-            f"the turning radius is {metres:g} m; give at most {most}, or a coarser resolution, "
-            "or a lattice"
+            f"the turning radius is {metres:g} m; give at most {limit}, or a coarser "
+            "resolution, or a lattice"
         )
-    angles = np.arctan2(DIRECTIONS[:, 1], DIRECTIONS[:, 0]) % (2 * math.pi)
-    found: list[tuple[int, int, Array, float]] = []
-    for heading, angle in enumerate(angles):
-        for towards in (0, 4, 12, 2, 14) if motion is Motion.OMNIDIRECTIONAL else (0,):
-            step = DIRECTIONS[(heading + towards) % HEADINGS]
-            long = max(round(STRIDE / cell / math.hypot(*step)), 2)
-            for count in (1, long) if towards in (0, 4, 12) else (1,):
-                poses = _straight(np.zeros(2), step * count, angle)
-                found += _both_ways(
-                    heading, heading, poses, 1.0 if towards == 0 else BEHIND
-                )
-        for side in (-1, 1):
-            end = (heading + side) % HEADINGS
-            found += _both_ways(heading, end, _bend(heading, end, angles, radius), 1.0)
-            if motion is not Motion.ACKERMANN:
-                turn = turn_between(angle, angles[end])
-                yaw = angle + turn * np.linspace(0, 1, math.ceil(abs(turn) / ANGLE) + 1)
-                spin = np.column_stack([np.zeros((len(yaw), 2)), yaw])
-                found.append((heading, end, spin, abs(turn) * TURN / cell))
-    return _motions(cell, angles, found)
+    return radius
 
 
-def _cell_size(name: str, metres: Any) -> float:
-    lowest, highest = CELL_SIZES
-    remedy = f"metres per cell, {lowest:g} to {highest:g}"
-    return as_number(name, metres, lowest, highest, remedy)
+def _straight_primitives(
+    motion: Motion, heading: int, angles: Float64, cell_size: float
+) -> list[Primitive]:
+    """Return short and long steps in all directions that the robot can drive."""
+    relative_headings: tuple[int, ...] = (AHEAD,)
+    if motion is Motion.OMNIDIRECTIONAL:
+        relative_headings = (AHEAD, *SIDEWAYS, *DIAGONALLY)
+    primitives = []
+    for relative_heading in relative_headings:
+        step = DIRECTIONS[(heading + relative_heading) % HEADINGS]
+        counts = [1]
+        if relative_heading not in DIAGONALLY:
+            stride = round(STRIDE / cell_size / math.hypot(*step))
+            counts.append(max(stride, 2))
+        for count in counts:
+            poses = _line(np.zeros(2), step * count, float(angles[heading]))
+            primitive = _driven_ahead(heading, heading, poses)
+            if relative_heading == AHEAD:
+                primitives += [primitive, _driven_behind(primitive)]
+            else:
+                cost = BEHIND * primitive.cost
+                primitives.append(primitive._replace(cost=cost))
+    return primitives
+
+
+def _driven_ahead(start: int, end: int, poses: Poses) -> Primitive:
+    steps = np.diff(poses[:, :2], axis=0)
+    length = float(np.hypot(steps[:, 0], steps[:, 1]).sum())
+    return Primitive(start, end, poses, cost=length)
+
+
+def _driven_behind(primitive: Primitive) -> Primitive:
+    """Return the reverse of a primitive, from the cell where that one ends."""
+    last_x, last_y, _ = primitive.poses[-1]
+    return Primitive(
+        start=primitive.end,
+        end=primitive.start,
+        poses=primitive.poses[::-1] - [last_x, last_y, 0],
+        cost=BEHIND * primitive.cost,
+    )
+
+
+def _turn_on_the_spot(
+    start: int, end: int, angles: Float64, cell_size: float
+) -> Primitive:
+    turn = float(turn_between(angles[start], angles[end]))
+    count = math.ceil(abs(turn) / ANGLE) + 1
+    yaw = angles[start] + turn * np.linspace(0, 1, count)
+    poses = np.column_stack([np.zeros((count, 2)), yaw])
+    return Primitive(start, end, poses, cost=abs(turn) * TURN / cell_size)
+
+
+def _line(start: NDArray[Any], end: NDArray[Any], yaw: float) -> Poses:
+    """Return poses on a line from one point (2,) to another."""
+    length = math.hypot(*np.subtract(end, start))
+    count = math.ceil(length / SPACING - 1e-9) + 1
+    points = np.linspace(start, end, count)
+    return np.column_stack([points, np.full(count, yaw)])
+
+
+def _bend(start: int, end: int, angles: Float64, radius: float) -> Poses:
+    """Return the shortest path to a neighbouring heading that ends in a cell's centre.
+
+    It is a line, an arc and a line, of which one line has the length 0. The arc touches
+    both lines at the same distance from their intersection: its tangents.
+    """
+    turn = float(turn_between(angles[start], angles[end]))
+    tan_of_half = math.tan(abs(turn) / 2)
+    yaws = angles[[start, end]]
+    directions = np.array([np.cos(yaws), np.sin(yaws)])  # (2, 2), in columns
+    min_tangent = max(radius, 1.0) * tan_of_half
+    tangents, end_cell = _nearest_end(directions, min_tangent)
+    first_tangent, last_tangent = tangents
+
+    arc_tangent = min(first_tangent, last_tangent)
+    arc_radius = arc_tangent / tan_of_half
+    count_by_angle = math.ceil(abs(turn) / ANGLE)
+    count_by_length = math.ceil(abs(turn) * arc_radius / SPACING)
+    count = max(count_by_angle, count_by_length) + 1
+    yaw = angles[start] + turn * np.linspace(0, 1, count)  # (N,)
+
+    side = math.copysign(1, turn)  # 1: the centre of the arc lies to the left
+    to_centre = np.array([-math.sin(angles[start]), math.cos(angles[start])]) * side
+    arc_start = (first_tangent - arc_tangent) * directions[:, 0]
+    centre = arc_start + arc_radius * to_centre
+    outward = np.column_stack([np.sin(yaw), -np.cos(yaw)]) * side  # (N, 2)
+    arc = np.column_stack([centre + arc_radius * outward, yaw])
+
+    first_line = _line(np.zeros(2), arc[0, :2], yaw[0])
+    last_line = _line(arc[-1, :2], end_cell, yaw[-1])
+    return np.concatenate([first_line[:-1], arc, last_line[1:]])
+
+
+def _nearest_end(
+    directions: Float64, min_tangent: float
+) -> tuple[Float64, NDArray[np.int64]]:
+    """Return the nearest end of a bend: its tangents (2,), and its cell (2,).
+
+    Parameters
+    ----------
+    directions : (2, 2) float64
+        The unit vectors of the first and the last heading, in columns.
+    min_tangent : float
+        Cells that the bend leads along each of them, at least.
+    """
+    max_distance = math.ceil(4 * min_tangent) + 6
+    coordinates = range(-max_distance, max_distance + 1)
+    cells = np.array(list(product(coordinates, repeat=2)))  # (N, 2)
+    tangents = np.linalg.solve(directions, cells.T).T  # (N, 2): cells = sum of both
+    possible = (tangents >= min_tangent - 1e-9).all(axis=1)
+    lengths = np.where(possible, tangents.sum(axis=1), np.inf)
+    nearest = lengths.argmin()
+    return tangents[nearest], cells[nearest]
+
+
+def _motions(
+    cell_size: float, angles: Float64, primitives: Sequence[Primitive]
+) -> Motions:
+    """Return primitives as arrays, sorted by their headings."""
+    in_order = sorted(primitives, key=lambda primitive: primitive[:2])
+    offsets = [np.rint(primitive.poses[-1, :2]) for primitive in in_order]
+    return Motions(
+        resolution=cell_size,
+        angles=angles,
+        start=np.array([primitive.start for primitive in in_order]),
+        end=np.array([primitive.end for primitive in in_order]),
+        offset=np.array(offsets, dtype=np.int64),
+        cost=np.array([primitive.cost for primitive in in_order], np.float32),
+        poses=tuple(primitive.poses for primitive in in_order),
+    )
+
+
+def dense_poses(poses: Poses, spacing: float, lever: float) -> Poses:
+    """Return poses with others between them.
+
+    Between two of them, a point moves by at most `spacing`, if it is no farther than
+    `lever` from the robot's origin.
+    """
+    parts = [poses[:1]]
+    for pose, next_pose in pairwise(poses):
+        step = next_pose - pose
+        movement = math.hypot(step[0], step[1]) + lever * abs(step[2])
+        count = max(math.ceil(movement / spacing - 1e-9), 1)
+        share = np.linspace(0, 1, count + 1)[1:, None]
+        parts.append(pose + share * step)
+    return np.concatenate(parts)
+
+
+# Lattice files
 
 
 def read_lattice(file: str | Path) -> Motions:
-    """Read the motion primitives of a state lattice in Nav2's JSON format; else a ValueError."""
-    file = as_path(file, "the lattice")
+    """Read the primitives of a state lattice in Nav2's JSON format.
+
+    A ValueError says what is wrong with a file.
+    """
+    path = as_path(file, "the lattice")
     try:
-        content = read_file(file, MAX_LATTICE_BYTES)
+        content = read_file(path, MAX_LATTICE_BYTES)
     except OSError as error:
-        problem = f"the lattice {file}: it cannot be read ({error.strerror})"
-        raise ValueError(f"{problem}; {OF_GENERATOR}") from None
+        problem = f"the lattice {path}: it cannot be read ({error.strerror})"
+        raise ValueError(f"{problem}; {GENERATOR_REMEDY}") from None
     try:
         return _motions_in(_json_of(content))
     except ValueError as error:
-        raise ValueError(f"the lattice {file}: {error}") from None
+        raise ValueError(f"the lattice {path}: {error}") from None
 
 
 def _json_of(content: bytes) -> Any:
@@ -148,187 +331,132 @@ def _json_of(content: bytes) -> Any:
         problem = "its brackets are nested too deeply"
     except ValueError as error:
         problem = f"it is no JSON ({error})"
-    raise ValueError(f"{problem}; {OF_GENERATOR}")
+    raise ValueError(f"{problem}; {GENERATOR_REMEDY}")
 
 
-def _field(owner: Any, field: str, name: str) -> Any:
-    """Return a field of a lattice; `name` says whose."""
+def _field(owner: object, field: str, owner_name: str) -> Any:
+    """Return a field of an object in a lattice's JSON."""
     if not isinstance(owner, dict) or field not in owner:
-        raise ValueError(f"{name} has no {field}; {OF_GENERATOR}")
+        raise ValueError(f"{owner_name} has no {field}; {GENERATOR_REMEDY}")
     return owner[field]
 
 
-def _motions_in(lattice: Any) -> Motions:
+def _motions_in(lattice: object) -> Motions:
     """Return the motion primitives of a lattice's JSON."""
-    about = _field(lattice, "lattice_metadata", "it")
-    cell = _cell_size(
-        "grid_resolution", _field(about, "grid_resolution", "lattice_metadata")
+    metadata: object = _field(lattice, "lattice_metadata", "it")
+    cell_size = _cell_size(
+        "grid_resolution", _field(metadata, "grid_resolution", "lattice_metadata")
     )
-    if "num_of_headings" in about:  # which not every lattice has
-        as_number(
-            "num_of_headings",
-            about["num_of_headings"],
-            HEADINGS,
-            HEADINGS,
-            f"{HEADINGS}",
+    _check_number_of_headings(metadata)
+    angles = _angles(_field(metadata, "heading_angles", "lattice_metadata"))
+    objects: object = _field(lattice, "primitives", "it")
+    if not isinstance(objects, list) or not objects:
+        raise ValueError(
+            f"its primitives are no list of one or more; {GENERATOR_REMEDY}"
         )
-    angles = _angles(_field(about, "heading_angles", "lattice_metadata"))
-    primitives = _field(lattice, "primitives", "it")
-    if not isinstance(primitives, list) or not primitives:
-        raise ValueError(f"its primitives are no list of one or more; {OF_GENERATOR}")
-    found = [
-        _primitive(f"primitive {number}", primitive, cell, angles)
-        for number, primitive in enumerate(primitives)
-    ]
-    motions = _motions(cell, angles, found)
-    for headings, verb in ((motions.start, "starts"), (motions.end, "ends")):
-        if missing := sorted(set(range(HEADINGS)) - set(headings.tolist())):
-            remedy = f"give primitives that start and end with each of the {HEADINGS}"
-            raise ValueError(
-                f"no primitive {verb} with the headings {missing}; {remedy}"
-            )
+    primitives = []
+    for number, primitive in enumerate(objects):
+        name = f"primitive {number}"
+        primitives.append(_primitive(name, primitive, cell_size, angles))
+    motions = _motions(cell_size, angles, primitives)
+    _check_headings(motions.start, "starts")
+    _check_headings(motions.end, "ends")
     return motions
 
 
-def _angles(values: Any) -> Array:
+def _check_number_of_headings(metadata: object) -> None:
+    """Raise a ValueError for another number of headings; a lattice may not say it."""
+    field = "num_of_headings"
+    if isinstance(metadata, dict) and field in metadata:
+        as_number(field, metadata[field], HEADINGS, HEADINGS, f"{HEADINGS}")
+
+
+def _check_headings(headings: NDArray[np.int64], verb: str) -> None:
+    """Raise a ValueError if no primitive starts, or ends, with some heading."""
+    missing = sorted(set(range(HEADINGS)) - set(headings.tolist()))
+    if missing:
+        remedy = f"give primitives that start and end with each of the {HEADINGS}"
+        raise ValueError(f"no primitive {verb} with the headings {missing}; {remedy}")
+
+
+def _angles(values: Any) -> Float64:
     """Return the yaws of a lattice's headings, (16,)."""
-    angles = numbers("heading_angles", values)
+    name = "heading_angles"
+    angles = numbers(name, values)
     if angles.shape != (HEADINGS,):
         raise ValueError(f"it has {angles.size} headings; give {HEADINGS}")
-    turned = -MOST_TURNED, MOST_TURNED
-    numbers(
-        "heading_angles", angles, between=turned, whole=False, remedy="finite radians"
-    )
+    limits = (-MAX_YAW, MAX_YAW)
+    numbers(name, angles, between=limits, whole=False, remedy="finite radians")
     return angles.astype(np.float64)
 
 
 def _primitive(
-    name: str, primitive: Any, cell: float, angles: Array
-) -> tuple[int, int, Array, float]:
-    """Return headings before and after, poses and cost of a primitive in a lattice."""
-    start, end = (
-        as_whole(f"{field} of {name}", _field(primitive, field, name), 0, HEADINGS - 1)
-        for field in ("start_angle_index", "end_angle_index")
-    )
-    field, metres = "trajectory_length", f"metres, 0 to {FARTHEST:g}"
+    name: str, primitive: object, cell_size: float, angles: Float64
+) -> Primitive:
+    """Return a primitive of a lattice's JSON."""
+    start = _heading("start_angle_index", name, primitive)
+    end = _heading("end_angle_index", name, primitive)
     length = as_number(
-        f"{field} of {name}", _field(primitive, field, name), 0, FARTHEST, metres
+        f"trajectory_length of {name}",
+        _field(primitive, "trajectory_length", name),
+        0,
+        MAX_DISTANCE,
+        f"metres, 0 to {MAX_DISTANCE:g}",
     )
-    poses = _poses(f"the poses of {name}", _field(primitive, "poses", name)) / (
-        cell,
-        cell,
-        1,
-    )
-    poses[-1, 2] = angles[end]
-    first = np.array([0, 0, angles[start]])
-    if np.abs(poses[0] - first).max() > 1e-6:  # only old files begin with it
-        poses = np.vstack([first, poses])
-    poses[:, 2] = np.unwrap(poses[:, 2])
-    misses = np.abs(poses[-1, :2] - np.rint(poses[-1, :2])).max()
-    if misses > OFF_CENTRE:
-        problem = f"{name} ends {misses:.2g} cells off the centres of cells"
-        raise ValueError(f"{problem}; give a file of the same grid_resolution")
+    poses = _poses(f"the poses of {name}", _field(primitive, "poses", name))
+    poses = poses / (cell_size, cell_size, 1)
+    poses = _from_heading_to_heading(poses, angles[start], angles[end])
+    _check_end(name, poses)
     turn = float(np.abs(np.diff(poses[:, 2])).sum())
-    cost = length / cell or turn * TURN / cell
-    distance = float(np.hypot(*poses[-1, :2])) * cell
-    if length < LEAST_LENGTH * distance or cost < LEAST_COST:
-        problem = (
-            f"{field} of {name} is {length:g}, and its poses lead {distance:.3g} m far"
+    cost = length / cell_size or turn * TURN / cell_size
+    distance = float(np.hypot(poses[-1, 0], poses[-1, 1])) * cell_size
+    if length < MIN_LENGTH_SHARE * distance or cost < MIN_COST:
+        raise ValueError(
+            f"trajectory_length of {name} is {length:g}, and its poses lead "
+            f"{distance:.3g} m far; give the metres that it drives, or leave it out"
         )
-        raise ValueError(f"{problem}; give the metres that it drives, or leave it out")
-    return start, end, closer(poses, SPACING, SPACING / ANGLE), cost
+    return Primitive(start, end, dense_poses(poses, SPACING, SPACING / ANGLE), cost)
 
 
-def _poses(name: str, values: Any) -> Array:
+def _heading(field: str, name: str, primitive: object) -> int:
+    value = _field(primitive, field, name)
+    return as_whole(f"{field} of {name}", value, 0, HEADINGS - 1)
+
+
+def _from_heading_to_heading(poses: Poses, start_yaw: float, end_yaw: float) -> Poses:
+    """Return poses with exact yaws at both ends, and no jumps by whole turns."""
+    poses[-1, 2] = end_yaw
+    start_pose = np.array([0, 0, start_yaw])
+    if np.abs(poses[0] - start_pose).max() > SAME_POSE:  # only old files begin with it
+        poses = np.vstack([start_pose, poses])
+    poses[:, 2] = np.unwrap(poses[:, 2])
+    return poses
+
+
+def _check_end(name: str, poses: Poses) -> None:
+    """Raise a ValueError if a primitive does not end in the centre of a cell."""
+    end = poses[-1, :2]
+    off_centre = np.abs(end - np.rint(end)).max()
+    if off_centre > MAX_OFF_CENTRE:
+        raise ValueError(
+            f"{name} ends {off_centre:.2g} cells off the centres of cells; give a file "
+            "of the same grid_resolution"
+        )
+
+
+def _poses(name: str, values: Any) -> Float64:
     """Return the poses of a lattice's primitive, (N, 3): metres, metres and radians."""
     poses = numbers(name, values)
-    if poses.ndim != 2 or poses.shape[1] != 3 or not 0 < len(poses) <= MOST_POSES:
+    if poses.ndim != 2 or poses.shape[1] != 3 or not 0 < len(poses) <= MAX_POSES:
         raise ValueError(
-            f"{name} have shape {poses.shape}; give 1 to {MOST_POSES} of [x, y, yaw]"
+            f"{name} have shape {poses.shape}; give 1 to {MAX_POSES} of [x, y, yaw]"
         )
-    for column, unit, most in (
-        (0, "metres", FARTHEST),
-        (1, "metres", FARTHEST),
-        (2, "radians", MOST_TURNED),
-    ):
-        remedy = f"{unit}, {-most:g} to {most:g}"
-        numbers(
-            name, poses[:, column], between=(-most, most), whole=False, remedy=remedy
-        )
+    _check_column(name, poses[:, 0], "metres", MAX_DISTANCE)
+    _check_column(name, poses[:, 1], "metres", MAX_DISTANCE)
+    _check_column(name, poses[:, 2], "radians", MAX_YAW)
     return poses.astype(np.float64)
 
 
-def closer(poses: Array, spacing: float, lever: float) -> Array:
-    """Return poses with others between them: what is so far from the origin moves by `spacing`."""
-    parts = [poses[:1]]
-    for before, after in pairwise(poses):
-        moves = math.hypot(*(after - before)[:2]) + lever * abs(after[2] - before[2])
-        share = np.linspace(0, 1, max(math.ceil(moves / spacing - 1e-9), 1) + 1)[
-            1:, None
-        ]
-        parts.append(before + share * (after - before))
-    return np.concatenate(parts)
-
-
-def _both_ways(start: int, end: int, poses: Array, factor: float) -> list[Any]:
-    """Return a primitive, and, unless it leads sideways, the same in reverse."""
-    length = factor * float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
-    primitives = [(start, end, poses, length)]
-    if factor == 1:
-        back = poses[::-1] - [*poses[-1, :2], 0]
-        primitives.append((end, start, back, BEHIND * length))
-    return primitives
-
-
-def _straight(begin: Any, end: Any, yaw: float) -> Array:
-    """Return poses on a line, from its begin to its end."""
-    count = math.ceil(math.hypot(*np.subtract(end, begin)) / SPACING - 1e-9) + 1
-    return np.column_stack([np.linspace(begin, end, count), np.full(count, yaw)])
-
-
-def _bend(start: int, end: int, angles: Array, radius: float) -> Array:
-    """Return the shortest way to a neighbouring heading that ends in the centre of a cell."""
-    # A line, an arc, a line, one line of length 0. With tangents of equal length, so many cells
-    # ahead and so many in the new heading, an arc of the least radius leads from one to the other.
-    turn = float(turn_between(angles[start], angles[end]))
-    ahead = np.array([np.cos(angles[[start, end]]), np.sin(angles[[start, end]])])
-    tangent = max(radius, 1.0) * math.tan(abs(turn) / 2)
-    far = math.ceil(4 * tangent) + 6
-    cells = np.array(list(product(range(-far, far + 1), repeat=2)))
-    lengths = np.linalg.solve(ahead, cells.T).T
-    possible = (lengths >= tangent - 1e-9).all(axis=1)
-    best = np.where(possible, lengths.sum(axis=1), np.inf).argmin()
-    (first, last), whole = lengths[best], cells[best]
-    arc = min(first, last)
-    arc_radius = arc / math.tan(abs(turn) / 2)
-    count = (
-        max(math.ceil(abs(turn) / ANGLE), math.ceil(abs(turn) * arc_radius / SPACING))
-        + 1
-    )
-    yaw = angles[start] + turn * np.linspace(0, 1, count)
-    side = np.array(
-        [-math.sin(angles[start]), math.cos(angles[start])]
-    ) * math.copysign(1, turn)
-    centre = (first - arc) * ahead[:, 0] + arc_radius * side
-    outward = np.column_stack([np.sin(yaw), -np.cos(yaw)]) * math.copysign(1, turn)
-    on_arc = np.column_stack([centre + arc_radius * outward, yaw])
-    parts = [
-        _straight((0, 0), on_arc[0, :2], yaw[0])[:-1],
-        on_arc,
-        _straight(on_arc[-1, :2], whole, yaw[-1])[1:],
-    ]
-    return np.concatenate(parts)
-
-
-def _motions(cell: float, angles: Array, found: list[Any]) -> Motions:
-    start, end, poses, cost = zip(*sorted(found, key=lambda it: it[:2]), strict=True)
-    offset = np.array([np.rint(one[-1, :2]) for one in poses], dtype=np.int64)
-    return Motions(
-        cell,
-        angles,
-        np.array(start),
-        np.array(end),
-        offset,
-        np.array(cost, np.float32),
-        poses,
-    )
+def _check_column(name: str, column: Float64, unit: str, limit: float) -> None:
+    remedy = f"{unit}, {-limit:g} to {limit:g}"
+    numbers(name, column, between=(-limit, limit), whole=False, remedy=remedy)

@@ -1,4 +1,4 @@
-"""Primitives that are quarter turns of each other: one unit of a network serves them."""
+"""Primitives that are quarter turns of each other share a unit of a network."""
 
 import math
 from dataclasses import replace
