@@ -4,7 +4,7 @@ import array
 import hashlib
 import math
 import pickle
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
@@ -24,7 +24,6 @@ from ddqn_planner.planning.exact_paths import dense
 Origin = tuple[float, float, float]
 Float64 = NDArray[np.float64]
 
-MAP_PARAMETERS = ("occupied_threshold", "allow_unknown", "use_map_costs", "map_type")
 MAX_TILT = math.sin(
     math.radians(1) / 2
 )  # of one degree: two decimals of a quaternion tilt less
@@ -41,49 +40,88 @@ BLANK_POSES = pickle.dumps(
 )
 
 
-def grid_from_message(message: OccupancyGrid, *rules: Any) -> GridMap:
-    """Make a grid map of a map message by rules of `MAP_PARAMETERS`, or a ValueError."""
-    info = message.info
-    size = f"{info.width} x {info.height} cells"
-    needs, has = info.width * info.height, len(message.data)
-    (finest, coarsest), metres = RESOLUTIONS, f"give {METRES_PER_CELL}"
-    for is_right, wrong in (
-        (message.header.frame_id, "frame is ''; name one in header.frame_id"),
-        (
-            finest <= info.resolution <= coarsest,
-            f"resolution is {info.resolution}; {metres}",
-        ),
-        (needs, f"size is {size}; give at least one row and column"),
-        (
-            needs <= MAX_CELLS,
-            f"size is {size}; give at most {MAX_CELLS}, or a coarser resolution",
-        ),
-        (has == needs, f"data has {has} values; its {size} need {needs}"),
-    ):
-        if not is_right:
-            raise ValueError(f"the map's {wrong}")
-    _check_pose("the map's origin", info.origin)
-    turned = rotation(info.origin.orientation)
-    if turned.tilt > MAX_TILT:
-        numbers = _numbers(info.origin.orientation)
-        raise ValueError(
-            f"the map's origin is rolled or pitched ({numbers}); give a yaw"
-        )
-    values = np.frombuffer(message.data, np.int8).reshape(info.height, info.width)
-    origin = (info.origin.position.x, info.origin.position.y, turned.yaw)
+class MapRules(NamedTuple):
+    """How a node reads the values of a map: its parameters of these names."""
+
+    occupied_threshold: int = 65
+    allow_unknown: bool = False
+    use_map_costs: bool = False
+    map_type: str = "map"  # or "costmap"
+
+
+DEFAULT_RULES = MapRules()
+
+
+def grid_from_message(
+    message: OccupancyGrid, rules: MapRules = DEFAULT_RULES
+) -> GridMap:
+    """Make a grid map of a map message.
+
+    Raises
+    ------
+    ValueError
+        If the message is no complete map in a named frame; with the remedy.
+    """
+    _check_map(message)
+    pose: Pose = message.info.origin
+    origin = (pose.position.x, pose.position.y, rotation(pose.orientation).yaw)
+    resolution: float = message.info.resolution
     try:
-        return grid_from_values(values, info.resolution, origin, *rules)
+        return grid_from_values(occupancy_values(message), resolution, origin, rules)
     except MemoryError:
         raise ValueError("no memory is left for the map; give a smaller one") from None
 
 
+def _check_map(message: OccupancyGrid) -> None:
+    if not message.header.frame_id:
+        raise ValueError("the map's frame is ''; name one in header.frame_id")
+    resolution: float = message.info.resolution
+    finest, coarsest = RESOLUTIONS
+    if not finest <= resolution <= coarsest:
+        wrong = f"the map's resolution is {resolution}"
+        raise ValueError(f"{wrong}; give {METRES_PER_CELL}")
+    width: int = message.info.width
+    height: int = message.info.height
+    number_of_cells = width * height
+    size = f"{width} x {height} cells"
+    if number_of_cells == 0:
+        wrong = f"the map's size is {size}"
+        raise ValueError(f"{wrong}; give at least one row and column")
+    if number_of_cells > MAX_CELLS:
+        remedy = f"give at most {MAX_CELLS}, or a coarser resolution"
+        raise ValueError(f"the map's size is {size}; {remedy}")
+    if len(message.data) != number_of_cells:
+        wrong = f"the map's data has {len(message.data)} values"
+        raise ValueError(f"{wrong}; its {size} need {number_of_cells}")
+    origin: Pose = message.info.origin
+    _check_pose("the map's origin", origin)
+    if rotation(origin.orientation).tilt > MAX_TILT:
+        wrong = (
+            f"the map's origin is rolled or pitched ({_numbers(origin.orientation)})"
+        )
+        raise ValueError(f"{wrong}; give a yaw")
+
+
+def occupancy_values(message: OccupancyGrid) -> NDArray[np.int8]:
+    """Return a view of the values of a map message, (H, W) int8."""
+    values = np.frombuffer(message.data, np.int8)
+    return values.reshape(message.info.height, message.info.width)
+
+
 def grid_from_values(
-    values: NDArray[np.int8], resolution: float, origin: Origin, *rules: Any
+    values: NDArray[np.int8], resolution: float, origin: Origin, rules: MapRules
 ) -> GridMap:
-    """Make a grid map by `MAP_PARAMETERS`, or the first of them; a costmap has other costs."""
-    if rules[3:] == ("costmap",):
-        return grid_from_costmap(values, resolution, origin, rules[1])
-    return GridMap.from_occupancy_values(values, resolution, origin, *rules[:3])
+    """Make a grid map of values as they are in a map message, (H, W) int8."""
+    if rules.map_type == "costmap":
+        return grid_from_costmap(values, resolution, origin, rules.allow_unknown)
+    return GridMap.from_occupancy_values(
+        values,
+        resolution,
+        origin,
+        occupied_threshold=rules.occupied_threshold,
+        allow_unknown=rules.allow_unknown,
+        use_map_costs=rules.use_map_costs,
+    )
 
 
 def occupancy_message(

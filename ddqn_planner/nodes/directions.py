@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.one_way import forbidden_on
 from ddqn_planner.nodes.base_node import BaseNode
-from ddqn_planner.nodes.conversions import grid_from_message
+from ddqn_planner.nodes.conversions import grid_from_message, occupancy_values
 from ddqn_planner.nodes.diagnostics import PlannerDiagnostics
 from ddqn_planner.nodes.quality import LATCHED
 
@@ -87,7 +87,9 @@ class Directions:
             zones = None
             if message.info.width or message.info.height or message.data:
                 grid = grid_from_message(message)
-                zones = grid.with_layers(forbidden=_values(message).view(np.uint8))
+                zones = grid.with_layers(
+                    forbidden=occupancy_values(message).view(np.uint8)
+                )
             self._frame, self._zones = message.header.frame_id, zones
             self._have_come, self._last = True, None
             self._know_publishers()
@@ -118,9 +120,3 @@ class Directions:
 
     def _know_publishers(self) -> None:
         self._known_publishers, self._awaited_since = self._publishers(), None
-
-
-def _values(message: OccupancyGrid) -> NDArray[np.int8]:
-    return np.frombuffer(message.data, np.int8).reshape(
-        message.info.height, message.info.width
-    )

@@ -1,4 +1,4 @@
-"""Messages for RViz: the value of a Q field as a map, a body's outlines along a path."""
+"""Messages for RViz: a Q field's value as a map, a body's outlines along a path."""
 
 from collections.abc import Callable
 from typing import NamedTuple

@@ -160,7 +160,8 @@ class TrainerNode(BaseNode):
             map_file = read_map_file(find_map(name))
         except (ValueError, OSError) as error:
             raise RuntimeError(f"map_file is {name!r}: {error}") from None
-        grid = map_file.grid(*map(self.value, OF_MAPS))
+        rules = self._map_rules()
+        grid = map_file.grid(rules.occupied_threshold, rules.allow_unknown)
         self.map = MapInFrame(grid, "map")
         for which, cell in (("start", map_file.start), ("goal", map_file.goal)):
             if cell is not None:
@@ -168,9 +169,15 @@ class TrainerNode(BaseNode):
                 at = self._poses[which].pose.position
                 at.x, at.y = grid.cell_to_world(cell)
 
+    def _map_rules(self) -> conversions.MapRules:
+        return conversions.MapRules(
+            occupied_threshold=self.value("occupied_threshold"),
+            allow_unknown=self.value("allow_unknown"),
+        )
+
     def _on_map(self, message: OccupancyGrid) -> None:
         with self.diagnostics.receiving("map"):
-            grid = conversions.grid_from_message(message, *map(self.value, OF_MAPS))
+            grid = conversions.grid_from_message(message, self._map_rules())
             self.map = MapInFrame(grid, message.header.frame_id)
             self.get_logger().info(f"map of {grid.width} x {grid.height} cells")
 

@@ -25,6 +25,7 @@ from std_msgs.msg import Header
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import (
+    MapRules,
     along,
     cell_from_pose,
     centres,
@@ -70,7 +71,7 @@ def test_a_map_survives_the_way_to_a_message_and_back(yaw: float, sign: int) -> 
     assert (math.cos(read), math.sin(read)) == pytest.approx(
         (math.cos(yaw), math.sin(yaw))
     )
-    grid = grid_from_message(message, 64, True)
+    grid = grid_from_message(message, MapRules(64, allow_unknown=True))
     assert grid.occupancy.tolist() == [[False, True, False], [True, True, False]]
 
 

@@ -28,18 +28,18 @@ from ddqn_planner import Experience, GridMap, MoveRule, Planner
 from ddqn_planner.grid import inflate
 from ddqn_planner.nodes.base_node import BaseNode
 from ddqn_planner.nodes.conversions import (
+    MapRules,
     bytes_message,
     grid_from_message,
     occupancy_message,
 )
 from ddqn_planner.nodes.diagnostics import PlannerDiagnostics
+from ddqn_planner.nodes.expected_times import ExpectedTimes
 from ddqn_planner.nodes.map_source import (
     BODY_PARAMETERS,
-    MAP_PARAMETERS,
-    ExpectedTimes,
     MapSource,
-    updated_values,
 )
+from ddqn_planner.nodes.map_updates import values_of_update
 from ddqn_planner.nodes.outcome import Outcome, RequestError
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.quality import LATCHED
@@ -67,7 +67,10 @@ class Source(MapSource):
 
     def __init__(self, node: BaseNode) -> None:
         self.heard, self.diagnostics = 0, PlannerDiagnostics(node)
-        super().__init__(node, self.diagnostics, Worker(node), self._hear)
+        self.now = 100.0  # seconds of its clock
+        super().__init__(
+            node, self.diagnostics, Worker(node), self._hear, lambda: self.now
+        )
 
     def _hear(self) -> None:
         self.heard += 1
@@ -90,11 +93,11 @@ class Source(MapSource):
         return self.check().stamp.sec, columns[0] if len({*columns}) == 1 else columns
 
     def on_map(self, stamp: int, **changes: Any) -> tuple[int, Any]:
-        self._take(map_of(stamp, **changes))
+        self.take(map_of(stamp, **changes))
         return self.used()
 
     def on_directions(self, stamp: int, value: int | None = EAST) -> tuple[int, Any]:
-        self._directions.take(directions_of(stamp, value))
+        self.directions.take(directions_of(stamp, value))
         return self.used()
 
 
@@ -147,7 +150,7 @@ def directions_of(stamp: int, value: int | None = EAST) -> Any:
     return occupancy_message(forbidden, 0.5, (0.0, 0.0, 0.0), map_of(stamp).header)
 
 
-def update(**fields: Any) -> SimpleNamespace:
+def update(**fields: Any) -> Any:
     """Return an update of 2 x 3 cells from (1, 0), or with other fields."""
     usual = {
         "header": Header(frame_id="map", stamp=Time(sec=6)),
@@ -183,19 +186,19 @@ def test_an_update_is_taken_if_fit(
     sent = update(x=x, y=y, width=width, height=height, data=data)
     if fits and surplus == 0:
         expected = np.reshape(data, (height, width))
-        np.testing.assert_array_equal(updated_values(map_of(5), sent), expected)
+        np.testing.assert_array_equal(values_of_update(map_of(5), sent), expected)
     else:
         reason = (
             "is not inside the map of 5 x 4" if not fits else f"need {width * height}"
         )
         with pytest.raises(ValueError, match=reason):
-            updated_values(map_of(5), sent)
+            values_of_update(map_of(5), sent)
 
 
 def test_an_update_has_the_maps_frame_and_its_stamp_or_a_later_one_or_none() -> None:
     for stamp in (Time(), Time(sec=5), Time(sec=9)):
         sent = update(header=Header(frame_id="map", stamp=stamp))
-        assert updated_values(map_of(5), sent).shape == (3, 2)
+        assert values_of_update(map_of(5), sent).shape == (3, 2)
     for frame, stamp, reason in (
         *(
             ("odom", Time(sec=6), "'odom', the map's is 'map'"),
@@ -204,7 +207,7 @@ def test_an_update_has_the_maps_frame_and_its_stamp_or_a_later_one_or_none() -> 
         ("map", Time(sec=4, nanosec=999), "later than the update"),
     ):
         with pytest.raises(ValueError, match=reason):
-            updated_values(
+            values_of_update(
                 map_of(5), update(header=Header(frame_id=frame, stamp=stamp))
             )
 
@@ -227,7 +230,7 @@ def test_after_updates_the_map_is_as_if_it_came_whole(
     random, whole = np.random.default_rng(0), Source(node)
     values = random.choice([0, 0, 0, 0, 20, 98, 99, 100, -1], (30, 40)).astype(np.int8)
     place = 0.5, (-1.0, 2.0, 0.3)
-    source._take(occupancy_message(values, *place, map_of(1).header))
+    source.take(occupancy_message(values, *place, map_of(1).header))
     for stamp in range(2, 12):
         height, width = random.integers(1, 12, 2).tolist()
         y, x = random.integers(30 - height), random.integers(40 - width)
@@ -235,11 +238,12 @@ def test_after_updates_the_map_is_as_if_it_came_whole(
         values[y : y + height, x : x + width] = patch
         header, data = map_of(stamp).header, array.array("b", patch.tobytes())
         box = {"x": int(x), "y": int(y), "width": width, "height": height}
-        source._take_update(update(header=header, data=data, **box))
+        source.take_update(update(header=header, data=data, **box))
         message = occupancy_message(values, *place, header)
         before = whole.grid() if stamp > 2 else None
-        whole._take(message)
-        new = grid_from_message(message, *map(node.value, MAP_PARAMETERS))
+        whole.take(message)
+        rules = MapRules(**{name: node.value(name) for name in MapRules._fields})
+        new = grid_from_message(message, rules)
         expected = inflate(new, *map(node.value, BODY_PARAMETERS))
         for found in (source.grid(), whole.grid()):
             assert found.fingerprint == expected.fingerprint
@@ -254,10 +258,10 @@ def test_after_updates_the_map_is_as_if_it_came_whole(
         assert source.grid().same_cells(expected)
     others = ("map", (0.5, (1.0, 2.0, 0.3))), ("map", (1.0, place[1])), ("odom", place)
     for frame, moved in others:
-        whole._take(occupancy_message(values, *moved, Header(frame_id=frame)))
+        whole.take(occupancy_message(values, *moved, Header(frame_id=frame)))
         assert (whole.frame, whole.grid().resolution) == (frame, moved[0])
         assert whole.grid().origin == pytest.approx(moved[1])
-    whole._take(occupancy_message(values, *place, Header()))
+    whole.take(occupancy_message(values, *place, Header()))
     assert "frame is ''" in whole.diagnostics.refused["map"]
     said = {"map stamp (s)": "11.000000000", "map updates applied": "10"}
     assert said.items() <= source.describe().items()
@@ -265,59 +269,55 @@ def test_after_updates_the_map_is_as_if_it_came_whole(
 
 def test_refused_updates_are_counted_and_change_nothing(source: Source) -> None:
     refused = source.diagnostics.refused
-    source._take_update(update())
+    source.take_update(update())
     assert refused["map_updates"].startswith("an update came before a map")
     assert source.missing
-    source._take(map_of(1))
+    source.take(map_of(1))
     assert "map_updates" not in refused
     before = source.grid()
-    source._take_update(update(x=40))
+    source.take_update(update(x=40))
     assert "not inside" in refused["map_updates"]
     assert source.describe()["map updates refused"] == "2"
     assert source.grid() is before
     assert source.check() == map_of(1).header
     assert source.heard == 1
-    source._take_update(update())
+    source.take_update(update())
     assert "map_updates" not in refused
     assert source.heard == 2
 
 
 @pytest.mark.usefixtures("published")
 def test_an_update_of_a_map_that_waits_changes_that_map(source: Source) -> None:
-    source._take(map_of(5))
-    source._take_update(update(data=array.array("b", [100] * 6)))
+    source.take(map_of(5))
+    source.take_update(update(data=array.array("b", [100] * 6)))
     assert source.used() == NOTHING
-    source._directions.take(directions_of(1, None))
+    source.directions.take(directions_of(1, None))
     assert source.grid().occupancy.tolist() == 3 * [[0, 1, 1, 0, 0]] + [[0] * 5]
     assert source.check() == update().header
 
 
 def test_a_costmap_is_planned_on_for_map_timeout_after_its_last_message(
-    source: Source, set_parameters: SetParameters, monkeypatch: pytest.MonkeyPatch
+    source: Source, set_parameters: SetParameters
 ) -> None:
-    now = [100.0]
-    clock = SimpleNamespace(monotonic=lambda: now[0])
-    monkeypatch.setattr("ddqn_planner.nodes.map_source.time", clock)
-
     def after(seconds: float) -> str:
-        now[0] += seconds
+        source.now += seconds
         try:
             source.check()
         except RequestError as error:
             return error.status if source.missing == str(error) else "another reason"
         return source.missing
 
-    source._take(map_of(5))
+    source.take(map_of(5))
     assert after(1e6) == ""  # a map
     set_parameters(map_type="costmap")
     assert after(0) == "MAP_TIMEOUT"
     assert (
         "nothing came on /map for longer than map_timeout, 5 s; start" in source.missing
     )
-    for take, message in ((source._take, map_of(5)), (source._take_update, update())):
+    for take, message in ((source.take, map_of(5)), (source.take_update, update())):
         take(message)
         assert [after(0), after(4.9), after(0.2)] == ["", "", "MAP_TIMEOUT"]
-    source._take_update(update(x=40))  # what is refused is no news
+    source.take_update(update(x=40))  # what is refused is no news
     set_parameters(robot_radius=0.4)  # nor is a parameter
     assert after(0) == "MAP_TIMEOUT"
     set_parameters(map_timeout=20.0)
@@ -394,7 +394,7 @@ def test_directions_hold_where_they_overlap_a_map_whatever_the_stamps(
         [0] * 3 + [EAST] * 2,
     )  # by the cells' centres
     assert source.on_map(9, resolution=0.25) == (9, EAST)
-    source._take(map_of(9, resolution=1.0))
+    source.take(map_of(9, resolution=1.0))
     forbidden: Any = source.grid().forbidden
     assert forbidden.tolist() == 2 * [[EAST] * 3 + [0] * 2] + 2 * [[0] * 5]
     for x in (50.0, 1e30, -1e30, 1e308, -1e308):
@@ -435,9 +435,6 @@ OTHERS = [
 def test_why_a_map_waits_for_directions_is_logged_once(
     source: Source, set_parameters: SetParameters, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    now = [100.0]
-    clock = SimpleNamespace(monotonic=lambda: now[0])
-    monkeypatch.setattr("ddqn_planner.nodes.map_source.time", clock)
     logged = list[str]()
     logger = SimpleNamespace(
         warning=logged.append, error=logged.append, info=lambda _: None
@@ -450,8 +447,8 @@ def test_why_a_map_waits_for_directions_is_logged_once(
         for stamp in range(10, 16):
             source.on_map(stamp, **changes[stamp % len(changes)])
             assert "map" in source.diagnostics.refused
-            now[0] += 0.5
-        now[0] += 2.0
+            source.now += 0.5
+        source.now += 2.0
         source.look()
         return logged
 
@@ -471,13 +468,13 @@ def test_why_a_map_waits_for_directions_is_logged_once(
     # Directions that come moments after their map are no reason to warn.
     logged.clear()
     assert source.on_map(21, frame="odom") == (20, EAST)
-    now[0] += 0.5
+    source.now += 0.5
     source.look()
     assert source.on_map(22) == (22, EAST)
-    now[0] += 5.0
+    source.now += 5.0
     assert source.on_map(23, frame="odom") == (22, EAST)
     assert not logged
-    now[0] += 1.0
+    source.now += 1.0
     source.look()
     assert len(logged) == 1
 
@@ -512,7 +509,7 @@ def test_maps_with_equal_zones_are_compared_by_their_patches(source: Source) -> 
     before = source.grid()
     changed = map_of(2)
     changed.data[0] = 100
-    source._take(changed)
+    source.take(changed)
     patches = source.grid().patches_since(before)
     assert patches
     assert len(patches) == 1
@@ -522,7 +519,7 @@ def test_malformed_directions_leave_those_before_them(source: Source) -> None:
     source.on_directions(1)
     broken = directions_of(2)
     broken.data = broken.data[:-1]
-    source._directions.take(broken)
+    source.directions.take(broken)
     assert "20" in source.diagnostics.refused["map_directions"]
     assert source.on_map(1) == (1, EAST)
     source.on_directions(1)
@@ -574,17 +571,17 @@ def test_drives_are_planned_with_at_once(
 ) -> None:
     data = bytes(driven.data)
     expected: Any = Experience.from_bytes(data).apply(GRID).slowness
-    source._take(MESSAGE)
+    source.take(MESSAGE)
     assert source.slowness() is None
     source.heard = 0
-    finished(source.times.on_sent(driven))
+    finished(source.times.on_message(driven))
     assert source.heard == 1
-    finished(source.times.on_sent(driven))  # the same again is no news
+    finished(source.times.on_message(driven))  # the same again is no news
     assert source.heard == 1
     free, closed = np.zeros((2, 40, 120), np.int8)
     closed[19:22, 60:63] = 100
     for values in (free, closed, free):
-        source._take(occupancy_message(values, *PLACE, MESSAGE.header))
+        source.take(occupancy_message(values, *PLACE, MESSAGE.header))
         timed = source.grid()
         assert source.grid() is timed
         np.testing.assert_array_equal(timed.occupancy, values > 0)
@@ -600,11 +597,11 @@ def test_drives_are_planned_with_at_once(
         ),
         (UInt8MultiArray(data=data), "label ''"),
     ):
-        finished(source.times.on_sent(bad))
+        finished(source.times.on_message(bad))
         assert reason in source.diagnostics.refused["experience"]
     assert source.heard == 0
     np.testing.assert_array_equal(source.slowness(), expected)
-    finished(source.times.on_sent(message_of(Experience(0.5))))
+    finished(source.times.on_message(message_of(Experience(0.5))))
     assert source.heard == 1
     assert source.slowness() is None  # it was forgotten
 
@@ -617,26 +614,26 @@ def test_a_file_is_planned_with_or_refused_or_none_is_set(
 ) -> None:
     file = tmp_path / "experience.npz"
     file.write_bytes(bytes(driven.data))
-    source._take(MESSAGE)
+    source.take(MESSAGE)
     set_parameters(experience=str(tmp_path))
     for problem in ("", "cannot be read"):
-        finished(source.times.on_sent())
+        finished(source.times.on_message())
         assert problem in source.diagnostics.refused.get("experience", "")
         assert source.slowness()[20, 60] > 2
         file.write_bytes(bytes(driven.data)[:-9])
     set_parameters(experience="")
-    finished(source.times.on_sent())
+    finished(source.times.on_message())
     assert source.slowness() is None
     assert "experience" not in source.diagnostics.refused
-    finished(source.times.on_sent(driven))
+    finished(source.times.on_message(driven))
     assert source.slowness()[20, 60] > 2
 
 
 def test_the_exploration_that_is_set_counts_at_once(
     source: Source, driven: UInt8MultiArray, set_parameters: SetParameters
 ) -> None:
-    source._take(MESSAGE)
-    finished(source.times.on_sent(driven))
+    source.take(MESSAGE)
+    finished(source.times.on_message(driven))
     for share in (0.1, 0.5):
         set_parameters(exploration=share)
         expected = Experience.from_bytes(bytes(driven.data)).apply(GRID, share)
@@ -655,20 +652,20 @@ def test_what_no_memory_was_left_for_is_refused_or_tried_again(
 
     changed = map_of(2)
     changed.data[0] = 100
-    source._take(map_of(1))
+    source.take(map_of(1))
     with monkeypatch.context() as patch:
         patch.setattr(source, "_inflate", fail)
         with pytest.raises(MemoryError):
             source.grid()
         patch.setattr(source, "_patched", fail)
-        source._take(changed)
+        source.take(changed)
         patch.setattr(source.times, "load", fail)
-        finished(source.times.on_sent())
+        finished(source.times.on_message())
         assert source.diagnostics.refused == dict.fromkeys(
             ("map", "experience"), "MemoryError()"
         )
     assert source.used() == (1, None)
-    source._take(changed)
+    source.take(changed)
     assert source.used() == (2, None)
 
 
@@ -699,16 +696,18 @@ def test_the_expected_time_is_told_as_soon_as_the_worker_has_it(
     )
     monkeypatch.setattr(source.times, "describe", lambda _: gate.wait() and told)
     outcome = Outcome("SUCCEEDED", "a path")
-    assert source.times.told(outcome) == {}  # without drives
-    finished(source.times.on_sent(driven))
+    assert source.times.diagnostics_of(outcome) == {}  # without drives
+    finished(source.times.on_message(driven))
     threads.clear()
-    assert source.times.told(outcome) == {}
+    assert source.times.diagnostics_of(outcome) == {}
     assert threads == {threading.get_ident()}  # it looks again soon
     gate.set()
-    assert wait_for("expected time", lambda: source.times.told(outcome)) == told
+    assert (
+        wait_for("expected time", lambda: source.times.diagnostics_of(outcome)) == told
+    )
     assert threads == {threading.get_ident()}  # the executor's alone
-    finished(source.times.on_sent())  # the file that is set: none
-    assert source.times.told(outcome) == {}
+    finished(source.times.on_message())  # the file that is set: none
+    assert source.times.diagnostics_of(outcome) == {}
 
 
 def test_the_plan_goes_round_and_its_time_is_told(times: ExpectedTimes) -> None:

@@ -446,7 +446,7 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
             node.set_parameters([Parameter("switch_threshold", value=threshold)])
             costs = values.copy()
             costs[dear, 10:20] = 2
-            node._map._take(map_message(costs, grid, next(NUMBERS)))
+            node._map.take(map_message(costs, grid, next(NUMBERS)))
             path, outcome = run(node._plan_for_action(task, lambda: None))
             request, validity = SimpleNamespace(path=path), SimpleNamespace()
             assert run(node._on_is_path_valid(request, validity)).is_valid
@@ -515,7 +515,7 @@ def test_a_path_leads_through_its_goals_in_order_or_as_far_as_it_can() -> None:
         )
 
         def plan(*goals: PoseStamped, via: bool = False) -> tuple[PathMessage, Outcome]:
-            node._map._take(map_message(values, grid, next(NUMBERS)))
+            node._map.take(map_message(values, grid, next(NUMBERS)))
             task = Task(start, [*goals], "", via)
             future = executor.create_task(node._plan_for_action(task, lambda: None))
             executor.spin_until_future_complete(future, TIMEOUT)

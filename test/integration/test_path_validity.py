@@ -59,7 +59,7 @@ class Asked:
         return self.run(self.node._on_is_path_valid(request, response))
 
     def set_map(self, values: np.ndarray) -> None:
-        self.node._map._take(map_message(values, GRID, next(NUMBERS)))
+        self.node._map.take(map_message(values, GRID, next(NUMBERS)))
 
     def stand(self, stamped: PoseStamped) -> None:
         self.node._places._take(stamped)

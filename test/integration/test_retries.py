@@ -22,7 +22,7 @@ from rclpy.utilities import try_shutdown
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import GridMap
-from ddqn_planner.nodes.map_source import Arrivals
+from ddqn_planner.nodes.arrivals import Arrivals
 from ddqn_planner.nodes.nav2 import CANCELED, Task
 from ddqn_planner.nodes.outcome import NOT_ACTIVE, STOPPING, Outcome
 from ddqn_planner.nodes.pending_requests import FAREWELL
@@ -66,14 +66,14 @@ class Asked:
         if seconds_ahead is not None:
             stamp = self.node.get_clock().now() + Duration(seconds=seconds_ahead)
             message.header.stamp = stamp.to_msg()
-        self.node._map._take(message)
+        self.node._map.take(message)
 
     def send_update(self, values: np.ndarray) -> None:
         """Send all cells as an update, which has no stamp, as Nav2's costmaps do."""
         height, width = values.shape
         box = {"x": 0, "y": 0, "width": width, "height": height}
         header, data = Header(frame_id="map"), array.array("b", values.tobytes())
-        self.node._map._take_update(SimpleNamespace(header=header, data=data, **box))
+        self.node._map.take_update(SimpleNamespace(header=header, data=data, **box))
 
     def set_period(self, seconds: float) -> None:
         """Let the last costmaps have come so far apart."""
@@ -249,13 +249,9 @@ def test_how_long_a_retry_waits(asked: Asked) -> None:
     assert [asked.answer(asked.ask()) for _ in range(2)] == ["NO_PATH", "NO_PATH"]
 
 
-def test_the_period_is_that_of_the_last_arrivals(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_period_is_that_of_the_last_arrivals() -> None:
     now = [0.0]
-    clock = SimpleNamespace(monotonic=lambda: now[0])
-    monkeypatch.setattr("ddqn_planner.nodes.map_source.time", clock)
-    arrivals, periods = Arrivals(), []
+    arrivals, periods = Arrivals(clock=lambda: now[0]), []
     for seconds in (0.0, 0.01, 0.5, 0.5, 60.0, 0.5, *8 * [0.2]):
         now[0] += seconds
         assert arrivals.note() == now[0]

@@ -241,7 +241,7 @@ def test_actions_lead_through_poses_and_paths_are_checked(
 
     try:
         executor.add_node(node)
-        node._map._take(map_message(rooms, grid, next(NUMBERS)))
+        node._map.take(map_message(rooms, grid, next(NUMBERS)))
         path, outcome = run(
             node._plan_for_action(Task(start, [middle, goal], ""), lambda: None)
         )
@@ -263,7 +263,7 @@ def test_actions_lead_through_poses_and_paths_are_checked(
         narrow = rooms.copy()
         narrow[:, 28:33] = 100
         narrow[24:29, 28:33] = 0
-        node._map._take(map_message(narrow, grid, next(NUMBERS)))
+        node._map.take(map_message(narrow, grid, next(NUMBERS)))
         through, _ = run(node._plan_for_action(Task(start, [goal], ""), lambda: None))
         poses_through = array_of(through)
         from_door = np.abs(poses_through[:, :2] - grid.cell_to_world((30, 26))).sum(
@@ -281,11 +281,11 @@ def test_actions_lead_through_poses_and_paths_are_checked(
             "cells, kept, as there is none from the cell and heading nearest"
             in outcome.reason
         )
-        node._map._take(map_message(rooms, grid, next(NUMBERS)))
+        node._map.take(map_message(rooms, grid, next(NUMBERS)))
         blocked = rooms.copy()
         x, y = grid.world_to_cell(*poses[len(poses) // 2, :2])
         blocked[y, x] = 100
-        node._map._take(map_message(blocked, grid, next(NUMBERS)))
+        node._map.take(map_message(blocked, grid, next(NUMBERS)))
         assert not is_valid(path)
     finally:
         node.destroy_node()

@@ -1,0 +1,166 @@
+"""Expected times on the planner's map: what the trainer has learned of drives."""
+
+from collections.abc import Callable
+
+import numpy as np
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.task import Future
+from std_msgs.msg import MultiArrayLayout, UInt8MultiArray
+
+from ddqn_planner.experience import Experience
+from ddqn_planner.grid import GridMap
+from ddqn_planner.nodes.base_node import BaseNode
+from ddqn_planner.nodes.conversions import bytes_of
+from ddqn_planner.nodes.diagnostics import PlannerDiagnostics
+from ddqn_planner.nodes.outcome import NO_REQUEST, Outcome
+from ddqn_planner.nodes.quality import LATCHED
+from ddqn_planner.nodes.worker import Worker
+
+# A share of the cells: where more have changed, experience is spread anew over the map,
+# which takes long.
+CHANGED_SHARE = 0.02
+
+
+class ExpectedTimes:
+    """Puts on maps the times that an experience expects; the trainer's or a file's.
+
+    Parameters
+    ----------
+    node
+        The planner's node, with its parameters.
+    diagnostics
+        Where refused messages and files are reported.
+    worker
+        Loads experience and computes the time of a plan.
+    on_change
+        Called when maps cost other times.
+    """
+
+    def __init__(
+        self,
+        node: BaseNode,
+        diagnostics: PlannerDiagnostics,
+        worker: Worker,
+        on_change: Callable[[], None],
+    ) -> None:
+        self._node = node
+        self._diagnostics = diagnostics
+        self._worker = worker
+        self._on_change = on_change
+        self._experience: Experience | None = None
+        # Of the message that the experience came in; it holds the digest.
+        self._layout: MultiArrayLayout | None = None
+        self._experience_of_file: Experience | None = None  # which was set last
+        self._spread_on: GridMap | None = None
+        # The outcome whose description the worker computes, and its answer.
+        self._described = NO_REQUEST
+        self._description = Future()
+        group = MutuallyExclusiveCallbackGroup()  # the callback waits for the worker
+        self._read_file = node.create_guard_condition(self.on_message, group).trigger
+        if node.value("experience"):
+            self._read_file()
+        if node.value("follow_trainer"):
+            node.create_subscription(
+                UInt8MultiArray,
+                "trainer/experience",
+                self.on_message,
+                LATCHED,
+                callback_group=group,
+            )
+
+    def use(self, experience: Experience | None) -> None:
+        """Plan by the experience of the file that was set, or by none."""
+        self._experience_of_file = experience
+        self._read_file()
+
+    async def on_message(self, message: UInt8MultiArray | None = None) -> None:
+        """Plan by the trainer's message, or by the file that is set, or refuse it."""
+        with self._diagnostics.receiving("experience"):
+            is_new: bool = await self._worker.call(self.load, message)
+            if is_new:
+                self._on_change()
+
+    def load(self, message: UInt8MultiArray | None = None) -> bool:
+        """Use a message, or without one the file that is set; return whether it is new.
+
+        The worker calls it.
+
+        Raises
+        ------
+        ValueError
+            If the message or the file holds no experience.
+        """
+        if message is None:
+            newer = self._load_file()
+        else:
+            data = bytes_of("experience", message)
+            if message.layout == self._layout:  # its digest is the same
+                return False
+            newer = Experience.from_bytes(data)
+        if newer is not None and self._experience is not None:
+            newer.take_over(self._experience)
+        self._experience = newer
+        self._layout = None if message is None else message.layout
+        return True
+
+    def _load_file(self) -> Experience | None:
+        file: str = self._node.value("experience")
+        if not file:
+            return None
+        experience = self._experience_of_file
+        self._experience_of_file = None
+        return Experience.load(file) if experience is None else experience
+
+    def apply(self, grid: GridMap) -> GridMap:
+        """Return a map whose moves cost expected time; the same map before a drive."""
+        if self._experience is None or not len(self._experience.evidence.table):
+            return grid
+        if self._spread_on is None or not is_like(grid, self._spread_on):
+            self._spread_on = grid
+        exploration: float = self._node.value("exploration")
+        return grid.with_times_of(self._experience.apply(self._spread_on, exploration))
+
+    def diagnostics_of(self, outcome: Outcome) -> dict[str, str]:
+        """Return what `describe` returns; empty until the worker has computed it."""
+        if self._experience is None:
+            return {}
+        if outcome is not self._described:
+            self._described = outcome
+            self._description = self._worker.call(self.describe, outcome)
+        if not self._description.done():
+            self._diagnostics.change()  # to look again soon
+            return {}
+        if self._description.exception():  # as when no memory is left
+            return {}
+        description: dict[str, str] = self._description.result() or {}
+        return description
+
+    def describe(self, outcome: Outcome) -> dict[str, str]:
+        """Return how long a plan takes, unless its map is old or has no times.
+
+        The worker calls it.
+        """
+        request = outcome.request
+        grid = self._spread_on
+        path = outcome.plan.path
+        if self._experience is None or grid is None or request is None:
+            return {}
+        if request.grid.slowness is None or not len(path):
+            return {}
+        if not is_like(request.grid, grid):
+            return {}
+        time = self._experience.expected_time(grid, path)
+        return {
+            "expected time (s)": f"{time.seconds:.1f}",
+            "expected time, 90 % interval (s)": f"{time.low:.1f} to {time.high:.1f}",
+        }
+
+
+def is_like(grid: GridMap, other: GridMap) -> bool:
+    """Return whether two maps have the same place, and nearly the same obstacles."""
+    if grid.occupancy.shape != other.occupancy.shape:
+        return False
+    if grid.resolution != other.resolution or grid.origin != other.origin:
+        return False
+    changed_cells = np.count_nonzero(grid.occupancy != other.occupancy)
+    return bool(changed_cells <= CHANGED_SHARE * grid.occupancy.size)
