@@ -9,7 +9,7 @@ import gc
 import math
 import os
 import time
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Iterator
 from functools import cache
 from itertools import pairwise, product
@@ -27,8 +27,6 @@ from tables import table
 from ddqn_planner import GridMap, Planner, load_map
 from ddqn_planner.cli import file_of
 from ddqn_planner.grid import MOVES, Cell, MoveRule
-from ddqn_planner.grid.layers import UPHILL
-from ddqn_planner.grid.moves import actions_along
 from ddqn_planner.model import ModelMetadata, RobotNetwork, package_version
 from ddqn_planner.planning.plan import PosePlan
 from ddqn_planner.robot.footprint import read_footprint
@@ -143,8 +141,8 @@ def worlds(maps: Path | None, random: np.random.Generator) -> dict[str, GridMap]
 
 
 @cache
-def ways(motions: Motions) -> list[dict[Cell, NDArray[np.float64]]]:
-    """Return the cells that the origin passes on each primitive, from points: share, x, y."""
+def ways(motions: Motions) -> list[dict[Cell, float]]:
+    """Return the cells that the origin passes on each primitive, and their shares of its length."""
     found = []
     for poses in motions.poses:
         at = np.linspace(0, len(poses) - 1, 1001)
@@ -152,13 +150,12 @@ def ways(motions: Motions) -> list[dict[Cell, NDArray[np.float64]]]:
             [np.interp(at, range(len(poses)), poses[:, i]) for i in (0, 1)]
         )
         length = np.hypot(*np.diff(way, axis=0).T) + 1e-12
-        parts = np.column_stack([length / length.sum(), np.diff(way, axis=0)])
-        shares: dict[Cell, NDArray[np.float64]] = {}
-        for cell, part in zip(
-            np.floor((way[1:] + way[:-1]) / 2 + 0.5), parts, strict=True
+        cells = np.floor((way[1:] + way[:-1]) / 2 + 0.5).astype(np.int64)
+        shares: dict[Cell, float] = defaultdict(float)
+        for (x, y), share in zip(
+            cells.tolist(), (length / length.sum()).tolist(), strict=True
         ):
-            key = int(cell[0]), int(cell[1])
-            shares[key] = shares.get(key, 0) + part
+            shares[x, y] += share
         found.append(shares)
     return found
 
@@ -183,16 +180,8 @@ def least_costs(
             hit[: max(-up, 0)] = hit[:, : max(-over, 0)] = True
         y, x = np.nonzero(~hit)
         factor = np.zeros(len(x))
-        for (over, up), (share, *moved) in way.items():
-            part = share * multiplier[y + up, x + over]
-            if grid.uphill is not None and np.any(moved):
-                part = (
-                    part
-                    * UPHILL[
-                        grid.uphill[y + up, x + over], actions_along(np.array([moved]))
-                    ]
-                )
-            factor += part
+        for (over, up), share in way.items():
+            factor += share * multiplier[y + up, x + over]
         allowed = np.ones(len(x), np.bool_)
         for here, after in pairwise(way):
             if grid.forbidden is not None:

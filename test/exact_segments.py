@@ -49,20 +49,6 @@ def exact_cost(first: Cell, last: Cell, grid: GridMap, rule: MoveRule) -> float:
     assert sum(found.values()) == 1
     x, y = np.transpose([*found])
     multipliers = grid.cost_multiplier[y, x].astype(float)
-    if grid.uphill is not None:
-        # Between two actions it counts as both do, by the share of the shorter side in the longer.
-        wide, high = np.abs(vector)
-        slant = min(wide, high) / max(wide, high, 1)
-        straight = np.where([wide >= high, high >= wide], np.sign(vector), 0)
-        steps, toward = np.divmod(grid.uphill[y, x], 8)
-        rises = (
-            steps
-            * np.maximum(np.cos(np.arctan2(*way[::-1]) - toward * np.pi / 4), 0)
-            * way.any()
-            for way in (np.sign(vector), straight)
-        )
-        diagonally, straight_on = (np.exp(0.15 * rise) for rise in rises)
-        multipliers *= slant * diagonally + (1 - slant) * straight_on
     mean = sum(
         share * Fraction(m)
         for share, m in zip(found.values(), multipliers, strict=True)

@@ -55,16 +55,6 @@ def grids_with_directions(draw: st.DrawFn) -> Place:
     return GridMap(grid.occupancy, cost=grid.cost, forbidden=forbidden), cell
 
 
-@st.composite
-def grids_uphill(draw: st.DrawFn) -> Place:
-    grid, cell = draw(grids_with_directions() | grids_with_costs())
-    codes = st.sampled_from([0, 0, *range(8, 256, 19)])
-    uphill = draw(numpy_st.arrays(np.uint8, grid.occupancy.shape, elements=codes))
-    return GridMap(
-        grid.occupancy, cost=grid.cost, forbidden=grid.forbidden, uphill=uphill
-    ), cell
-
-
 def json_values(scalars: st.SearchStrategy[object]) -> st.SearchStrategy[object]:
     return st.recursive(
         scalars, lambda it: st.lists(it) | st.dictionaries(st.text(), it), max_leaves=8
@@ -94,4 +84,4 @@ def patched(draw: st.DrawFn, grid: GridMap) -> GridMap:
 
 
 GRIDS = grids_with_free_cell() | grids_with_costs() | grids_in_parts()
-GRIDS |= grids_with_directions() | grids_uphill()
+GRIDS |= grids_with_directions()

@@ -35,7 +35,7 @@ AT_START = {**ON_MAP, "start_clearing_radius": 0.0}
 OF_MAP = {"resolution": 1.0, "origin": (0.0, 0.0, 0.0), "forbidden": None}
 FLAGS = {"occupied_threshold": 65, "allow_unknown": False, "use_map_costs": False}
 LAYERS = {"cost": None, "obstacles": None}
-TIMES = {"slowness": np.ones(SHAPE), "seconds_per_cell": 1.0, "uphill": np.zeros(SHAPE)}
+TIMES = {"slowness": np.ones(SHAPE), "seconds_per_cell": 1.0}
 CALLS: dict[Callable[..., Any], dict[str, Any]] = {
     GridMap: {"occupancy": np.zeros(SHAPE), **OF_MAP, **LAYERS, **TIMES},
     GridMap.from_occupancy_values: {"values": np.zeros(SHAPE, int), **OF_MAP, **FLAGS},

@@ -12,16 +12,12 @@ from numpy.typing import NDArray
 from ddqn_planner.experience.posterior import (
     FEW_PLACES,
     NOISE,
-    ROW,
     Posterior,
-    squares_of,
 )
 from ddqn_planner.experience.prior import Prior
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
 from ddqn_planner.grid.grid_map import check_grid
-from ddqn_planner.grid.layers import CLIMBED_SHARE
-from ddqn_planner.grid.moves import MOVES
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -52,10 +48,6 @@ CHANGED = (
     0.01  # share of all evidence that is left then: where one place changed, others did
 )
 
-# Of a climb: the weight of what the squares around show, and how many visits are assumed to show
-# that it does not matter. It does if twice the logarithm of how much likelier that is, is more.
-BESIDE, LEVEL_VISITS, SURE = 0.5, 2.0, 12.0
-
 MOST_PASSAGES = 20.0  # a wait is the mean of about the last so many
 
 SHORTEST = (
@@ -80,55 +72,7 @@ class Visits(NamedTuple):
     position: Float64  # (V, 2)
     seconds: Float64  # (V,): without waits
     metres: Float64  # (V,)
-    toward: Int64  # (V,): the action of its direction, in a frame that is not turned
     waits: Float64  # (W, 3): x, y, seconds
-
-
-class Climbs(NamedTuple):
-    """Squares where driving takes longer in one direction."""
-
-    square: Int64  # (S,), in order
-    toward: Int64  # (S,): the action of that direction, in a frame that is not turned
-    rise: Float64  # (S,): log of how much longer
-
-    def at(self, square: Int64) -> tuple[Int64, Float64]:
-        """Return direction and rise of each of some squares, a rise of 0 where it is flat."""
-        if not len(self.square):
-            return np.zeros(len(square), np.int64), np.zeros(len(square))
-        place = np.searchsorted(self.square, square).clip(max=len(self.square) - 1)
-        return self.toward[place], self.rise[place] * (self.square[place] == square)
-
-
-def climbs_of(square: Int64, visits: NDArray[np.float32]) -> Climbs:
-    """Return where directions matter, from sums of places in squares.
-
-    Visits (N, 2, 8) have the weight, and that times the log slowness, of those in each direction.
-    """
-    # Regression of the log slowness on the share of the rise, within each place, for each direction
-    # in which it may be steepest. A place that was driven in one direction tells nothing.
-    telling = np.flatnonzero(np.count_nonzero(visits[:, 0], axis=1) > 1)
-    telling = telling[np.argsort(square[telling])]
-    driven, begins = np.unique(square[telling], return_index=True)
-    told = visits[telling].astype(np.float64)
-    (weight, log), (share, product) = (
-        told.sum(axis=2).T[..., None],
-        (told @ CLIMBED_SHARE).swapaxes(0, 1),
-    )
-    squared = told[:, 0] @ CLIMBED_SHARE**2 - share**2 / weight
-    product_with_log = product - share * log / weight
-    of_driven = np.add.reduceat(np.hstack([squared, product_with_log]), begins)
-    steps = np.append(0, MOVES @ ROW)  # to a square itself, and to those around it
-    known, places = np.unique(driven + steps[:, None], return_inverse=True)
-    sums = np.zeros((len(known), 16))
-    for place, part in zip(
-        places.reshape(len(steps), -1), [1, *[BESIDE] * 8], strict=True
-    ):
-        sums[place] += part * of_driven
-    squared, product_with_log = sums[:, :8] + LEVEL_VISITS, np.maximum(sums[:, 8:], 0)
-    gain = product_with_log**2 / squared / NOISE
-    toward, rise = gain.argmax(axis=1), product_with_log / squared
-    sure = np.flatnonzero(gain.max(axis=1, initial=0) > SURE)
-    return Climbs(known[sure], toward[sure], rise[sure, toward[sure]])
 
 
 class Evidence:
@@ -150,8 +94,6 @@ class Evidence:
         self.driven = 0.0
         self.table = np.zeros((0, len(COLUMNS)))
         self.rows: dict[complex, int] = {}  # of the table, by square of the world
-        # The first two columns of the visits in each direction of `MOVES`.
-        self.directed = np.zeros((0, 2, len(MOVES)), np.float32)
         # Of the last drives' log times, and the greatest of each, both in standard deviations.
         self.errors, self.surprises = (
             deque[float](maxlen=KEPT),
@@ -171,7 +113,7 @@ class Evidence:
             self._rows_at(visits.position),
             self._rows_at(visits.waits[:, :2]),
         )
-        if self._has_changed(rows, log, visits.toward):
+        if self._has_changed(rows, log):
             self._fade(CHANGED)
         np.add.at(self.table[:, 3], waited, visits.waits[:, 2])
         # Only passages from the first wait on tell how long a wait is.
@@ -182,8 +124,6 @@ class Evidence:
         )
         seen = weight[:, None] * np.column_stack([np.ones(len(log)), log, is_near])
         np.add.at(self.table[:, :3], rows, seen)
-        of_visits: Any = rows, slice(None), visits.toward
-        np.add.at(self.directed, of_visits, seen[:, :2])
         self.table[waited, 2] = np.maximum(self.table[waited, 2], 1)
         self.table[:, 2:4] /= np.maximum(self.table[:, 2:3] / MOST_PASSAGES, 1)
         seconds = float(visits.seconds.sum() + visits.waits[:, 2].sum())
@@ -194,15 +134,13 @@ class Evidence:
     def _fade(self, share: float) -> None:
         """Let all evidence count less."""
         self.table[:, :4] *= share
-        self.directed *= share
 
-    def _has_changed(self, rows: Any, log: Float64, toward: Any) -> bool:
+    def _has_changed(self, rows: Int64, log: Float64) -> bool:
         """Return whether a part of a drive was other than all before."""
         weight = self.table[rows, 0]
         known = np.flatnonzero(weight >= KNOWN)
-        steepest, rise = self.climbs.at(squares_of(self.table[rows, 5:]))
-        surprises = log - rise * CLIMBED_SHARE[toward, steepest]
-        surprises[known] -= self.flat[rows[known]] / weight[known]
+        surprises = log.copy()
+        surprises[known] -= self.table[rows[known], 1] / weight[known]
         found = []
         for part in np.array_split(known, max(1, len(known) // PART)):
             if len(part) >= PART / 2:
@@ -211,7 +149,7 @@ class Evidence:
                     NOISE * (1 + 1 / weight[part]).mean() / len(part) + PART_NOISE**2
                 )
                 found.append(abs(float(surprise)) / math.sqrt(variance))
-        # Up a ramp each drive takes longer than down, and nothing has changed.
+        # What is often slower in one direction has not changed.
         low, _, high = self.quantiles()
         usual = UNUSUAL * float(
             np.quantile([*self.surprises, *[1.0] * ASSUMED], OF_DRIVES)
@@ -237,26 +175,14 @@ class Evidence:
                 self.posterior.places_at(new)
             ]
         self.table = np.concatenate([self.table, fresh])
-        self.directed = np.pad(self.directed, [(0, len(new)), (0, 0), (0, 0)])
         return rows
 
     def _fit(self) -> None:
         """Learn what all places have in common, how they differ, and what the prior is worth."""
-        square = squares_of(self.table[:, 5:])
-        self.climbs = climbs_of(square, self.directed)
-        # The sums of the log slowness, as if nobody had driven uphill.
-        steepest, rise = self.climbs.at(square)
-        climbed = (self.directed[:, 0] * CLIMBED_SHARE[steepest]).sum(axis=1)
-        self.flat = self.table[:, 1] - rise * climbed
-        self.sums = (
-            self.table[:, 0],
-            self.flat,
-            *self.table[:, 2:4].T,
-        )  # see `Posterior.update`
         used = self.table[:, 0] >= 0.2
         weight, sum_of_log, foretold = (
             self.table[used, 0],
-            self.flat[used],
+            self.table[used, 1],
             self.table[used, 4],
         )
         log = sum_of_log / weight
@@ -297,8 +223,7 @@ class Evidence:
         if free.sum() >= SHORTEST:
             nominal = visits.metres[free] / self.nominal_speed
             level = nominal * self.posterior.slowness[places[free]]
-            toward = (visits.toward[free] - self.posterior.turned) % len(MOVES)
-            expected, deviation = self.posterior.time(level, places[free], toward)
+            expected, deviation = self.posterior.time(level, places[free])
             seconds = visits.seconds[free].sum() + visits.waits[:, 2].sum()
             self.errors.append(math.log(seconds / expected) / deviation)
 
@@ -340,7 +265,6 @@ class Evidence:
         rows = self._rows_at(other.table[:, 5:])
         self.table[rows, :4] += other.table[:, :4]
         self.table[rows[rows >= known], 4] = other.table[rows >= known, 4]
-        self.directed[rows] += other.directed
         self.errors += other.errors
         self.surprises += other.surprises
         self.driven += other.driven
@@ -358,34 +282,17 @@ class Evidence:
     def restore(self, *arrays: NDArray[Any]) -> None:
         """Take the table and all else of a file; a ValueError if that cannot be true."""
         given = [array.astype(np.float64) for array in arrays]
-        places, of_directions = len(given[0]), (len(given[0]), 2, len(MOVES))
-        if not given[1].size:  # older files have none
-            given[1] = np.zeros(of_directions)
-        table, directed, driven, errors, surprises = given
-        shapes = (
-            (places, len(COLUMNS)),
-            of_directions,
-            (),
-            (errors.size,),
-            (surprises.size,),
-        )
+        table, driven, errors, surprises = given
+        places = len(table)
+        shapes = (places, len(COLUMNS)), (), (errors.size,), (surprises.size,)
         if (
             shapes != tuple(array.shape for array in given)
             or not all(np.isfinite(array).all() for array in given)
-            or min(
-                table[:, [0, 2, 3]].min(initial=0),
-                directed[:, 0].min(initial=0),
-                driven,
-            )
-            < 0
+            or min(table[:, [0, 2, 3]].min(initial=0), driven) < 0
             or np.abs(table[:, 5:]).max(initial=0) > FARTHEST
             or len(np.unique(self._rows_at(table[:, 5:]))) < places
         ):
             raise ValueError("its evidence cannot be true")
-        self.table, self.directed, self.driven = (
-            table,
-            directed.astype("f4"),
-            float(driven),
-        )
+        self.table, self.driven = table, float(driven)
         self.errors, self.surprises = deque(errors, KEPT), deque(surprises, KEPT)
         self._fit()

@@ -28,8 +28,7 @@ from ddqn_planner.grid.arguments import (
     numbers,
 )
 from ddqn_planner.grid.grid_map import Exploration
-from ddqn_planner.grid.layers import UPHILL
-from ddqn_planner.grid.moves import MOVES, actions_along, cells_along
+from ddqn_planner.grid.moves import cells_along
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -40,7 +39,6 @@ PRIOR = "prior_"  # before the names of its arrays in a file
 EXPERIENCE = "experience.npz"  # the name of the file in a folder
 ARRAYS = (
     "evidence",
-    "directed",
     "driven",
     "errors",
     "surprises",
@@ -109,8 +107,8 @@ class Learned(NamedTuple):
 class Experience:
     """How long driving takes at places of the world, learned from poses of a robot.
 
-    A place has a slowness, that is seconds over those at nominal speed, perhaps more of it in one
-    direction, and perhaps a wait, in seconds a passage. The log slowness is a Gaussian Markov
+    A place has a slowness, that is seconds over those at nominal speed, and
+    perhaps a wait, in seconds a passage. The log slowness is a Gaussian Markov
     random field over the free places of a map: near places are alike, but not through walls. What
     nobody drove is expected to be as slow as what was driven, or as `prior` foretells from the map.
     All is kept by places of the world: maps may grow, shift or come in another resolution.
@@ -235,7 +233,7 @@ class Experience:
         """Return the visits of a drive."""
         speed, side = self.learned_speed, self.evidence.side
         max_speed, step = max(self.max_speed, 3 * usual_speed), max(side, WINDOW) / 2
-        steps, waits = [np.zeros((0, 5))], [np.zeros((0, 3))]
+        steps, waits = [np.zeros((0, 3))], [np.zeros((0, 3))]
         for part in _believed_parts(time, position, max_speed, self.max_pause):
             seconds, at = averaged(time[part], position[part], window)
             # Standing at the ends of a drive is no waiting on the way.
@@ -256,9 +254,7 @@ class Experience:
         )
         count, sums = np.diff(entered, append=len(rows)), np.add.reduceat(rows, entered)
         middle, waited = sums[:, :2] / count[:, None], np.concatenate(waits)
-        return Visits(
-            middle, sums[:, 2], step * count, actions_along(sums[:, 3:]), waited
-        )
+        return Visits(middle, sums[:, 2], step * count, waited)
 
     def record_failure(self, position: Sequence[float]) -> None:
         """Learn that the robot failed at a place: it costs as much as a wait of `max_pause`."""
@@ -267,7 +263,7 @@ class Experience:
             "the position", position, (2,), between=near, whole=False, remedy=remedy
         )
         none, waits = np.zeros((0, 2)), np.array([[*point, self.max_pause]])
-        visits = Visits(none, none[:, 0], none[:, 0], actions_along(none), waits)
+        visits = Visits(none, none[:, 0], none[:, 0], waits)
         self._learn(partial(Evidence.add, visits=visits))
 
     def _learn(self, step: Callable[[Evidence], None]) -> None:
@@ -336,19 +332,12 @@ class Experience:
         """
         share = as_number("exploration", exploration, 0, 10, "0 to 10")
         evidence, posterior = self.evidence, self.evidence.over(grid)
-        uphill = (
-            posterior.layer("uphill", posterior.uphill, 0)
-            if posterior.uphill.any()
-            else None
-        )
         fastest = FAST_STEP * min(0, math.floor(evidence.fastest / FAST_STEP + 0.5))
 
         def hoping(name: str, hope: Float64 | float, most: float) -> GridMap:
             slowness = posterior.paint(name, hope, fastest - most)
             seconds = grid.resolution / self.nominal_speed * math.exp(fastest - most)
-            return grid.with_layers(
-                slowness=slowness, seconds_per_cell=seconds, uphill=uphill
-            )
+            return grid.with_layers(slowness=slowness, seconds_per_cell=seconds)
 
         expected = hoping("expected", 0.0, 0.0)
         if not share:
@@ -364,12 +353,9 @@ class Experience:
         return expected.with_layers(exploration=Exploration(share, bold, safe))
 
     def slowness(self, grid: GridMap) -> Float32:
-        """Return (H, W) float32: seconds, with waits, over nominal ones; the mean of directions."""
+        """Return (H, W) float32: seconds, with waits, over those at nominal speed."""
         posterior = self.evidence.over(grid)
-        of_directions = UPHILL[posterior.uphill, : len(MOVES)].mean(axis=1)
-        return posterior.over(
-            (posterior.slowness * of_directions).astype(np.float32), 1
-        )
+        return posterior.over(posterior.slowness.astype(np.float32), 1)
 
     def uncertainty(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: the standard deviation of the log slowness, most if unknown."""
@@ -397,9 +383,8 @@ class Experience:
         metres = np.diff(position) * of_segments[position[:-1].astype(np.int64)]
         places = posterior.place[path[:, 1], path[:, 0]]
         slowness = posterior.slowness[places]
-        level = metres / self.nominal_speed * (slowness[1:] + slowness[:-1]) / 2
-        toward = actions_along(np.diff(path, axis=0))
-        seconds, deviation = posterior.time(level, places[1:], toward)
+        expected = metres / self.nominal_speed * (slowness[1:] + slowness[:-1]) / 2
+        seconds, deviation = posterior.time(expected, places[1:])
         low, middle, high = (
             seconds * np.exp(self.evidence.quantiles() * deviation)
         ).tolist()
@@ -440,7 +425,7 @@ class Experience:
         prior = self.prior._asdict() if self.prior is not None else {}
         arrays: dict[str, Any] = {PRIOR + name: array for name, array in prior.items()}
         options, kept = list(self.options.values()), self.evidence
-        tables = kept.table, kept.directed, kept.driven, kept.errors, kept.surprises
+        tables = kept.table, kept.driven, kept.errors, kept.surprises
         arrays |= dict(zip(ARRAYS, tables, strict=True))
         np.savez(content, version=VERSION, options=options, **arrays)
         return content.getvalue()
@@ -578,7 +563,7 @@ def ways(position: Float64, metres: float) -> list[int]:
 
 
 def _steps(seconds: Float64, position: Float64, step: float) -> Float64:
-    """Return the middle of each step of a way, its seconds, and itself: (N, 5)."""
+    """Return the middle of each step of a path, and its seconds: (N, 3)."""
     metres = np.hypot(*np.diff(position, axis=0).T)
     along, clock = (np.cumsum(np.append(0, values)) for values in (metres, seconds))
     ends = np.arange(0, along[-1], step)
@@ -586,4 +571,4 @@ def _steps(seconds: Float64, position: Float64, step: float) -> Float64:
         [np.interp(ends, along, axis) for axis in (*position.T, clock)]
     )
     middle = (points[1:] + points[:-1]) / 2
-    return np.column_stack([middle[:, :2], np.diff(points, axis=0)[:, [2, 0, 1]]])
+    return np.column_stack([middle[:, :2], np.diff(points[:, 2])])

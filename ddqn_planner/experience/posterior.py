@@ -12,8 +12,6 @@ from ddqn_planner.compiled import in_place
 from ddqn_planner.experience.prior import Prior, map_features
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
-from ddqn_planner.grid.layers import STEEPNESS, UPHILL
-from ddqn_planner.grid.moves import MOVES
 
 if TYPE_CHECKING:
     from ddqn_planner.experience.evidence import Evidence
@@ -26,7 +24,6 @@ CORRELATION = 1.0  # metres: how far the slowness of a place tells of that of ot
 STEP = 0.02  # slowness is told in steps of this share: fields need no repair for less
 STEPS = (1 + STEP) ** np.arange(1 + round(math.log(MAX_SLOWNESS) / math.log(1 + STEP)))
 STEPS = np.minimum(STEPS, MAX_SLOWNESS).astype(np.float32)
-STEEPEST = 15  # steps of `GridMap.uphill`: of more, fields would need more memory
 ACCURACY = (
     0.01  # of the log slowness: no place is farther from the solution of its equations
 )
@@ -37,17 +34,6 @@ WAIT_PLACES = (
 FEW_PLACES = 16.0  # it is assumed that so many were driven where nothing was slow
 # Standard deviations of the log time of a drive: on ways that are known, and that are not.
 DRIVE_NOISE, UNSURE = 0.05, 0.42
-
-SQUARE = 1.0  # metres: the side of squares of the world in which a climb is alike
-ROW = np.array(
-    [1, 1 << 32]
-)  # from the number of a square to that of the next column, and row
-
-
-def squares_of(position: Float64) -> Int64:
-    """Return the number of the square of each position, (N, 2) in metres."""
-    squares: Int64 = np.floor(position / SQUARE).astype(np.int64) @ ROW
-    return squares
 
 
 class Posterior:
@@ -76,18 +62,12 @@ class Posterior:
         self.solution = np.zeros(count, dtype=np.complex128)
         self.prior: Prior | None = None
         self.foretold = np.zeros(count)  # by the prior
-        squares = squares_of(np.column_stack(grid.centres(*self.middle.T)))
-        self.square, self.in_square = np.unique(squares, return_inverse=True)
-        self.turned = round(grid.origin[2] / (math.pi / 4))  # by so many actions
         self.painted: dict[
             str, tuple[NDArray[Any], NDArray[Any]]
         ] = {}  # steps, and the map
 
-    def time(
-        self, seconds: Float64, places: Int64, toward: Int64
-    ) -> tuple[float, float]:
-        """Return the seconds of a way, and the deviation of their log, by those in level places."""
-        seconds = seconds * UPHILL[self.uphill[places], toward]
+    def time(self, seconds: Float64, places: Int64) -> tuple[float, float]:
+        """Return the seconds of a path, given those in its places, and their log's deviation."""
         total = float(seconds.sum())
         unknown = float(seconds @ self.unknown[places] / total)
         return total, math.hypot(DRIVE_NOISE, UNSURE * unknown)
@@ -109,7 +89,7 @@ class Posterior:
         places = self.places_at(evidence.table[:, 5:])
         on, count = places >= 0, len(self.middle)
         sums: list[Any] = [
-            np.bincount(places[on], rows[on], count) for rows in evidence.sums
+            np.bincount(places[on], rows[on], count) for rows in evidence.table[:, :4].T
         ]
         weight, log, passed, waited = sums
         # A lattice whose links have strength 1 has about the variance ln(32 / kappa) / 4 pi;
@@ -134,12 +114,6 @@ class Posterior:
             self.expected + self.solution.real + evidence.surplus * (1 - self.known)
         )
         self.slowness = np.exp(self.mean)
-        toward, rise = evidence.climbs.at(self.square)
-        steps = np.minimum(np.rint(rise / STEEPNESS), STEEPEST).astype(np.int64)
-        codes = np.where(
-            steps > 0, len(MOVES) * steps + (toward - self.turned) % len(MOVES), 0
-        )
-        self.uphill = codes.astype(np.uint8)[self.in_square]
         if waited.any():
             self.slowness += evidence.nominal_speed * self._waits(
                 passed, waited, evidence.side

@@ -28,7 +28,6 @@ from ddqn_planner.grid.layers import (
     NO_COST,
     NO_FORBIDDEN,
     NO_SLOWNESS,
-    NO_UPHILL,
     Layers,
     legal_moves,
     multipliers_of,
@@ -40,7 +39,6 @@ LAYERS = (
     "cost",
     "forbidden",
     "slowness",
-    "uphill",
 )  # what its moves depend on
 PATCHED = {
     "occupancy",
@@ -87,9 +85,6 @@ class GridMap:
         The expected time in each cell over that at nominal speed, 1 to 100; it multiplies the cost.
     seconds_per_cell : float, optional
         The time for the length of a cell at nominal speed: with it, `Plan.cost` is in seconds.
-    uphill : (H, W) array of whole numbers 0..255, optional
-        Where driving in one direction takes longer: from a cell with 8 s + a, action a has the cost
-        of others times exp(0.15 s), and those beside it times exp(0.15 s cos(angle between them)).
     unknown : (H, W) bool, optional
         Which occupied cells are occupied only because nothing is known of them, by default none.
         Where they are the reason that a plan has no path, its reason says so.
@@ -105,7 +100,6 @@ class GridMap:
     forbidden: NDArray[np.uint8] | None = None
     slowness: NDArray[np.float32] | None = None
     seconds_per_cell: float | None = None
-    uphill: NDArray[np.uint8] | None = None
     unknown: Occupancy | None = None
     body_radius: float = 0.0
 
@@ -137,11 +131,6 @@ class GridMap:
                 "slowness", self.slowness, shape, "iuf", slowest, whole=False
             )
             self._set(slowness=times.astype(np.float32, order="C"))
-        if self.uphill is not None:
-            codes = arguments.numbers("uphill", self.uphill, shape, between=(0, 255))
-            self._set(uphill=codes.astype(np.uint8, order="C"))
-            if self.slowness is None:  # so there is one wherever moves take longer
-                self._set(slowness=np.ones(shape, np.float32))
         if (seconds := self.seconds_per_cell) is not None:
             seconds = as_number("seconds_per_cell", seconds, *POSITIVE, "more than 0")
             self._set(seconds_per_cell=seconds)
@@ -293,7 +282,7 @@ class GridMap:
         # None if it is no such map, or has other layers, or there were more than `MAX_PATCHES`.
         if self._history.lineage is not older._history.lineage:
             return None
-        names = "forbidden", "slowness", "uphill"
+        names = "forbidden", "slowness"
         if not all(getattr(self, name) is getattr(older, name) for name in names):
             return None
         versions = [version for version, _ in self._history.versions]
@@ -313,8 +302,7 @@ class GridMap:
                 hopes.share, *(self.with_times_of(each) for each in hopes[1:])
             )
         times = {
-            name: getattr(other, name)
-            for name in ("slowness", "uphill", "seconds_per_cell")
+            name: getattr(other, name) for name in ("slowness", "seconds_per_cell")
         }
         return self.with_layers(**times, exploration=hopes)
 
@@ -383,7 +371,6 @@ class GridMap:
             forbidden=NO_FORBIDDEN if self.forbidden is None else self.forbidden,
             cost=NO_COST if self.cost is None else self.cost,
             slowness=NO_SLOWNESS if self.slowness is None else self.slowness,
-            uphill=NO_UPHILL if self.uphill is None else self.uphill,
             cuts_corners=rule.cuts_corners,
         )
 

@@ -7,16 +7,14 @@ cost, 1 to `MAX_COST_MULTIPLIER`, times its slowness.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.compiled import inlined, inner
+from ddqn_planner.compiled import inlined
 from ddqn_planner.grid.arguments import OCCUPIED, Occupancy
 from ddqn_planner.grid.moves import (
-    ACTION_OF_STEP,
     BIT_OF_STEP,
     LENGTHS,
     MOVES,
@@ -31,29 +29,6 @@ MAX_COST_MULTIPLIER = 5.0
 # (101,): the multiplier of each cost, 0 to 100; index -1 (unknown) is the last one.
 MULTIPLIERS = np.linspace(1, MAX_COST_MULTIPLIER, OCCUPIED + 1, dtype=np.float32)
 
-STEEPNESS = 0.15  # log cost of a move by each step of `GridMap.uphill`
-
-# (8, 8): the share of a rise that each action climbs, by the action along which it is
-# steepest.
-CLIMBED_SHARE = np.maximum(
-    np.cos(np.subtract.outer(np.arange(8), np.arange(8)) * np.pi / 4), 0
-)
-
-
-def _uphill_factors() -> NDArray[np.float32]:
-    """Return the factor of each action's cost by `GridMap.uphill`: (256, 9) float32.
-
-    The last column is 1, for no move.
-    """
-    codes = np.arange(256)
-    rise = STEEPNESS * (codes >> 3)  # (256,)
-    climbed = CLIMBED_SHARE[codes & 7]  # (256, 8)
-    factors = np.exp(rise[:, None] * climbed).astype(np.float32)
-    return np.hstack([factors, np.ones((256, 1), np.float32)])
-
-
-UPHILL = _uphill_factors()
-
 
 class Layers(NamedTuple):
     """The layers of a map on which its moves depend, as compiled code reads them.
@@ -65,7 +40,6 @@ class Layers(NamedTuple):
     forbidden: NDArray[np.uint8]  # (H, W): bit a is set where action a may not leave
     cost: NDArray[np.int8]  # (H, W): 0 to 99, or -1 where unknown
     slowness: NDArray[np.float32]  # (H, W): 1 or more
-    uphill: NDArray[np.uint8]  # (H, W): the row of `UPHILL`
     cuts_corners: bool  # see `MoveRule`
 
 
@@ -77,7 +51,6 @@ def empty_layer(dtype: type[np.generic]) -> NDArray[Any]:
 NO_FORBIDDEN: NDArray[np.uint8] = empty_layer(np.uint8)
 NO_COST: NDArray[np.int8] = empty_layer(np.int8)
 NO_SLOWNESS: NDArray[np.float32] = empty_layer(np.float32)
-NO_UPHILL: NDArray[np.uint8] = empty_layer(np.uint8)
 
 
 # Whole maps
@@ -108,28 +81,18 @@ def legal_moves(
     return legal
 
 
-def move_costs(
-    multiplier: NDArray[np.float32],
-    uphill: NDArray[np.uint8] | None = None,
-) -> NDArray[np.float64]:
+def move_costs(multiplier: NDArray[np.float32]) -> NDArray[np.float64]:
     """Return the cost of each move: (8, H, W) float64.
 
     Parameters
     ----------
     multiplier : (H, W) float32
         See `GridMap.cost_multiplier`.
-    uphill : (H, W) uint8, optional
-        See `GridMap.uphill`.
     """
-    multiplier_of_action = multiplier[None].astype(np.float64)  # (1 or 8, H, W)
-    if uphill is not None:
-        factors = UPHILL.T[: len(MOVES), uphill]  # (8, H, W)
-        multiplier_of_action = multiplier_of_action * factors
-    padded = np.pad(multiplier_of_action, ((0, 0), (1, 1), (1, 1)), mode="edge")
-    multiplier_of_target = []
-    for action, (dx, dy) in enumerate(MOVES.tolist()):
-        multiplier_of_target.append(shifted(padded[action % len(padded)], dx, dy))
-    sums = multiplier_of_action + np.stack(multiplier_of_target)
+    before = multiplier.astype(np.float64)  # (H, W)
+    padded = np.pad(before, 1, mode="edge")
+    after = np.stack([shifted(padded, dx, dy) for dx, dy in MOVES.tolist()])
+    sums = before + after  # (8, H, W)
     costs: NDArray[np.float64] = LENGTHS[:, None, None] * sums / 2
     return costs
 
@@ -178,30 +141,6 @@ def multiplier_at(x: int, y: int, one: Any, layers: Layers) -> Any:
     return multiplier
 
 
-# It is not inlined: what few maps need must not slow the others down.
-@partial(inner, _nrt=False)
-def uphill_at(x: int, y: int, dx: int, dy: int, layers: Layers) -> Any:
-    """Return the factor of the cost of a segment (dx, dy) within a cell.
-
-    It is interpolated between those of the two actions between which the segment lies.
-    """
-    if layers.uphill.size == 0:
-        return 1.0
-    code = layers.uphill[np.uint64(y), np.uint64(x)]
-    width = abs(dx)
-    height = abs(dy)
-    step_x = (dx > 0) - (dx < 0)
-    step_y = (dy > 0) - (dy < 0)
-    diagonal = ACTION_OF_STEP[step_y + 1, step_x + 1]
-    straight = ACTION_OF_STEP[
-        step_y * (height >= width) + 1, step_x * (width >= height) + 1
-    ]
-    shorter = min(width, height)
-    longer = max(width, height)
-    share = shorter / longer if longer > 0 else 0.0
-    return share * UPHILL[code, diagonal] + (1 - share) * UPHILL[code, straight]
-
-
 @inlined
 def cost_of_move(x: int, y: int, action: int, layers: Layers) -> Any:
     """Return what a move costs, legal or not."""
@@ -209,9 +148,7 @@ def cost_of_move(x: int, y: int, action: int, layers: Layers) -> Any:
     dy = MOVES[action, 1]
     one = np.float64(1)
     before = multiplier_at(x, y, one, layers)
-    before = before * uphill_at(x, y, dx, dy, layers)
     after = multiplier_at(x + dx, y + dy, one, layers)
-    after = after * uphill_at(x + dx, y + dy, dx, dy, layers)
     return LENGTHS[action] * (before + after) / 2
 
 

@@ -71,15 +71,6 @@ def neighbours(shape: tuple[int, int]) -> NDArray[np.int64]:
     return np.stack([shifted(padded, dx, dy).ravel() for dx, dy in MOVES.tolist()])
 
 
-def actions_along(
-    vectors: NDArray[np.float64] | NDArray[np.int64],
-) -> NDArray[np.int64]:
-    """Return the action nearest to the direction of each vector: (N, 2) to (N,)."""
-    angles: NDArray[np.float64] = np.arctan2(vectors[:, 1], vectors[:, 0])
-    eighths_of_turn = np.rint(angles / (np.pi / 4)).astype(np.int64)
-    return eighths_of_turn % len(MOVES)
-
-
 def path_length(cells: Cells) -> float:
     """Return the length in cells of a path of straight segments between cells."""
     path = np.asarray(cells, dtype=np.int64).reshape(-1, 2)

@@ -56,7 +56,7 @@ def _shortest_paths(
     step_A = (MOVES[:, 1] * grid.width + MOVES[:, 0]).astype(np.int32)
     order_A = np.argsort(step_A)
     legal_CA = grid.legal_moves(move_rule)[order_A].reshape(len(MOVES), -1).T
-    costs = move_costs(grid.cost_multiplier, grid.uphill)
+    costs = move_costs(grid.cost_multiplier)
     cost_CA = costs[order_A].reshape(len(MOVES), -1).T
 
     cells = len(legal_CA)
@@ -67,8 +67,7 @@ def _shortest_paths(
     edges = cost_CA[legal_CA], target_CA[legal_CA], row_starts
     graph = csr_array(edges, shape=(cells, cells))
 
-    is_symmetric = grid.forbidden is None and grid.uphill is None
-    if not is_symmetric:
+    if grid.forbidden is not None:
         graph = graph.T  # paths lead to the goal, and scipy's lead from it
     distance, next_cell = dijkstra(
         graph, indices=y * grid.width + x, return_predecessors=True

@@ -21,7 +21,6 @@ from ddqn_planner.grid import (
 from ddqn_planner.grid.boxes import ORIGIN, Box, wider, within
 from ddqn_planner.grid.copies import replaced
 from ddqn_planner.grid.grid_map import LAYERS
-from ddqn_planner.grid.layers import UPHILL
 
 # Shapes: C = cells of the padded map, P = patches, S = sets of actions, A = 8 actions, L = the 102
 # values of a cell: 0 for unknown, 1 to 100 for the costs 0 to 99, 101 for occupied.
@@ -55,16 +54,12 @@ class MoveCosts(NamedTuple):
     """The cost of each move of each cell, on a map with a border of one cell."""
 
     # It is table[8 patch[cell] + action]. With terms, that is a length, times the sum of the terms
-    # of its two cells, half of 1 or more each; with multipliers, times the mean of its cells',
-    # each times its factor in `UPHILL`.
+    # of its two cells, half of 1 or more each; with multipliers, times the mean of its cells'.
     patch: NDArray[Any]  # (C,) uint16 or int32: the number of each cell's patch
     table: Array  # (8 P,) float32: at least 1; infinite where a move is not possible
     value: NDArray[np.uint8]  # (C,), for the terms, or empty
     terms: Array  # (2 * 8 * L,) float32: of the cell before a move and of that after it, or empty
     multiplier: Array  # (C,) float32: 1 or more, or empty
-    uphill: NDArray[
-        np.uint8
-    ]  # (C,), for factors of the multipliers by the action, or empty
     width: int  # columns of the padded map
     highest: float  # no possible move costs more
     straight: float  # no straight move costs less
@@ -81,7 +76,7 @@ class MoveCosts(NamedTuple):
         diagonal = float(table_PA[:, 1::2].min(initial=2 * straight))
         table = np.append(table_PA, np.full(table_PA.shape[1], np.inf, np.float32))
         none, nothing = np.empty(0, np.float32), np.empty(0, np.uint8)
-        empty = np.empty(0, np.uint16), table, nothing, none, none, nothing
+        empty = np.empty(0, np.uint16), table, nothing, none, none
         return cls(*empty, 0, highest, straight, diagonal, none)
 
     def after(self, grid: GridMap, boxes: Sequence[Box]) -> MoveCosts | None:
@@ -108,7 +103,7 @@ class MoveCosts(NamedTuple):
                 min(after.least, of_part.least),
             )
             after = after._replace(highest=highest, least=least)
-            for name in ("patch", "value", "multiplier", "uphill"):
+            for name in ("patch", "value", "multiplier"):
                 layer, new = getattr(after, name), getattr(of_part, name)
                 if new.size:
                     layer, new = (
@@ -151,10 +146,6 @@ class MoveCosts(NamedTuple):
                 float(grid.cost_multiplier.min()),
             )
             costs = costs._replace(multiplier=multiplier, highest=highest, least=least)
-        if grid.uphill is not None:
-            uphill = _with_border(grid.uphill, 0).ravel()
-            steepest = float(UPHILL[uphill.max()].max())
-            costs = costs._replace(uphill=uphill, highest=steepest * costs.highest)
         return costs
 
     def read(self, first: int, end: int) -> tuple[int, int] | None:

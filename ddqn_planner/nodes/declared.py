@@ -30,6 +30,7 @@ class Declared(NamedTuple):
     description: str
     allowed: tuple[float, float] | list[str] | str = ""
     read_only: bool = False
+    replaced: Mapping[str, str] = {}  # choices of older versions, with today's
 
     @property
     def limits(self) -> str:
@@ -77,6 +78,9 @@ class Declared(NamedTuple):
             return self._read_number(name, value, *self.allowed)
         if isinstance(self.allowed, list):
             choice = value.strip().lower()
+            if choice in self.replaced:
+                today = self.replaced[choice]
+                raise ValueError(f"{name} {choice} is gone; give {today}")
             if choice not in self.allowed:
                 choices = ", ".join(choice or "''" for choice in self.allowed)
                 raise ValueError(f"{name} is {value!r}; give one of {choices}")

@@ -68,8 +68,9 @@ PLANNER_PARAMETERS: Final = {
     ),
     "path_simplification": Declared(
         "straight",
-        "straight: lines, a pose at least each cell; line_of_sight: only at turns; none: cells",
-        ["none", "line_of_sight", "straight"],
+        "straight: lines, a pose at least each cell; none: cells",
+        ["none", "straight"],
+        replaced={"line_of_sight": "straight"},
     ),
     "start_source": Declared(
         "initialpose", "What says where the robot is", ["initialpose", "odometry", "tf"]

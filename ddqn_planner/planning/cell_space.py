@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place, inlined, inner, specialised
 from ddqn_planner.grid import MOVES
-from ddqn_planner.grid.layers import UPHILL
 from ddqn_planner.model.move_costs import MARGIN, VALUES, MoveCosts
 from ddqn_planner.planning.queues import (
     Buckets,
@@ -82,7 +81,6 @@ class StepCosts(NamedTuple):
     value: NDArray[np.uint8]
     terms: NDArray[np.float32]
     multiplier: NDArray[np.float32]
-    uphill: NDArray[np.uint8]
     width: int
 
 
@@ -94,7 +92,6 @@ def step_costs(costs: MoveCosts) -> StepCosts:
         costs.value,
         costs.terms,
         costs.multiplier,
-        costs.uphill,
         costs.width,
     )
 
@@ -116,15 +113,6 @@ class CellSpace(NamedTuple):
     offset: NDArray[np.uint64]  # (8,): by how much an action changes a cell's number
 
 
-# Not inlined: what few maps need must not slow the others down.
-@partial(inner, _nrt=False)
-def _uphill(cell: Any, end: Any, action: Any, multiplier: Any, uphill: Any) -> Any:
-    """Return the multipliers of an action's cells where it may lead uphill, added."""
-    at_cell = np.float64(multiplier[cell]) * UPHILL[np.uint64(uphill[cell]), action]
-    at_end = np.float64(multiplier[end]) * UPHILL[np.uint64(uphill[end]), action]
-    return at_cell + at_end
-
-
 @inlined
 def cost_of(cell: int, action: int, costs: Any) -> Any:
     """Return the cost of a move, infinite if it is not possible. See `MoveCosts`."""
@@ -132,11 +120,6 @@ def cost_of(cell: int, action: int, costs: Any) -> Any:
     end = np.uint64(cell + MOVE_Y[action] * costs.width + MOVE_X[action])
     cost = costs.table[ACTIONS * np.uint64(costs.patch[begin]) + np.uint64(action)]
     if costs.multiplier.size > 0:
-        if costs.uphill.size > 0:
-            sum_of_both = _uphill(
-                begin, end, np.uint64(action), costs.multiplier, costs.uphill
-            )
-            return np.float64(cost) * sum_of_both / 2
         # One of them as float64, so that the sum is no float32.
         return cost * (np.float64(costs.multiplier[begin]) + costs.multiplier[end]) / 2
     if costs.terms.size > 0:

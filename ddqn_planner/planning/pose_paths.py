@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place
 from ddqn_planner.grid import GridMap
-from ddqn_planner.grid.layers import UPHILL, multipliers_of
-from ddqn_planner.grid.moves import ACTION_OF_STEP, actions_along
+from ddqn_planner.grid.layers import multipliers_of
+from ddqn_planner.grid.moves import ACTION_OF_STEP
 from ddqn_planner.planning.plan import PlanStatus, PosePlan
 from ddqn_planner.planning.pose_world import body_costs, occupied_for_body
 from ddqn_planner.robot.footprint import inside, outline
@@ -122,9 +122,6 @@ def cost_of_poses(poses: Float64, grid: GridMap) -> float:
         spent *= multipliers_of(cost[y, x])
     if grid.slowness is not None:
         spent *= grid.slowness[y, x]
-    if grid.uphill is not None:
-        moves = np.where(length < 1e-6, 8, actions_along(steps))
-        spent *= UPHILL[grid.uphill[y, x], moves]
     return float(spent.sum())
 
 

@@ -9,9 +9,9 @@ from ddqn_planner.compiled import in_place, inlined
 from ddqn_planner.grid import GridMap, MoveRule
 from ddqn_planner.grid.arguments import OCCUPIED
 from ddqn_planner.grid.boxes import Box
-from ddqn_planner.grid.layers import UPHILL, Layers, forbids, has_costs, multiplier_at
+from ddqn_planner.grid.layers import Layers, forbids, has_costs, multiplier_at
 from ddqn_planner.grid.map_changes import changed_cells
-from ddqn_planner.grid.moves import ACTION_OF_STEP, actions_along
+from ddqn_planner.grid.moves import ACTION_OF_STEP
 from ddqn_planner.robot.motions import HEADINGS, Motions, dense_poses
 
 SHIFT: Final = 2  # so many bits tell where in its tile a cell lies, along a side
@@ -50,9 +50,7 @@ class Body(NamedTuple):
     ]  # (R, 2): y and x of the first of 64 swept cells in a row, or fewer
     bits: NDArray[np.uint64]  # (R,): which of them
     first: NDArray[np.int64]  # (P + 35,): where the rows of each begin
-    passed: NDArray[
-        np.int64
-    ]  # (C, 4): x, y, how the origin leaves the cell, and moves in it
+    passed: NDArray[np.int64]  # (C, 3): x, y, and how the origin leaves the cell
     share: NDArray[np.float32]  # (C,): which part of the cost counts in this cell
     first_passed: NDArray[np.int64]  # (P + 1,)
     pose: NDArray[
@@ -158,7 +156,7 @@ def rows_of(
 def _passed(
     poses: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the cells that the origin passes, with two actions, 8 for none; and its shares."""
+    """Return the cells that the origin passes, the action that leaves each, and its shares."""
     way = dense_poses(poses, FINE, 0.0)[:, :2]
     middle, length = (way[1:] + way[:-1]) / 2, np.hypot(*np.diff(way, axis=0).T)
     if not length.any():
@@ -167,11 +165,8 @@ def _passed(
     begins = np.flatnonzero(np.r_[True, (cells[1:] != cells[:-1]).any(axis=1)])
     share = np.add.reduceat(length, begins) / length.sum()
     x, y = np.diff(cells[begins], axis=0).T
-    moved = way[np.append(begins[1:], len(way) - 1)] - way[begins]
-    moves = np.where(moved.any(axis=1), actions_along(moved), 8)
-    return np.column_stack(
-        [cells[begins], [*ACTION_OF_STEP[y + 1, x + 1], 8], moves]
-    ), share
+    leaves = [*ACTION_OF_STEP[y + 1, x + 1], 8]
+    return np.column_stack([cells[begins], leaves]), share
 
 
 def occupied_for_body(grid: GridMap) -> NDArray[np.bool_]:
@@ -289,10 +284,7 @@ def cost_of(x: int, y: int, number: int, world: Any) -> Any:
         column, line = x + body.passed[place, 0], y + body.passed[place, 1]
         if forbids(column, line, body.passed[place, 2], layers):
             return np.float32(np.inf)
-        part = body.share[place] * multiplier_at(column, line, np.float32(1), layers)
-        if layers.uphill.size > 0:
-            part *= UPHILL[layers.uphill[line, column], body.passed[place, 3]]
-        total += part
+        total += body.share[place] * multiplier_at(column, line, np.float32(1), layers)
     # Rounded, the shares may be less than 1 together; what counts on the least cost relies on it.
     return body.cost[number] * max(total, np.float32(1))
 

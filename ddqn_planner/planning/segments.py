@@ -15,7 +15,6 @@ from ddqn_planner.grid.layers import (
     actions_of_segment,
     has_costs,
     multiplier_at,
-    uphill_at,
 )
 
 Path: TypeAlias = NDArray[np.int32]  # (N, 2): cells, joined by moves or by segments
@@ -117,7 +116,7 @@ def _cost(
     x: int, y: int, last_x: int, last_y: int, begin: float, layers: Layers
 ) -> float:
     """Return the cost of a segment, infinity if it is not legal from a share of it on."""
-    occupancy, forbidden, _, _, uphill, cuts_corners = layers
+    occupancy, forbidden, _, _, cuts_corners = layers
     costs_differ = has_costs(layers)
     dx, dy = last_x - x, last_y - y
     step_x, step_y = (dx > 0) - (dx < 0), (dy > 0) - (dy < 0)
@@ -145,8 +144,7 @@ def _cost(
             blocked |= occupancy[np.uint64(y + step_y), column]
         legal = until <= ignored or not blocked
         if costs_differ:
-            part = (until - at) * multiplier_at(x, y, np.float64(1), layers)
-            total += part * uphill_at(x, y, dx, dy, layers) if uphill.size else part
+            total += (until - at) * multiplier_at(x, y, np.float64(1), layers)
         at = until
         if at_column == until:
             x, at_column = x + step_x, at_column + 2 * height

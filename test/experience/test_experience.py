@@ -406,6 +406,25 @@ def test_a_file_of_an_older_version_is_read(path: Path) -> None:
     )
 
 
+def test_a_file_with_directions_of_slowness_loads_without_them(tmp_path: Path) -> None:
+    # Written by version 0.4: six drives at a third of the speed east, and six at full
+    # speed west, from (2, 5.1) to (5, 5.1).
+    experience = Experience.load(Path(__file__).with_name("with_directions.npz"))
+    expected = driven(
+        *[straight((2, 5.1), (5, 5.1), 3), straight((5, 5.1), (2, 5.1))] * 6
+    )
+    np.testing.assert_allclose(
+        experience.slowness(HALL), expected.slowness(HALL), rtol=0.05
+    )
+    ends = [HALL.world_to_cell(x, 5.1) for x in (2.5, 4.5)]
+    east = experience.expected_time(HALL, ends).seconds
+    west = experience.expected_time(HALL, ends[::-1]).seconds
+    assert east == pytest.approx(west, rel=0.01)
+    experience.save(tmp_path / "again.npz")
+    again = Experience.load(tmp_path / "again.npz")
+    np.testing.assert_array_equal(again.slowness(HALL), experience.slowness(HALL))
+
+
 LINE = np.column_stack([np.linspace(0, 10, 41), np.zeros(41)])
 TIMES = np.linspace(0, 20, 41)
 

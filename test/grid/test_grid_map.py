@@ -179,8 +179,7 @@ def full_grids(draw: st.DrawFn) -> GridMap:
     )
     known = draw(st.none() | numpy_st.arrays(np.bool_, shape))
     obstacles = None if known is None else known & grid.occupancy
-    uphill = draw(st.none() | numpy_st.arrays(np.uint8, shape))
-    layers = {"forbidden": grid.forbidden, "slowness": slowness, "uphill": uphill}
+    layers = {"forbidden": grid.forbidden, "slowness": slowness}
     return GridMap(grid.occupancy, 0.5, (1.0, 2.0, 3.0), grid.cost, obstacles, **layers)
 
 
@@ -245,7 +244,7 @@ def test_patches_are_exact(
 def test_maps_of_the_same_fingerprint_have_the_same_layers(
     a: GridMap, b: GridMap
 ) -> None:
-    names = "occupancy", "cost", "forbidden", "slowness", "uphill"
+    names = "occupancy", "cost", "forbidden", "slowness"
     for changed in (None, *names):
         layers = {name: getattr(a, name) for name in names}
         if changed is not None and getattr(b, changed) is not None:
@@ -283,7 +282,7 @@ def test_a_wrong_patch_is_named_and_the_remedy_too() -> None:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("slowness", np.float32(2)), ("forbidden", np.uint8(2)), ("uphill", np.uint8(2))],
+    [("slowness", np.float32(2)), ("forbidden", np.uint8(2))],
 )
 def test_maps_tell_their_patches_where_all_else_is_the_same(
     name: str, value: Any
@@ -546,13 +545,11 @@ def test_what_is_no_choice_is_named_whatever_its_kind(wrong: Any) -> None:
     assert MoveRule(np.str_("corner_cutting")) is copy.deepcopy(rule) is rule
 
 
-@pytest.mark.parametrize(
-    "layer", ["occupancy", "cost", "forbidden", "slowness", "uphill"]
-)
+@pytest.mark.parametrize("layer", ["occupancy", "cost", "forbidden", "slowness"])
 @pytest.mark.parametrize("row", range(20))
 def test_maps_that_differ_in_one_cell_are_not_the_same(layer: str, row: int) -> None:
     ones = np.ones((20, 3), np.uint8)
-    layers = {"cost": ones, "forbidden": ones, "slowness": ones, "uphill": ones}
+    layers = {"cost": ones, "forbidden": ones, "slowness": ones}
     grid = GridMap(np.zeros((20, 3), np.bool_), **layers)
     changed = grid.occupancy.copy() if layer == "occupancy" else layers[layer].copy()
     changed[row, 1] = 1 - changed[row, 1] if layer == "occupancy" else 2

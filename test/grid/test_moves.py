@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import RULES, Data, Place, grids_uphill, grids_with_directions
+from strategies import RULES, Data, Place, grids_with_directions
 
 from ddqn_planner import GridMap, MoveRule
 from ddqn_planner.grid import LENGTHS, MOVES, neighbours, shortest_path
@@ -106,7 +106,7 @@ def test_reachable_is_exact(
         assert forward[y, x] == any(np.isfinite(distance[cell[::-1]]) for cell in cells)
 
 
-@given(grids_with_directions() | grids_uphill(), RULES, st.data())
+@given(grids_with_directions(), RULES, st.data())
 def test_distances_and_paths_are_exact(
     place: Place, rule: MoveRule, data: Data
 ) -> None:
@@ -114,7 +114,7 @@ def test_distances_and_paths_are_exact(
     distance = shortest_distances(grid, goal, rule)
     legal, cost = (
         grid.legal_moves(rule),
-        move_costs(grid.cost_multiplier, grid.uphill),
+        move_costs(grid.cost_multiplier),
     )
     assert distance[goal[1], goal[0]] == 0
     assert np.isinf(distance[grid.occupancy]).all()

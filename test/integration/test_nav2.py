@@ -480,7 +480,6 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
         node.set_parameters([Parameter("switch_threshold", value=1.0)])
         for form, is_kept in (
             ("straight", True),
-            ("line_of_sight", True),
             ("none", False),
         ):
             node.set_parameters([Parameter("path_simplification", value=form)])

@@ -175,7 +175,7 @@ def test_what_people_send_is_judged_by_where_it_lies_and_else_refused(
         assert (answer.success, answer.is_valid) == (False, False)
 
 
-@pytest.mark.parametrize("form", ["straight", "line_of_sight", "none"])
+@pytest.mark.parametrize("form", ["straight", "none"])
 def test_a_path_begins_at_the_start_and_ends_at_the_goal_and_stays_valid(
     asked: Asked, form: str
 ) -> None:

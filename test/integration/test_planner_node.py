@@ -201,6 +201,7 @@ def test_a_bad_parameter_is_refused_and_a_good_one_holds(
         ("clearance_weight", 1.5, "clearance_weight is 1.5; give 0 to 1"),
         ("tolerance", math.nan, "tolerance is nan; give 0 to 1000"),
         ("robot_radius", "0.3", "robot_radius is '0.3', a text (a number"),
+        ("path_simplification", "line_of_sight", "is gone; give straight"),
         ("mode", "best", "mode is 'best'; give one of greedy, astar_fallback"),
         ("start_source", "gps", "start_source is 'gps'; give one of"),
         *(

@@ -69,7 +69,6 @@ SAME: list[tuple[dict[str, Any], ...]] = [
         {},
     ),  # its range lets it pass
     ({"move_rule": "corner_cutting"}, {}, {}, {"move_rule": "corner_cutting"}),
-    ({"path_simplification": "line_of_sight"}, {}, {}, {}),
     ({"path_simplification": "none"}, {}, {}, {"simplified": False}),
     ({}, {}, {}, {"goal": (26, 29), "tolerance": 2}),
     ({}, {}, {}, FROM_OBSTACLE),

@@ -278,11 +278,8 @@ def test_a_map_made_of_others_is_as_new(
             grid = grid.with_patch([[not grid.occupancy[y, x]]], x, y, cost)
         elif data.draw(st.booleans()):
             slowness = (1 + random.random(grid.occupancy.shape)).astype(np.float32)
-            uphill = (
-                random.integers(0, 96, slowness.shape, np.uint8) if seed % 2 else None
-            )
             kept = grid.slowness if seed % 3 and grid.slowness is not None else slowness
-            grid = grid.with_layers(slowness=kept, seconds_per_cell=1.0, uphill=uphill)
+            grid = grid.with_layers(slowness=kept, seconds_per_cell=1.0)
         else:
             grid = data.draw(changed_maps(grid))
         maps.append(grid)
@@ -300,7 +297,7 @@ def test_a_map_made_of_others_is_as_new(
         costs, new = (one.fields.costs(grid, rule) for one in (planner, new_planner()))
         assert costs is not None
         assert new is not None
-        for layer in ("patch", "value", "multiplier", "uphill"):
+        for layer in ("patch", "value", "multiplier"):
             np.testing.assert_array_equal(getattr(costs, layer), getattr(new, layer))
         if data.draw(st.booleans(), label="compare"):
             assert_same(
@@ -338,7 +335,7 @@ def test_no_move_costs_more_than_the_highest_or_less_than_the_least(
     grid, _ = place
     costs = ANY_MAP.network.move_costs(grid, rule)
     assert costs is not None
-    exact = move_costs(grid.cost_multiplier, grid.uphill)
+    exact = move_costs(grid.cost_multiplier)
     legal = grid.legal_moves(rule)
     assert exact.max(initial=0, where=legal) <= 1.01 * costs.highest
     for first, bound in ((0, costs.straight), (1, costs.diagonal)):

@@ -100,17 +100,6 @@ def test_a_body_explores_within_the_share_alone(planner: Planner) -> None:
     assert costs[0] > 1.05 * costs[1]
 
 
-def test_a_body_pays_for_driving_uphill_alone(
-    planner: Planner, corridor: GridMap
-) -> None:
-    slope = corridor.with_layers(slowness=np.ones((20, 40), np.float32))
-    for code, factor in ((8 * 10, math.exp(1.5)), (8 * 10 + 4, 1.0)):
-        grid = slope.with_layers(uphill=np.full((20, 40), code, np.uint8))
-        path = plan(planner, grid, START, bound=1.0)
-        assert path.cost == pytest.approx(29 * factor)
-        assert cost_of_poses(path.poses, grid) == pytest.approx(path.cost)
-
-
 def test_it_keeps_no_path_that_is_blocked_or_leads_elsewhere(
     planner: Planner, corridor: GridMap
 ) -> None:

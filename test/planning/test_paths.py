@@ -19,7 +19,6 @@ from strategies import (
     Data,
     Place,
     cells_of,
-    grids_uphill,
     grids_with_costs,
     grids_with_directions,
     grids_with_free_cell,
@@ -213,7 +212,7 @@ def test_a_path_pulled_straight_through_an_opening_is_a_new_one() -> None:
         assert extra_cost is None
 
 
-@given(grids_with_costs() | grids_uphill(), RULES, st.data())
+@given(grids_with_costs() | grids_with_directions(), RULES, st.data())
 def test_a_search_finds_any_legal_path(
     place: Place, rule: MoveRule, data: Data
 ) -> None:
