@@ -490,13 +490,8 @@ def certify(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
 
 def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     """Learn from a robot's recorded drives how long places take, and what of it the map tells."""
-    from ddqn_planner.experience.drives import (
-        EXPERIENCE,
-        LOCK,
-        RECORD,
-        Drive,
-        read_recording,
-    )
+    from ddqn_planner.experience.drives import EXPERIENCE, LOCK, RECORD, Drive
+    from ddqn_planner.experience.recordings import read_recording
     from ddqn_planner.grid import read_map_file
 
     words = "trainers' folders, bags, MCAP files, or CSV files with the columns seconds, x, y"
@@ -562,10 +557,15 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
                 stack.enter_context(
                     WorkFolder(source, [LOCK, RECORD], "drives", "records")
                 )
-            how = options.topic, options.frame, options.robot_frame
-            name, found = read_recording(source, grid, *how)
-            print(f"{source}: {name}")
-            drives += found
+            recording = read_recording(
+                source,
+                grid,
+                topic=options.topic,
+                frame=options.frame,
+                robot_frame=options.robot_frame,
+            )
+            print(f"{source}: {recording.source}")
+            drives += recording.drives
         reasons = []
         for number, drive in enumerate(drives, 1):
             learned = drive.teach(experience, grid)

@@ -13,7 +13,8 @@ import pytest
 from ddqn_planner import Experience, GridMap, Planner, load_map
 from ddqn_planner.cli import main
 from ddqn_planner.code_cache import read_checked
-from ddqn_planner.experience.drives import DriveFolder, read_csv, read_drives, read_mcap
+from ddqn_planner.experience.drives import DriveFolder, read_drives
+from ddqn_planner.experience.recordings import read_csv, read_mcap
 from ddqn_planner.files import read_file, write_atomically
 from ddqn_planner.grid.map_file import MapNotFoundError
 from ddqn_planner.resources import find_resource

@@ -10,14 +10,8 @@ import pytest
 from map_files import save_map
 
 from ddqn_planner import Experience, GridMap
-from ddqn_planner.experience.drives import (
-    Drive,
-    DriveEnd,
-    DriveFolder,
-    read_csv,
-    read_mcap,
-    read_recording,
-)
+from ddqn_planner.experience.drives import Drive, DriveEnd, DriveFolder
+from ddqn_planner.experience.recordings import read_csv, read_mcap, read_recording
 
 GRID = GridMap(np.zeros((40, 120), dtype=np.bool_), resolution=0.25)
 

@@ -1,0 +1,388 @@
+"""Recordings of a robot's poses: MCAP bags, CSV files, and records of drives."""
+
+import csv
+import math
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from io import TextIOWrapper
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ddqn_planner.experience.drives import (
+    RECORD,
+    Drive,
+    DriveRecorder,
+    Sample,
+    read_drives,
+)
+from ddqn_planner.experience.posterior import cells_of
+from ddqn_planner.files import open_regular
+from ddqn_planner.grid import GridMap
+from ddqn_planner.grid.rotations import Rotation
+
+MAX_CSV_BYTES = 2**28  # of a recording: some 8 million poses
+COLUMNS = "seconds", "x", "y"
+
+POSE_TYPES = (
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "nav_msgs/msg/Odometry",
+)
+TRANSFORM_TYPE = "tf2_msgs/msg/TFMessage"
+BASE = "base_link"
+
+# More than this share of poses earlier than the pose before is no recording of a drive:
+# a clock jumps back less often.
+BACKWARD_SHARE = 0.1
+# Metres. Two topics whose poses mostly lie farther apart belong to two robots.
+DISTANCE_OF_ROBOTS = 1.0
+# Goals are poses too. A topic with a smaller share of poses is not taken for a robot's.
+SMALLEST_SHARE = 0.1
+
+
+class Recording(NamedTuple):
+    """The drives of a recording."""
+
+    source: str  # what the poses come from, in words
+    drives: list[Drive]
+
+
+class PoseSource(NamedTuple):
+    """What poses in a bag come from."""
+
+    topic: str
+    robot_frame: str = ""  # of transforms; empty for a topic of poses
+    # The frame whose transforms date the poses. Localisation dates its corrections into
+    # the future, so poses that come from different transforms do not mix.
+    dated_by: str = ""
+
+    @property
+    def name(self) -> str:
+        """The topic, and for transforms the robot's frame."""
+        if self.robot_frame:
+            return f"{self.topic} of {self.robot_frame}"
+        return self.topic
+
+
+class Transform(NamedTuple):
+    """Where a frame lies in its parent frame, in the plane."""
+
+    parent: str
+    x: float  # metres
+    y: float
+    cos: float  # of the yaw
+    sin: float
+
+
+def read_recording(
+    path: Path,
+    grid: GridMap,
+    *,
+    topic: str = "",
+    frame: str = "map",
+    robot_frame: str = "",
+) -> Recording:
+    """Return the drives that a recording on a map holds.
+
+    Parameters
+    ----------
+    path : Path
+        An ``episodes.csv`` or a folder with one, a CSV file with seconds, x and y, an
+        MCAP file, or a folder with MCAP files.
+    grid : GridMap
+        The map on which the robot drove.
+    topic, frame, robot_frame : str
+        See `read_mcap`.
+
+    Raises
+    ------
+    ValueError
+        If nothing can be learned from the recording, with the reason.
+    """
+    if path.name == RECORD:
+        recording = Recording(RECORD, list(read_drives(path)))
+    elif (path / RECORD).is_file():
+        recording = Recording(RECORD, list(read_drives(path / RECORD)))
+    elif path.suffix.lower() == ".csv":
+        recording = _divided(path, path.name, read_csv(path))
+    else:
+        name, samples = read_mcap(_files_of(path), topic, frame, robot_frame)
+        recording = _divided(path, name, samples)
+    if not recording.drives:
+        raise ValueError(f"{path} holds no drive; drive on")
+    _check_on_map(path, recording.drives, grid)
+    return recording
+
+
+def _divided(path: Path, name: str, samples: Sequence[Sample]) -> Recording:
+    """Divide the poses of a recording into drives."""
+    finite = [sample for sample in samples if all(map(math.isfinite, sample))]
+    elapsed = np.diff([sample.seconds for sample in finite])
+    if len(elapsed):
+        runs_backwards = (elapsed < 0).mean() > BACKWARD_SHARE
+        stands_still = not elapsed.any()
+        if runs_backwards or stands_still:
+            raise ValueError(
+                f"{path}: the time of {name} runs backwards or stands still; give "
+                "poses in the order of their times"
+            )
+    drives: list[Drive] = []
+    recorder = DriveRecorder(drives.append)
+    for sample in finite:
+        recorder.add(*sample)
+    recorder.end()
+    return Recording(f"{len(finite)} poses of {name}", drives)
+
+
+def _check_on_map(path: Path, drives: Sequence[Drive], grid: GridMap) -> None:
+    """Raise a ValueError if no pose of any drive lies on a free cell."""
+    positions = np.concatenate([drive.positions for drive in drives])  # (N, 2)
+    cells, is_inside = cells_of(positions, grid)
+    x, y = cells.T
+    is_free = is_inside & ~grid.occupancy[y, x]
+    if is_free.any():
+        return
+    lowest = positions.min(axis=0).round(1).tolist()
+    highest = positions.max(axis=0).round(1).tolist()
+    width = grid.width * grid.resolution
+    height = grid.height * grid.resolution
+    raise ValueError(
+        f"{path}: no pose lies on a free cell of the map: they go from {lowest} to "
+        f"{highest}, the map has {width:.1f} x {height:.1f} m from {grid.origin[:2]}; "
+        "give the map of these poses, or others"
+    )
+
+
+def _files_of(path: Path) -> Sequence[Path]:
+    """Return the MCAP files of a bag in the order of their numbers.
+
+    A path that does not exist is returned too: opening it says so.
+    """
+    if path.is_dir():
+        files = sorted(
+            path.glob("*.mcap"), key=lambda file: (len(file.name), file.name)
+        )
+    else:
+        files = [path]
+    has_mcap = any(file.suffix.lower() == ".mcap" for file in files)
+    if path.exists() and not has_mcap:
+        raise ValueError(
+            f"{path} is no .csv and no .mcap file, and no folder with {RECORD} or "
+            ".mcap files; `ros2 bag convert` makes MCAP files of other bags "
+            "(storage_id: mcap)"
+        )
+    return files
+
+
+def read_csv(path: Path) -> list[Sample]:
+    """Return the poses of a CSV file with the columns seconds, x and y.
+
+    A ValueError says which column is missing, or which row has no numbers.
+    """
+    content = open_regular(path, MAX_CSV_BYTES)
+    samples = []
+    with TextIOWrapper(content, "utf-8-sig", errors="replace", newline="") as file:
+        reader = csv.DictReader(line for line in file if line.strip(" ,\r\n"))
+        reader.fieldnames = [name.strip() for name in reader.fieldnames or ()]
+        missing = sorted(set(COLUMNS) - set(reader.fieldnames))
+        if missing:
+            raise ValueError(
+                f"{path}: the columns {', '.join(missing)} are missing; give seconds, "
+                "and x and y in metres in the frame of the map"
+            )
+        for row in reader:
+            try:
+                sample = Sample(*(float(row[name]) for name in COLUMNS))
+            except (TypeError, ValueError):
+                raise ValueError(
+                    f"{path}: {row} has no numbers; give seconds, x and y"
+                ) from None
+            samples.append(sample)
+    return samples
+
+
+# Bags
+
+
+def read_mcap(
+    paths: Sequence[Path], topic: str = "", frame: str = "map", robot_frame: str = ""
+) -> tuple[str, list[Sample]]:
+    """Return a robot's poses in the map's frame, and the name of their source.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        The files of a bag, in order.
+    topic : str
+        The topic of poses or transforms; by default the one with most poses.
+    frame : str
+        The map's frame.
+    robot_frame : str
+        The robot's frame; by default any that ends in ``base_link``.
+
+    Raises
+    ------
+    ValueError
+        If a file is broken, no topic has poses in the map's frame, or it is unclear
+        which of several robots is meant.
+    """
+    bag = _Bag(frame, robot_frame)
+    for path in paths:
+        bag.read(path)
+    poses = {
+        source: samples
+        for source, samples in bag.poses.items()
+        if topic in ("", source.topic)
+    }
+    remedy = "give --topic, --frame or --robot-frame"
+    if not poses:
+        raise ValueError(
+            f"{paths[0]} has no poses in the frame {frame!r} (topics, and their "
+            f"frames: {bag.topics_in_words()}); {remedy}"
+        )
+    best = max(poses, key=lambda source: len(poses[source]))
+    names = _robots(poses, best)
+    if len(names) > 1:
+        raise ValueError(
+            f"{paths[0]} has poses of several robots: {', '.join(names)}; {remedy}"
+        )
+    return best.name, poses[best]
+
+
+def _robots(poses: Mapping[PoseSource, list[Sample]], best: PoseSource) -> list[str]:
+    """Return the names of the robots whose poses these seem to be."""
+    robots = {best._replace(dated_by="")}
+    for source, samples in poses.items():
+        if _are_apart(samples, poses[best]):
+            robots.add(source._replace(dated_by=""))
+    return [robot.name for robot in sorted(robots)]
+
+
+def _are_apart(samples: Sequence[Sample], reference: Sequence[Sample]) -> bool:
+    """Return whether poses are those of another robot than the poses of reference."""
+    if len(samples) < SMALLEST_SHARE * len(reference):
+        return False
+    times, x, y = np.array(sorted(samples)).T
+    reference_times, reference_x, reference_y = np.array(sorted(reference)).T
+    away_x = x - np.interp(times, reference_times, reference_x)
+    away_y = y - np.interp(times, reference_times, reference_y)
+    distance = np.hypot(away_x, away_y)
+    return bool(np.median(distance) > DISTANCE_OF_ROBOTS)
+
+
+class _Bag:
+    """The poses of robots in the files of a bag."""
+
+    def __init__(self, frame: str, robot_frame: str) -> None:
+        self.frame = frame
+        self.robot_frame = robot_frame
+        self.poses: dict[PoseSource, list[Sample]] = defaultdict(list)
+        self._frames: dict[str, set[str]] = defaultdict(set)  # by topic
+        # By topic, the last transform of each frame.
+        self._trees: dict[str, dict[str, Transform]] = defaultdict(dict)
+
+    def topics_in_words(self) -> str:
+        """Return the topics of poses and transforms with their frames, for an error."""
+        topics = sorted(self._frames)
+        words = [f"{topic} in {sorted(self._frames[topic])}" for topic in topics]
+        return ", ".join(words) or "none"
+
+    def read(self, path: Path) -> None:
+        """Add the poses of a file; a ValueError if it is broken."""
+        from mcap.reader import make_reader
+        from mcap_ros2.decoder import DecoderFactory
+
+        with open_regular(path) as file:
+            try:
+                reader = make_reader(file, decoder_factories=[DecoderFactory()])
+                for schema, channel, _, message in reader.iter_decoded_messages():
+                    self._add(schema.name if schema else "", channel.topic, message)
+            # Broken bytes make the reader raise many kinds of errors.
+            except Exception as error:
+                raise ValueError(
+                    f"{path}: cannot be read as MCAP ({error!r}); `mcap recover` "
+                    "repairs a recording that a crash cut"
+                ) from error
+
+    def _add(self, message_type: str, topic: str, message: Any) -> None:
+        if message_type in POSE_TYPES:
+            self._add_pose(topic, message)
+        elif message_type == TRANSFORM_TYPE:
+            self._add_transforms(topic.removesuffix("_static"), message)
+
+    def _add_pose(self, topic: str, message: Any) -> None:
+        frame: str = message.header.frame_id
+        self._frames[topic].add(frame)
+        if frame.lstrip("/") != self.frame or self.robot_frame:
+            return
+        # With covariance, the pose lies one level deeper.
+        pose = getattr(message.pose, "pose", message.pose)
+        sample = Sample(_seconds(message), pose.position.x, pose.position.y)
+        self.poses[PoseSource(topic)].append(sample)
+
+    def _add_transforms(self, topic: str, message: Any) -> None:
+        tree = self._trees[topic]
+        for stamped in message.transforms:
+            self._frames[topic].add(stamped.child_frame_id)
+        for stamped in message.transforms:
+            transform = _planar(stamped)
+            if transform is None:
+                continue
+            child: str = stamped.child_frame_id.lstrip("/")
+            tree[child] = transform
+            for robot in self._robots_in(tree):
+                position = _position_of(robot, tree, self.frame, child)
+                if position is None:
+                    continue
+                sample = Sample(_seconds(stamped), *position)
+                self.poses[PoseSource(topic, robot, child)].append(sample)
+
+    def _robots_in(self, tree: Mapping[str, Transform]) -> Iterator[str]:
+        """Yield the frames of robots among the frames of a tree."""
+        for name in tree:
+            if self.robot_frame:
+                if name == self.robot_frame:
+                    yield name
+            elif name.rpartition("/")[2] == BASE:
+                yield name
+
+
+def _seconds(stamped: Any) -> float:
+    """Return the time of a stamped message."""
+    return float(stamped.header.stamp.sec + stamped.header.stamp.nanosec / 1e9)
+
+
+def _planar(stamped: Any) -> Transform | None:
+    """Return a transform in the plane; None for one without a rotation, as in tf2."""
+    shift = stamped.transform.translation
+    turn = stamped.transform.rotation
+    rotation = Rotation(turn.x, turn.y, turn.z, turn.w)
+    if not rotation.is_rounded:
+        return None
+    parent: str = stamped.header.frame_id.lstrip("/")
+    cos = math.cos(rotation.yaw)
+    sin = math.sin(rotation.yaw)
+    return Transform(parent, shift.x, shift.y, cos, sin)
+
+
+def _position_of(
+    robot: str, tree: Mapping[str, Transform], frame: str, changed: str
+) -> tuple[float, float] | None:
+    """Return where a robot is in a frame, if the changed transform tells."""
+    x = 0.0
+    y = 0.0
+    name = robot
+    chain: set[str] = set()
+    # Frames may form a circle.
+    while name != frame and name in tree and name not in chain:
+        chain.add(name)
+        name, shift_x, shift_y, cos, sin = tree[name]
+        turned_x = cos * x - sin * y
+        turned_y = cos * y + sin * x
+        x = shift_x + turned_x
+        y = shift_y + turned_y
+    if name == frame and changed in chain:
+        return x, y
+    return None
