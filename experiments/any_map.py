@@ -6,6 +6,7 @@ from typing import Any, Final
 import goal_1
 import goal_3
 import numpy as np
+from printed_target import PrintedTrainer
 from random_maps import generate_map
 from tables import median_and_range, table
 from trainings import MOVE_RULE, SCENARIO, Settings, Training, rollouts
@@ -18,13 +19,15 @@ from ddqn_planner.model.certificate import MOVE_RULES
 from ddqn_planner.training.any_map import ANY_MAP, random_scenarios
 from ddqn_planner.training.environment import GridVectorEnvironment
 from ddqn_planner.training.evaluation import evaluate
+from ddqn_planner.training.trainer import Trainer
 
 PAPERS_REWARD: Final = {"reward": "paper", "goal_reward": 10.0}
+PRINTED: Final = "the printed target"
 # The changes to ANY_MAP of each variant; the number of its folder is its place.
 VARIANTS: Final[dict[str, dict[str, Any]]] = {
     "all": {},
     "DQN's target": {"target": "dqn"},
-    "the printed target": {"target": "printed"},
+    PRINTED: {},
     "given initial cells (p_r = 0)": {"p_r": 0.0},
     "the paper's reward": PAPERS_REWARD,
     "plain reward (α = β = 0)": {**PAPERS_REWARD, "alpha": 0.0, "beta": 0.0},
@@ -41,13 +44,16 @@ ABLATION = (
 
 def trainings(settings: Settings) -> list[Training]:
     """Return the trainings of the ablation. Each seed has maps of its own."""
-    parameters_of = {
-        f"any_map/{number}": replace(ANY_MAP, steps=STEPS, **changes)
-        for number, changes in enumerate(VARIANTS.values())
-    }
-    return settings.trainings(
-        parameters_of, random_scenarios, evaluation_interval=10**9
-    )
+    trainings: list[Training] = []
+    for number, (variant, changes) in enumerate(VARIANTS.items()):
+        parameters = replace(ANY_MAP, steps=STEPS, **changes)
+        trainings += settings.trainings(
+            {f"any_map/{number}": parameters},
+            random_scenarios,
+            evaluation_interval=10**9,
+            trainer_class=PrintedTrainer if variant == PRINTED else Trainer,
+        )
+    return trainings
 
 
 def report(settings: Settings) -> str:

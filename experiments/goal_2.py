@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, Final
 
 import goal_1
@@ -10,12 +11,14 @@ import numpy as np
 from figures import draw_curves, draw_map, save_figure
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from numpy.typing import NDArray
+from printed_target import PrintedTrainer
 from tables import mean_and_worst, median_and_range, table
 from trainings import MOVE_RULE, PROFILES, SCENARIO, Settings, Training
 
 from ddqn_planner import Planner, QField
 from ddqn_planner.grid import MOVES, Cell, legal_moves
 from ddqn_planner.model import PropagationQNetwork
+from ddqn_planner.training.double_dqn import next_q
 from ddqn_planner.training.environment import GridVectorEnvironment
 from ddqn_planner.training.evaluation import length_ratios
 from ddqn_planner.training.propagation import PropagationLearner
@@ -36,11 +39,11 @@ START_DEAD_END: Final[frozenset[Cell]] = frozenset(
         (7, 7),
     }
 )
-# The folder and the target of each. The paper's equation, as it is printed, leaves θ⁻ out.
-TARGETS = {
-    "Double DQN": ("paper/both", "double_dqn"),  # the trainings of goal i
-    "DQN": ("paper/target_dqn", "dqn"),
-    "printed": ("paper/target_printed", "printed"),
+# The folder of each target's trainings.
+TARGETS: Final[dict[str, str]] = {
+    "Double DQN": "paper/both",  # the trainings of goal i
+    "DQN": "paper/target_dqn",
+    "printed": "paper/target_printed",
 }
 COLUMNS = (
     "profile | solved, of 286 | without action masking | of the dilemma's 10 | "
@@ -67,7 +70,9 @@ def trained_field(planner: Planner) -> QField:
         {name: tensor.copy() for name, tensor in network.tensors.items()}
         for _ in range(4)
     ]
-    learner = PropagationLearner(network, tuple(parts), environment)
+    learner = PropagationLearner(
+        network, parts, environment, partial(next_q, "double_dqn")
+    )
     q_CA = learner.q_values(np.zeros_like(cells), cells)
     q_AHW = q_CA.T.reshape(len(MOVES), *occupancy.shape)
     return QField(SCENARIO.goal, q_AHW, legal_moves(occupancy, MOVE_RULE))
@@ -135,19 +140,22 @@ def _draw(settings: Settings, ratios: dict[str, list[NDArray[np.float64]]]) -> s
 
 def target_trainings(settings: Settings) -> list[Training]:
     """Return the trainings of the profile paper with each target."""
-    parameters_of = {
-        folder: replace(PROFILES["paper"], target=target)
-        for folder, target in TARGETS.values()
+    parameters = PROFILES["paper"]
+    by_name = {
+        TARGETS["Double DQN"]: parameters,
+        TARGETS["DQN"]: replace(parameters, target="dqn"),
     }
-    return settings.trainings(parameters_of, [SCENARIO])
+    printed = {TARGETS["printed"]: parameters}
+    return [
+        *settings.trainings(by_name, [SCENARIO]),
+        *settings.trainings(printed, [SCENARIO], trainer_class=PrintedTrainer),
+    ]
 
 
 def target_report(settings: Settings) -> str:
     """Return the table of the targets, and write their figure."""
     rows = []
-    runs = {
-        label: settings.evaluations(folder) for label, (folder, _) in TARGETS.items()
-    }
+    runs = {label: settings.evaluations(folder) for label, folder in TARGETS.items()}
     estimates = {
         label: [run["overestimation"] for run in of] for label, of in runs.items()
     }
@@ -156,7 +164,7 @@ def target_report(settings: Settings) -> str:
         row = [
             label,
             f"{sum(int(run['solved'][-1]) for run in runs[label])} of {settings.seeds}",
-            count_solved(_ratios(_fields(settings, TARGETS[label][0])), STARTS),
+            count_solved(_ratios(_fields(settings, TARGETS[label])), STARTS),
             median_and_range(late, 2),
             median_and_range([error.max() for error in errors], 2),
         ]

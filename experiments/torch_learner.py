@@ -45,6 +45,7 @@ class TorchLearner:
 
     def __init__(self, trainer: Trainer) -> None:
         self.environment = trainer.environment
+        self._next_q_of = trainer.next_q
         self._online, self._target = (
             PaperModule(**trainer.network.sizes) for _ in range(2)
         )
@@ -74,6 +75,9 @@ class TorchLearner:
             answer: Tensor = self._online(self._observe(scenario, cell))
         return answer.numpy()
 
+    def settle(self) -> None:
+        """Do nothing: the modules share the memory of the trainer's weights."""
+
     def update(self, batch: Transitions, number: int) -> None:
         """Make an update, of this number."""
         with torch.no_grad():
@@ -81,8 +85,9 @@ class TorchLearner:
         cells = np.concatenate([batch.cell, batch.next_cell])
         q_2BA = self._online(self._observe(np.tile(batch.scenario, 2), cells))
         p = self.environment.parameters
-        q = target_BA.numpy(), q_2BA.numpy(force=True)
-        gradient_BA = torch.from_numpy(double_dqn_gradient(p.target, batch, *q))
+        q_BA, online_next_BA = np.split(q_2BA.numpy(force=True), 2)
+        next_q = self._next_q_of(online_next_BA, target_BA.numpy())
+        gradient_BA = torch.from_numpy(double_dqn_gradient(batch, q_BA, next_q))
         self._online.zero_grad()
         torch.autograd.backward(q_2BA[: len(gradient_BA)], gradient_BA)
         self._adam.step()

@@ -71,6 +71,7 @@ class Training:
     scenarios: tuple[Scenario, ...]
     seed: int
     evaluation_interval: int
+    trainer_class: type[Trainer] = Trainer
 
 
 @dataclass(frozen=True)
@@ -95,15 +96,24 @@ class Settings:
         parameters_of: Mapping[str, HyperParameters],
         scenarios: Sequence[Scenario] | Callable[[int], Sequence[Scenario]],
         evaluation_interval: int = 250,
+        trainer_class: type[Trainer] = Trainer,
     ) -> list[Training]:
-        """Return one training per name and seed, which may have scenarios of its own."""
-        most, found = 1_000 if self.quick else 10**9, []
+        """Return one training per name and seed; `scenarios` may depend on the seed."""
+        max_steps = 1_000 if self.quick else 10**9
+        trainings = []
         for name, parameters in parameters_of.items():
-            short = replace(parameters, steps=min(parameters.steps, most))
+            steps = min(parameters.steps, max_steps)
             for seed, folder in enumerate(self.folders(name)):
-                drawn = tuple(scenarios(seed) if callable(scenarios) else scenarios)
-                found.append(Training(folder, short, drawn, seed, evaluation_interval))
-        return found
+                training = Training(
+                    folder,
+                    replace(parameters, steps=steps),
+                    tuple(scenarios(seed) if callable(scenarios) else scenarios),
+                    seed,
+                    evaluation_interval,
+                    trainer_class,
+                )
+                trainings.append(training)
+        return trainings
 
     def evaluations(self, name: str) -> list[Evaluations]:
         """Return the evaluations of the trainings with a name, one table per seed."""
@@ -187,7 +197,13 @@ def _in_one_thread(job: Callable[[Any], Any], item: Any) -> Any:
 def train(training: Training) -> None:
     """Train and evaluate, or resume; keep the last network that solved the most scenarios, too."""
     folder = training.folder
-    run = TrainingRun(folder, training.scenarios, training.parameters, training.seed)
+    run = TrainingRun(
+        folder,
+        training.scenarios,
+        training.parameters,
+        training.seed,
+        training.trainer_class,
+    )
     with closing(run):
         trainer = run.trainer
         before = read_csv(folder / "evaluations.csv")
@@ -253,8 +269,10 @@ def rollouts(
             [[p.length if p.cells else np.nan for p in each] for each in plans]
         )
     # All maps at once, and the paths' cells alone: whole fields take 10 to 20 times as long.
-    maps, background = np.arange(len(environment.start)), environment.background
-    of_model, exact = planner.network, background.astype(np.float64)
+    maps = np.arange(len(environment.start))
+    background = environment.background
+    of_model = planner.network
+    exact: Any = background.astype(np.float64)
     tensors = {name: of_model.tensors[name] for name in of_model.shapes(of_model.sizes)}
     windows, (network,) = networks_of(exact, environment.shape, [tensors], len(maps))
     look(network, windows)

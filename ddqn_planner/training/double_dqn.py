@@ -1,4 +1,7 @@
-"""Double DQN: replay memory, and the gradient of the online network θ; θ⁻ is the target network."""
+"""Double DQN: replay memory, and the gradient of the loss by Q.
+
+θ is the online network, θ⁻ the target network. Dimensions: B = a batch, A = 8 actions.
+"""
 
 from typing import NamedTuple, TypeAlias
 
@@ -7,13 +10,11 @@ from numpy.typing import NDArray
 
 Q: TypeAlias = NDArray[np.float32]
 
-# Dimensions: B = a batch, A = 8 actions.
-
 
 class Transitions(NamedTuple):
-    """B transitions as arrays, (B,) each; cells are numbers y * W + x on the scenario's map."""
+    """B transitions; cells are numbers y * W + x on the scenario's map."""
 
-    scenario: NDArray[np.int64]
+    scenario: NDArray[np.int64]  # (B,), as all others
     cell: NDArray[np.int64]
     action: NDArray[np.int64]
     reward: NDArray[np.float32]
@@ -27,11 +28,13 @@ class ReplayBuffer:
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
         self.added = 0
-        self.transitions = Transitions._make(
-            np.zeros(
-                capacity, np.float32 if name in ("reward", "discount") else np.int64
-            )
-            for name in Transitions._fields
+        self.transitions = Transitions(
+            scenario=np.zeros(capacity, np.int64),
+            cell=np.zeros(capacity, np.int64),
+            action=np.zeros(capacity, np.int64),
+            reward=np.zeros(capacity, np.float32),
+            next_cell=np.zeros(capacity, np.int64),
+            discount=np.zeros(capacity, np.float32),
         )
 
     def __len__(self) -> int:
@@ -40,8 +43,8 @@ class ReplayBuffer:
     def add(self, transitions: Transitions) -> None:
         """Add B transitions, B <= capacity; they replace the oldest ones."""
         indices = (self.added + np.arange(len(transitions.cell))) % self.capacity
-        for name in Transitions._fields:
-            getattr(self.transitions, name)[indices] = getattr(transitions, name)
+        for name, stored in self.transitions._asdict().items():
+            stored[indices] = getattr(transitions, name)
         self.added += len(indices)
 
     def sample(self, count: int, random: np.random.Generator) -> Transitions:
@@ -50,20 +53,34 @@ class ReplayBuffer:
         return Transitions._make(stored[indices] for stored in self.transitions)
 
 
-def double_dqn_gradient(
-    kind: str, batch: Transitions, target_BA: Q, online_2BA: Q
-) -> Q:
-    """Return the gradient of the mean squared temporal-difference error by Q of states: (B, 8)."""
-    # Given is Q of the next states by θ⁻, and Q of the states and then the next ones by θ.
-    q_BA, online_BA = np.split(online_2BA, 2)
-    # Double DQN (van Hasselt et al. 2016, equation 4) selects the next action with θ and evaluates
-    # it with θ⁻. DQN (Mnih et al. 2015) does both with θ⁻, the paper's target as printed with θ.
-    selection_BA = target_BA if kind == "dqn" else online_BA
-    evaluation_BA = online_BA if kind == "printed" else target_BA
-    each = np.arange(len(q_BA))
-    y_B = (
-        batch.reward + batch.discount * evaluation_BA[each, selection_BA.argmax(axis=1)]
-    )
+class NextQ(NamedTuple):
+    """Q of the next states, which a target selects actions with and evaluates them with."""
+
+    selection: Q  # (B, 8)
+    evaluation: Q  # (B, 8)
+
+
+def next_q(target: str, online_BA: Q, target_BA: Q) -> NextQ:
+    """Return which Q of the next states a target uses, of that by θ and that by θ⁻.
+
+    Double DQN (van Hasselt et al. 2016, equation 4) selects the next action with θ and
+    evaluates it with θ⁻. DQN (Mnih et al. 2015) does both with θ⁻.
+    """
+    if target == "dqn":
+        return NextQ(selection=target_BA, evaluation=target_BA)
+    return NextQ(selection=online_BA, evaluation=target_BA)
+
+
+def double_dqn_gradient(batch: Transitions, q_BA: Q, next_q: NextQ) -> Q:
+    """Return the gradient of the mean squared temporal-difference error by Q: (B, 8).
+
+    `q_BA` is Q of the batch's states by θ.
+    """
+    rows = np.arange(len(q_BA))
+    next_action_B = next_q.selection.argmax(axis=1)
+    next_value_B = next_q.evaluation[rows, next_action_B]
+    y_B = batch.reward + batch.discount * next_value_B
+    error_B = q_BA[rows, batch.action] - y_B
     gradient_BA = np.zeros_like(q_BA)
-    gradient_BA[each, batch.action] = 2 / len(q_BA) * (q_BA[each, batch.action] - y_B)
+    gradient_BA[rows, batch.action] = 2 / len(q_BA) * error_B
     return gradient_BA

@@ -25,7 +25,6 @@ class HyperParameters:
     target: str = _choice(
         "double_dqn",
         "dqn",
-        "printed",
         source="ours: the target, see training/double_dqn.py",
     )
     reward: str = _choice(

@@ -18,6 +18,7 @@ from ddqn_planner.training.double_dqn import (
     ReplayBuffer,
     Transitions,
     double_dqn_gradient,
+    next_q,
 )
 from ddqn_planner.training.exploring_starts import initial_cells
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -205,8 +206,11 @@ class RobotTrainer:
         p_2BK = self._success(unit_2BK, place_2B)
         collision = np.float32(p.obstacle_reward)
         gain_2BK = self._return_SCK[states] - collision
-        q = self._q_SCK[batch.scenario, batch.next_cell], collision + p_2BK * gain_2BK
-        q_gradient = double_dqn_gradient(p.target, batch, *q)
+        q_BK, online_next_BK = np.split(collision + p_2BK * gain_2BK, 2)
+        target_next_BK = self._q_SCK[batch.scenario, batch.next_cell]
+        q_gradient = double_dqn_gradient(
+            batch, q_BK, next_q(p.target, online_next_BK, target_next_BK)
+        )
         taken = np.arange(p.batch_size), batch.action
         by_logit_B = (q_gradient * gain_2BK[: p.batch_size])[taken]
         by_logit_B *= p_2BK[taken] * (1 - p_2BK[taken])

@@ -24,13 +24,14 @@ class TrainingRun(WorkFolder):
         scenarios: Sequence[Scenario],
         parameters: HyperParameters,
         seed: int,
+        trainer_class: type[Trainer] = Trainer,
     ) -> None:
         after = f"the training continues and tries again every {SAVE_INTERVAL} steps"
         super().__init__(folder, MARKS, "training", "trains", after)
         self.model_path = self.folder / "model.safetensors"
         self.checkpoint_path = self.folder / CHECKPOINT
         with self.opening(), _memory_with_remedy():
-            self.trainer = Trainer(scenarios, parameters, seed)
+            self.trainer = trainer_class(scenarios, parameters, seed)
             if self.checkpoint_path.exists():
                 self.trainer.restore(self.checkpoint_path)
             self._record = open_record(

@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import safetensors.numpy
@@ -23,70 +23,105 @@ from ddqn_planner.model import (
     NETWORKS,
     ModelMetadata,
     PropagationQNetwork,
+    QNetwork,
     model_bytes,
     package_version,
 )
 from ddqn_planner.planning import Planner
-from ddqn_planner.training.compiled_learner import arrays_of, play
-from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions
+from ddqn_planner.training.compiled_learner import Counters, play, training_of
+from ddqn_planner.training.double_dqn import (
+    NextQ,
+    Q,
+    ReplayBuffer,
+    Transitions,
+    next_q,
+)
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
 from ddqn_planner.training.episodes import Episode, EpisodeEnd
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.propagation import PropagationLearner
 
-CHECKPOINT_KEY, DIGEST_KEY = "ddqn_planner_checkpoint", "sha256"
+CHECKPOINT_KEY = "ddqn_planner_checkpoint"
+DIGEST_KEY = "sha256"
 
 
 class CheckpointError(ValueError):
     """A checkpoint cannot be resumed; the message says why and what to do."""
 
 
+class Learner(Protocol):
+    """Updates a network, and evaluates it; B = a batch."""
+
+    def q_values(
+        self, scenario: NDArray[np.int64], cell: NDArray[np.int64]
+    ) -> NDArray[np.float32]:
+        """Return Q(s, a) of robots in `cell` (B,) on the maps `scenario` (B,): (B, 8)."""
+
+    def update(self, batch: Transitions, number: int) -> None:
+        """Make the update of this number."""
+
+    def settle(self) -> None:
+        """Take over weights that were changed from outside."""
+
+
 class Trainer:
-    """Trains a Q-network by Double DQN; the same arguments give the same network, bit for bit."""
+    """Trains a Q-network by Double DQN.
+
+    The same arguments give the same network, bit for bit.
+    """
 
     def __init__(
         self, scenarios: Sequence[Scenario], parameters: HyperParameters, seed: int
     ) -> None:
         self.scenarios = tuple(listed(scenarios, "the scenarios"))
         self.parameters = parameters
-        self.seed = seed = as_seed(seed)
-        self.steps = self.updates = self.episodes = 0
+        self.seed = as_seed(seed)
+        self.steps = 0
+        self.updates = 0
+        self.episodes = 0
 
-        weights, *others = np.random.SeedSequence(seed).spawn(4)
-        self._generators = [np.random.default_rng(sequence) for sequence in others]
+        weight_seed, *generator_seeds = np.random.SeedSequence(self.seed).spawn(4)
+        self._generators = [np.random.default_rng(seed) for seed in generator_seeds]
         initial, self._exploration, self._sampling = self._generators
         self.environment = GridVectorEnvironment(self.scenarios, parameters, initial)
-        network_class, (height, width) = (
-            NETWORKS[parameters.network],
-            self.environment.shape,
+        self.network = self._initial_network(int(weight_seed.generate_state(1)[0]))
+        # All that an update changes: the tensors of the networks θ and θ⁻, and of
+        # Adam's two moments of the gradient.
+        tensors = self.network.tensors
+        self._parts = (
+            tensors,
+            {name: np.copy(tensor) for name, tensor in tensors.items()},
+            {name: np.zeros_like(tensor) for name, tensor in tensors.items()},
+            {name: np.zeros_like(tensor) for name, tensor in tensors.items()},
         )
-        known = {**asdict(parameters), "height": height, "width": width}
-        sizes = {name: known[name] for name in network_class.size_names}
-        first = _initial_tensors(
-            network_class.shapes(sizes), int(weights.generate_state(1)[0])
-        )
-        self.network = network_class(sizes, first)
-        self.network.tensors = (
-            first  # all of them: what is noise is known once they are trained
-        )
-        copies = np.copy, np.zeros_like, np.zeros_like
-        target, mean, square = (
-            {name: copy(t) for name, t in first.items()} for copy in copies
-        )
-        # The networks θ and θ⁻, and Adam's moments of the gradient: all that an update changes.
-        self._parts = self.network.tensors, target, mean, square
         self._replay = ReplayBuffer(parameters.replay_capacity)
-
         self.environment.reset()
-        self._learner: Any = (
-            None  # the paper's network needs none: it learns in compiled code
-        )
+        # The paper's network learns in compiled code, and has no learner.
+        self._learner: Learner | None = None
         if isinstance(self.network, PropagationQNetwork):
             self._learner = PropagationLearner(
-                self.network, self._parts, self.environment
+                self.network, self._parts, self.environment, self.next_q
             )
         else:
-            self._arrays = arrays_of(self._parts, self.environment, self._replay)
+            self._training = training_of(
+                self._parts, self.environment, self._replay, self.next_q
+            )
+
+    def _initial_network(self, seed: int) -> QNetwork:
+        """Return the network with random weights."""
+        network_class = NETWORKS[self.parameters.network]
+        height, width = self.environment.shape
+        values = {**asdict(self.parameters), "height": height, "width": width}
+        sizes = {name: values[name] for name in network_class.size_names}
+        tensors = _initial_tensors(network_class.shapes(sizes), seed)
+        network = network_class(sizes, tensors)
+        # A network drops what it takes for noise, which shows only after training.
+        network.tensors = tensors
+        return network
+
+    def next_q(self, online_BA: Q, target_BA: Q) -> NextQ:
+        """Return which Q of the next states the target uses, see `next_q`."""
+        return next_q(self.parameters.target, online_BA, target_BA)
 
     @property
     def epsilon(self) -> float:
@@ -96,70 +131,99 @@ class Trainer:
         return p.epsilon_start + fraction * (p.epsilon_end - p.epsilon_start)
 
     def run(self, until: int, every: int = 10**9) -> Iterator[list[Episode]]:
-        """Train until step `until`; yield what ended, often and at each multiple of `every`."""
+        """Train until step `until`.
+
+        Yields the episodes that ended, often and at each multiple of `every` steps.
+        """
         while self.steps < until:
             pause = min(until, (self.steps // every + 1) * every)
-            if self._learner:
-                self._step()
-            else:
+            if self._learner is None:
                 self._play(pause)
+            else:
+                self._step(self._learner)
             yield self._end_episodes()
 
     def _play(self, until: int) -> None:
         """Make some steps in compiled code, until an episode ends."""
-        counters = np.array([self.steps, self.updates, self._replay.added])
-        play(*self._arrays, (self._exploration, self._sampling), counters, until)
-        self.steps, self.updates, self._replay.added = counters.tolist()
+        counters = Counters(self.steps, self.updates, self._replay.added)
+        counters = play(
+            self._training, self._exploration, self._sampling, counters, until
+        )
+        self.steps, self.updates, self._replay.added = counters
 
-    def _step(self) -> None:
-        """Make a step, with torch."""
-        e, p = self.environment, self.parameters
-        scenario, cell = e.scenario, e.cell.copy()
-        actions = self._exploration.integers(len(MOVES), size=p.environments)
+    def _step(self, learner: Learner) -> None:
+        """Make a step, and the updates that are due after it."""
+        environment = self.environment
+        p = self.parameters
+        scenario = environment.scenario
+        cell = environment.cell.copy()
+        action = self._exploration.integers(len(MOVES), size=p.environments)
         is_greedy = self._exploration.random(p.environments) >= self.epsilon
         if is_greedy.any():
-            q_NA = self._learner.q_values(scenario, cell)
-            actions = np.where(is_greedy, q_NA.argmax(axis=1), actions)
-        reward, terminated, _ = e.move(actions)
+            best_action = learner.q_values(scenario, cell).argmax(axis=1)
+            action = np.where(is_greedy, best_action, action)
+        reward, terminated, _ = environment.move(action)
         discount = np.where(terminated, 0.0, p.gamma).astype(np.float32)
-        self._replay.add(Transitions(scenario, cell, actions, reward, e.cell, discount))
-        before, self.steps = self.steps, self.steps + p.environments
+        self._replay.add(
+            Transitions(scenario, cell, action, reward, environment.cell, discount)
+        )
+        intervals = self.steps // p.update_interval
+        self.steps += p.environments
+        updates_due = self.steps // p.update_interval - intervals
         if self.steps > p.learning_starts:
-            for _ in range(
-                self.steps // p.update_interval - before // p.update_interval
-            ):
+            for _ in range(updates_due):
                 self.updates += 1
                 batch = self._replay.sample(p.batch_size, self._sampling)
-                self._learner.update(batch, self.updates)
+                learner.update(batch, self.updates)
 
     def _end_episodes(self) -> list[Episode]:
-        """Return the episodes that have ended, and start others in their place."""
-        e, episodes = self.environment, list[Episode]()
-        ended = e.terminated | e.truncated
-        for index in np.flatnonzero(ended).tolist():
-            scenario, moves = int(e.scenario[index]), int(e.steps[index])
-            cells, outcome = (
-                e.visited[index, : moves + 1].tolist(),
-                EpisodeEnd.OUT_OF_STEPS,
-            )
-            if cells[-1] == e.goal[scenario]:
-                outcome = EpisodeEnd.REACHED_GOAL
-            elif e.terminated[index]:
-                outcome, cells = EpisodeEnd.COLLIDED, cells[:-1]
-            visited = tuple((cell % e.shape[1], cell // e.shape[1]) for cell in cells)
+        """Return the episodes that have ended, and start new ones in their place."""
+        has_ended = self.environment.terminated | self.environment.truncated
+        episodes = []
+        for robot in np.flatnonzero(has_ended).tolist():
             self.episodes += 1
-            ends = self.episodes, self.steps, scenario, outcome, visited, moves
-            episodes.append(Episode(*ends, float(e.total_reward[index])))
+            episodes.append(self._episode(robot))
         if episodes:
-            e.reset(ended)
+            self.environment.reset(has_ended)
         return episodes
+
+    def _episode(self, robot: int) -> Episode:
+        """Return the episode of a robot that has just ended."""
+        environment = self.environment
+        _, width = environment.shape
+        scenario = int(environment.scenario[robot])
+        moves = int(environment.steps[robot])
+        numbers = environment.visited[robot, : moves + 1].tolist()
+        if numbers[-1] == environment.goal[scenario]:
+            outcome = EpisodeEnd.REACHED_GOAL
+        elif environment.terminated[robot]:
+            outcome = EpisodeEnd.COLLIDED
+            numbers.pop()  # the cell in which the robot stayed
+        else:
+            outcome = EpisodeEnd.OUT_OF_STEPS
+        return Episode(
+            number=self.episodes,
+            step=self.steps,
+            scenario=scenario,
+            outcome=outcome,
+            cells=tuple((number % width, number // width) for number in numbers),
+            moves=moves,
+            total_reward=float(environment.total_reward[robot]),
+        )
 
     def planner(self) -> Planner:
         """Return a planner with a copy of the network as it is now."""
-        p, network, first = self.parameters, self.network, self.scenarios[0]
-        of_training = first.grid.fingerprint, self.steps, self.seed, package_version()
+        network = self.network
+        scenario = self.scenarios[0]
         metadata = ModelMetadata(
-            p.network, network.sizes, first.move_rule, p.gamma, *of_training
+            network=self.parameters.network,
+            sizes=network.sizes,
+            move_rule=scenario.move_rule,
+            gamma=self.parameters.gamma,
+            map_fingerprint=scenario.grid.fingerprint,
+            steps=self.steps,
+            seed=self.seed,
+            package_version=package_version(),
         )
         tensors = {name: tensor.copy() for name, tensor in network.tensors.items()}
         return Planner(type(network)(network.sizes, tensors), metadata)
@@ -177,20 +241,19 @@ class Trainer:
         return model_bytes(planner.network, planner.metadata)
 
     def _description(self) -> dict[str, Any]:
-        """Return what of a checkpoint is no array, with the names of 0.1: those load too."""
-        e = self.environment
+        """Return what of a checkpoint is no array; the names are those of version 0.1."""
+        environment = self.environment
+        paths = zip(environment.visited, environment.steps, strict=True)
         return {
             "seed": self.seed,
             "move_rule": self.scenarios[0].move_rule.value,
             "parameters": asdict(self.parameters),
             "scenarios": [
-                [s.grid.fingerprint, [*s.start], [*s.goal]] for s in self.scenarios
+                [scenario.grid.fingerprint, [*scenario.start], [*scenario.goal]]
+                for scenario in self.scenarios
             ],
             "counters": [self.steps, self.updates, self.episodes, self._replay.added],
-            "walked": [
-                cells[: count + 1].tolist()
-                for cells, count in zip(e.visited, e.steps, strict=True)
-            ],
+            "walked": [cells[: steps + 1].tolist() for cells, steps in paths],
             "generators": [
                 generator.bit_generator.state for generator in self._generators
             ],
@@ -199,55 +262,35 @@ class Trainer:
     def save_checkpoint(self, path: Path) -> None:
         """Write all that `restore` needs; after an OSError, an old file is unchanged."""
         tensors = {
-            name: np.asarray(t, order="C") for name, t in self._tensors().items()
+            name: np.asarray(tensor, order="C")
+            for name, tensor in self._tensors().items()
         }
         text = json.dumps(self._description())
         metadata = {CHECKPOINT_KEY: text, DIGEST_KEY: _digest(text, tensors)}
         write_atomically(as_path(path), safetensors.numpy.save(tensors, metadata))
 
     def restore(self, path: Path) -> None:
-        """Take over a checkpoint of this training, whatever its `steps`, or a CheckpointError."""
+        """Continue from a checkpoint of this training, whatever its `steps`.
+
+        Raises
+        ------
+        CheckpointError
+            If the file is not a complete checkpoint, or one of another training. Then
+            this trainer may have taken over a part of it: make another one.
+        """
         try:
             open_regular(as_path(path)).close()  # safe_open would wait for a pipe
             with safe_open(as_path(path), framework="np") as file:
-                metadata, now = file.metadata(), self._description()
-                saved = json.loads(metadata[CHECKPOINT_KEY])
-                if saved["scenarios"] != now["scenarios"]:
-                    raise CheckpointError(
-                        "was made with another map, start or goal; give that one"
-                    )
-                others = saved["parameters"] | {"steps": self.parameters.steps}
-                before = saved | asdict(HyperParameters(**others))
-                given = {name: now[name] for name in ("seed", "move_rule")} | now[
-                    "parameters"
-                ]
-                if changed := differences(before, given):
-                    raise CheckpointError(f"was made with {changed}; give those values")
-                self.steps, self.updates, self.episodes, self._replay.added = saved[
-                    "counters"
-                ]
-                tensors = self._tensors()
-                shapes = {name: [*tensor.shape] for name, tensor in tensors.items()}
-                # Before any is read: a small sparse file can claim tensors of any size.
-                names = file.keys()
-                saved_shapes = {
-                    name: file.get_slice(name).get_shape() for name in names
-                }
-                if saved_shapes != shapes:
-                    raise ValueError("its tensors have other names or shapes")
-                for name, tensor in tensors.items():
-                    tensor[...] = file.get_tensor(name)
-                if metadata[DIGEST_KEY] != _digest(metadata[CHECKPOINT_KEY], tensors):
-                    raise ValueError("its digest is another")
-            for visited, cells in zip(
-                self.environment.visited, saved["walked"], strict=True
+                metadata = file.metadata()
+                description = json.loads(metadata[CHECKPOINT_KEY])
+                self._check_training(description)
+                self._restore_arrays(file, description["counters"])
+            if metadata[DIGEST_KEY] != _digest(
+                metadata[CHECKPOINT_KEY], self._tensors()
             ):
-                visited[: len(cells)] = cells
-            for generator, state in zip(
-                self._generators, saved["generators"], strict=True
-            ):
-                generator.bit_generator.state = state
-            if self._learner:
+                raise ValueError("its digest is another")
+            self._restore_episodes(description)
+            if self._learner is not None:
                 self._learner.settle()
         except CheckpointError as error:
             raise CheckpointError(
@@ -261,52 +304,95 @@ class Trainer:
                 f"{path}: {problem}, or train into another folder"
             ) from error
 
+    def _check_training(self, saved: dict[str, Any]) -> None:
+        """Raise a CheckpointError unless a checkpoint's description is of this training."""
+        current = self._description()
+        if saved["scenarios"] != current["scenarios"]:
+            raise CheckpointError(
+                "was made with another map, start or goal; give that one"
+            )
+        # How long a training takes may change, and old files lack new parameters.
+        values = saved["parameters"] | {"steps": self.parameters.steps}
+        saved_options = saved | asdict(HyperParameters(**values))
+        options = {
+            "seed": current["seed"],
+            "move_rule": current["move_rule"],
+            **current["parameters"],
+        }
+        changed = differences(saved_options, options)
+        if changed:
+            raise CheckpointError(f"was made with {changed}; give those values")
+
+    def _restore_arrays(self, file: Any, counters: list[int]) -> None:
+        """Read the counters and arrays of a checkpoint, a file of safetensors."""
+        # First the counters, as they tell how many transitions there are.
+        self.steps, self.updates, self.episodes, self._replay.added = counters
+        tensors = self._tensors()
+        shapes = {name: [*tensor.shape] for name, tensor in tensors.items()}
+        # Before any is read: a small sparse file can claim tensors of any size.
+        saved_shapes = {
+            name: file.get_slice(name).get_shape()
+            for name in file.keys()  # noqa: SIM118
+        }
+        if saved_shapes != shapes:
+            raise ValueError("its tensors have other names or shapes")
+        for name, tensor in tensors.items():
+            tensor[...] = file.get_tensor(name)
+
+    def _restore_episodes(self, saved: dict[str, Any]) -> None:
+        """Take over the episodes that have not ended, and the random generators."""
+        paths = zip(self.environment.visited, saved["walked"], strict=True)
+        for visited, cells in paths:
+            visited[: len(cells)] = cells
+        states = zip(self._generators, saved["generators"], strict=True)
+        for generator, state in states:
+            generator.bit_generator.state = state
+
     def _tensors(self) -> dict[str, NDArray[Any]]:
         """Return the arrays of a checkpoint, which share the trainer's memory."""
         online, target, mean, square = self._parts
-        replay = self._replay.transitions._asdict()
-        groups: dict[str, dict[str, NDArray[Any]]] = {
-            "network": online,
-            "target": target,
-            "replay": {
-                name: values[: len(self._replay)] for name, values in replay.items()
-            },
-            "environment": {
-                n: getattr(self.environment, n) for n in ("scenario", "cell", "steps")
-            },
+        environment = self.environment
+        tensors: dict[str, NDArray[Any]] = {
+            "environment.scenario": environment.scenario,
+            "environment.cell": environment.cell,
+            "environment.steps": environment.steps,
+            "total_reward": environment.total_reward,
         }
-        for index, name in enumerate(online if self.updates else ()):
-            moments = {"exp_avg": mean[name], "exp_avg_sq": square[name]}
-            groups[f"optimiser.{index}"] = {
-                "step": np.array(self.updates, np.float32),
-                **moments,
-            }
-        tensors = {
-            f"{g}.{n}": array
-            for g, arrays in groups.items()
-            for n, array in arrays.items()
-        }
-        return tensors | {"total_reward": self.environment.total_reward}
+        for name in online:
+            tensors[f"network.{name}"] = online[name]
+            tensors[f"target.{name}"] = target[name]
+        for name, values in self._replay.transitions._asdict().items():
+            tensors[f"replay.{name}"] = values[: len(self._replay)]
+        if self.updates:
+            # As torch's optimisers name them.
+            for number, name in enumerate(online):
+                optimiser = f"optimiser.{number}"
+                tensors[f"{optimiser}.step"] = np.array(self.updates, np.float32)
+                tensors[f"{optimiser}.exp_avg"] = mean[name]
+                tensors[f"{optimiser}.exp_avg_sq"] = square[name]
+        return tensors
 
 
 def _initial_tensors(
     shapes: Mapping[str, tuple[int, ...]], seed: int
-) -> dict[str, Any]:
+) -> dict[str, NDArray[np.float32]]:
     """Draw weights and biases as torch does for its layers."""
-    generator, tensors = torch.Generator().manual_seed(seed), {}
+    generator = torch.Generator().manual_seed(seed)
+    tensors = {}
     for name, shape in shapes.items():
         layer, _, _ = name.partition(".")
-        most = math.prod(shapes[f"{layer}.weight"][1:]) ** -0.5
-        tensors[name] = np.empty(shape, np.float32)
-        torch.from_numpy(tensors[name]).uniform_(-most, most, generator=generator)
-        if (
-            name == "prices.bias"
-        ):  # a cost multiplier below 1 has no gradient: it must begin above
-            tensors[name][:] = 1
+        inputs = math.prod(shapes[f"{layer}.weight"][1:])
+        bound = inputs**-0.5
+        tensor = np.empty(shape, np.float32)
+        torch.from_numpy(tensor).uniform_(-bound, bound, generator=generator)
+        if name == "prices.bias":
+            # A cost multiplier below 1 has no gradient: it must begin above.
+            tensor[:] = 1
+        tensors[name] = tensor
     return tensors
 
 
-def _digest(text: str, tensors: dict[str, NDArray[Any]]) -> str:
+def _digest(text: str, tensors: Mapping[str, NDArray[Any]]) -> str:
     digest = hashlib.sha256(text.encode())
     for name in sorted(tensors):
         digest.update(name.encode())

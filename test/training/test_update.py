@@ -11,6 +11,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from printed_target import PrintedTrainer
 from torch import Tensor
 from torch_layers import in_torch, propagation_layers
 from torch_learner import TorchLearner
@@ -31,6 +32,12 @@ from ddqn_planner.training.environment import Scenario, paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.robot import RobotTrainer
 from ddqn_planner.training.trainer import Trainer
+
+TARGETS = {
+    "double_dqn": (Trainer, "double_dqn"),
+    "dqn": (Trainer, "dqn"),
+    "printed": (PrintedTrainer, "double_dqn"),
+}
 
 Q = dict[Scenario, dict[Cell, Tensor]]
 """Q(s, a) of all actions, (8,), for the robot in each cell of a scenario's map."""
@@ -97,7 +104,7 @@ def check_update(trainer: Trainer, loss: Tensor, before: dict[str, Tensor]) -> N
 
 
 @pytest.mark.parametrize("units", [0, 6])
-@pytest.mark.parametrize("target", ["double_dqn", "dqn", "printed"])
+@pytest.mark.parametrize("target", [*TARGETS])
 def test_compiled_training_is_that_of_torch(
     small: Scenario, tmp_path: Path, target: str, units: int
 ) -> None:
@@ -112,8 +119,9 @@ def test_compiled_training_is_that_of_torch(
         "max_episode_steps": 7,
         "filters": 4,
     }
+    trainer_class, target = TARGETS[target]
     parameters = HyperParameters(target=target, hidden_units=units, **brief)
-    trainers = [Trainer(scenarios, parameters, seed=2) for _ in range(2)]
+    trainers = [trainer_class(scenarios, parameters, seed=2) for _ in range(2)]
     compiled, of_torch = trainers
     for trainer in trainers:
         part(trainer)
@@ -125,7 +133,7 @@ def test_compiled_training_is_that_of_torch(
     assert compiled.updates == of_torch.updates > 60
     check_same(compiled, of_torch)
     of_torch.save_checkpoint(tmp_path / "checkpoint")
-    compiled = Trainer(scenarios, parameters, seed=2)
+    compiled = trainer_class(scenarios, parameters, seed=2)
     compiled.restore(tmp_path / "checkpoint")
     one, other = (
         [e for ended in t.run(180) for e in ended] for t in (compiled, of_torch)
@@ -149,7 +157,7 @@ def test_weights_whose_gradients_fade_move_as_those_of_torch(small: Scenario) ->
         {name: 0 * t for name, t in trainer.network.tensors.items()} for _ in range(3)
     )
     e, parts = trainer.environment, (trainer.network.tensors, *zeros)
-    windows, networks = networks_of(e.background, e.shape, parts, batch=1)
+    windows, networks = networks_of(e.background, e.shape, parts, states=1)
     online, gradient, *moments = networks
     moved = [each.weights for each in (online, gradient, *moments)]
     weight = torch.tensor(online.weights)
@@ -170,7 +178,7 @@ def test_weights_whose_gradients_fade_move_as_those_of_torch(small: Scenario) ->
     torch.testing.assert_close(torch.tensor(online.weights), weight)
 
 
-@pytest.mark.parametrize("target", ["double_dqn", "dqn", "printed"])
+@pytest.mark.parametrize("target", [*TARGETS])
 def test_an_update_is_the_equations_and_counts_each_reward_once(
     small: Scenario, target: str
 ) -> None:
@@ -190,10 +198,12 @@ def test_an_update_is_the_equations_and_counts_each_reward_once(
         "filters": 4,
     }
     settings |= {"learning_starts": 60, "environments": 5, "update_interval": 5}
-    parameters = HyperParameters("any_map", target, max_episode_steps=7, **settings)
-    trainer = Trainer(scenarios, parameters, seed=1)
+    trainer_class, name = TARGETS[target]
+    parameters = HyperParameters("any_map", name, max_episode_steps=7, **settings)
+    trainer = trainer_class(scenarios, parameters, seed=1)
     list(trainer.run(60))
     part(trainer)
+    assert trainer._learner is not None
     trainer._learner.settle()
     trainer.network.tensors["prices.bias"][
         ::2
