@@ -18,7 +18,7 @@ from ddqn_planner.grid import MOVES, Cell, clearance
 from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.moves import cells_along
 from ddqn_planner.grid.noise import random_requests
-from ddqn_planner.planning.segments import _cost, cost_along, straightened
+from ddqn_planner.planning.segments import cost_along, segment_cost, straightened
 
 RULE = MoveRule.ROBOT_SAFE
 KINDS = ("random_10", "random_20", "rooms", "office", "dead_ends", "maze")
@@ -156,10 +156,12 @@ def _theta_star(
             number = to_y * width + to_x
             if not (0 <= to_x < width and 0 <= to_y < height) or closed[number]:
                 continue
-            through = cost[cell] + _cost(x, y, to_x, to_y, 0.0, layers)
+            through = cost[cell] + segment_cost(x, y, to_x, to_y, 0.0, layers)
             if through == np.inf:
                 continue
-            direct = cost[parent[cell]] + _cost(from_x, from_y, to_x, to_y, 0.0, layers)
+            direct = cost[parent[cell]] + segment_cost(
+                from_x, from_y, to_x, to_y, 0.0, layers
+            )
             least = min(through, direct)
             if least < cost[number] * (1 - 1e-12):
                 cost[number], parent[number] = (
@@ -213,7 +215,7 @@ def _optimum(points: NDArray[np.int64], layers: Any) -> float:
         for other in range(len(points)):
             to_x, to_y = points[other]
             if cost[number] + np.hypot(to_x - x, to_y - y) < cost[other] - 1e-9:
-                length = cost[number] + _cost(x, y, to_x, to_y, 0.0, layers)
+                length = cost[number] + segment_cost(x, y, to_x, to_y, 0.0, layers)
                 if length < cost[other] - 1e-9:
                     cost[other] = length
                     order = length + np.hypot(points[1, 0] - to_x, points[1, 1] - to_y)
