@@ -129,7 +129,8 @@ def costmap_values() -> NDArray[np.int8]:
     values[metres > INFLATION_RADIUS] = 0
     values[metres <= INSCRIBED_RADIUS] = INSCRIBED
     values[obstacles] = LETHAL
-    return values.astype(np.int8)
+    written: NDArray[np.int8] = values.astype(np.int8)
+    return written
 
 
 def costmap() -> Any:
