@@ -34,25 +34,14 @@ from ddqn_planner.grid.layers import (
 )
 from ddqn_planner.grid.moves import MoveRule
 
-LAYERS = (
-    "occupancy",
-    "cost",
-    "forbidden",
-    "slowness",
-)  # what its moves depend on
-PATCHED = {
-    "occupancy",
-    "cost",
-    "obstacles",
-    "unknown",
-}  # layers of which patches change some cells
+LAYERS = ("occupancy", "cost", "forbidden", "slowness")  # on which its moves depend
+PATCHED = {"occupancy", "cost", "obstacles", "unknown"}  # layers that patches change
 RESOLUTIONS = 1e-6, 1e6
 METRES_PER_CELL = "metres per cell, {:g} to {:g}".format(*RESOLUTIONS)
-MAX_CELLS_AWAY = (
-    2.0**40
-)  # float64 tells points so far away apart by less than 1/1000 of a cell
+# So far away, float64 tells points apart that differ by 1/1000 of a cell.
+MAX_CELLS_AWAY = 2.0**40
 MAX_YAW = 1e6  # radians, of an origin
-MAX_PATCHES = 512  # so many are known of a map, one after the other
+MAX_PATCHES = 512  # the last patches of a map that are remembered
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,53 +94,44 @@ class GridMap:
 
     def __post_init__(self) -> None:
         occupancy = arguments.as_mask("occupancy", self.occupancy)
-        metres = as_number("resolution", self.resolution, *RESOLUTIONS, METRES_PER_CELL)
-        origin, shape = arguments.as_pose("origin", self.origin), occupancy.shape
-        _check_place(origin, metres, shape)
-        self._set(occupancy=occupancy, resolution=metres, origin=origin)
+        shape = occupancy.shape
+        resolution = as_number(
+            "resolution", self.resolution, *RESOLUTIONS, METRES_PER_CELL
+        )
+        origin = arguments.as_pose("origin", self.origin)
+        _check_place(origin, resolution, shape)
+        self._set(occupancy=occupancy, resolution=resolution, origin=origin)
         if self.cost is not None:
             self._set(cost=_costs(self.cost, occupancy))
         if self.obstacles is not None:
             obstacles = arguments.as_mask("obstacles", self.obstacles, shape)
-            if (obstacles & ~occupancy).any():
-                raise ValueError(
-                    "obstacles lie on free cells; give some within the occupied cells"
-                )
+            _check_occupied(obstacles, occupancy, "obstacles lie on free cells")
             self._set(obstacles=obstacles)
         if self.forbidden is not None:
-            bits = arguments.numbers(
-                "forbidden", self.forbidden, shape, between=(0, 255)
-            )
-            self._set(
-                forbidden=bits.astype(np.uint8, order="C") if bits.any() else None
-            )
+            self._set(forbidden=_forbidden(self.forbidden, shape))
         if self.slowness is not None:
-            slowest = 1, arguments.MAX_SLOWNESS
-            times = arguments.numbers(
-                "slowness", self.slowness, shape, "iuf", slowest, whole=False
+            self._set(slowness=_slowness(self.slowness, shape))
+        if self.seconds_per_cell is not None:
+            seconds = as_number(
+                "seconds_per_cell", self.seconds_per_cell, *POSITIVE, "more than 0"
             )
-            self._set(slowness=times.astype(np.float32, order="C"))
-        if (seconds := self.seconds_per_cell) is not None:
-            seconds = as_number("seconds_per_cell", seconds, *POSITIVE, "more than 0")
             self._set(seconds_per_cell=seconds)
         if self.unknown is not None:
             unknown = arguments.as_mask("unknown", self.unknown, shape)
-            if (unknown & ~occupancy).any():
-                raise ValueError(
-                    "unknown cells are free; give some within the occupied cells"
-                )
+            _check_occupied(unknown, occupancy, "unknown cells are free")
             self._set(unknown=unknown if unknown.any() else None)
         limits = 0, sys.float_info.max, "metres, finite and 0 or more"
         self._set(body_radius=as_number("body_radius", self.body_radius, *limits))
 
-    def _set(self, **layers: Any) -> None:
-        for value in layers.values():
+    def _set(self, **values: object) -> None:
+        """Give the map its values; its arrays are read-only from now on."""
+        for name, value in values.items():
             if isinstance(value, np.ndarray):
                 value.flags.writeable = False
-        vars(self).update(layers)  # the dataclass is frozen
+            object.__setattr__(self, name, value)  # the dataclass is frozen
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take what was pickled or copied: NumPy forgets that arrays are read-only."""
+    def __setstate__(self, state: dict[str, object]) -> None:
+        """Take a pickled or copied state: NumPy forgets that arrays are read-only."""
         self._set(**state)
 
     @classmethod
@@ -187,14 +167,16 @@ class GridMap:
                 f"the values are of type {array.dtype}; give integers, percent"
             )
         array = array.astype(np.int8, copy=False)
-        occupied, unknown = array >= occupied_threshold, None
+        occupied = array >= occupied_threshold
+        unknown = None
         if not arguments.as_flag("allow_unknown", allow_unknown):
             unknown = array < 0
             occupied |= unknown
-        with_costs = arguments.as_flag("use_map_costs", use_map_costs)
-        cost = np.maximum(array, UNKNOWN) if with_costs else None
-        layers: Any = {"forbidden": forbidden, "unknown": unknown}
-        return cls(occupied, resolution, origin, cost, **layers)
+        cost = None
+        if arguments.as_flag("use_map_costs", use_map_costs):
+            cost = np.maximum(array, UNKNOWN)
+        bits: Any = forbidden  # it is checked there
+        return cls(occupied, resolution, origin, cost, forbidden=bits, unknown=unknown)
 
     def with_patch(
         self,
@@ -223,97 +205,98 @@ class GridMap:
             Which of the new occupied cells are unknown, as for `GridMap`; by default none.
         """
         patch = arguments.as_mask("occupancy", occupancy)
-        left, bottom = arguments.as_cell((x, y), "the first cell of the patch")
-        height, width = patch.shape
-        if not (
-            0 <= left <= self.width - width and 0 <= bottom <= self.height - height
-        ):
+        box = self._box_of_patch(x, y, patch.shape)
+        patched_obstacles = patch
+        if obstacles is not None:
+            mask = arguments.as_mask("obstacles", obstacles, patch.shape)
+            patched_obstacles = patch & mask
+        patched = self.with_layers(
+            occupancy=replaced(self.occupancy, box, patch),
+            cost=self._patched_cost(patch, box, cost),
+            obstacles=_replaced_if_any(self.obstacles, box, patched_obstacles),
+            unknown=self._patched_unknown(patch, box, unknown),
+        )
+        # Where most of the map is new, it is quicker to compare all of it.
+        is_small = 2 * patch.size <= self.occupancy.size
+        has_same_layers = (patched.cost is None) == (self.cost is None)
+        if is_small and has_same_layers:
+            patched._set(_history=self._history.with_patch(box))
+        return patched
+
+    def _box_of_patch(self, x: int, y: int, shape: tuple[int, ...]) -> Box:
+        """Return the rows and columns of a patch; ValueError if some are off the map."""
+        x, y = arguments.as_cell((x, y), "the first cell of the patch")
+        height, width = shape
+        has_columns = 0 <= x <= self.width - width
+        has_rows = 0 <= y <= self.height - height
+        if not (has_columns and has_rows):
             size = f"{self.width} x {self.height}"
-            part = f"{width} x {height} cells from {left, bottom}"
+            part = f"{width} x {height} cells from {x, y}"
             raise ValueError(
                 f"a patch of {part} is not inside the map of {size}; cut it"
             )
-        box = Box(slice(bottom, bottom + height), slice(left, left + width))
-        costs = self.cost
-        if costs is not None or cost is not None:
-            costs = (
-                np.zeros(self.occupancy.shape, dtype=np.int8)
-                if costs is None
-                else costs
-            )
-            costs = replaced(
-                costs, box, _costs(costs[box] if cost is None else cost, patch)
-            )
-        closed = patch
-        if obstacles is not None:
-            closed = patch & arguments.as_mask("obstacles", obstacles, patch.shape)
-        patched = self.with_layers(
-            occupancy=replaced(self.occupancy, box, patch),
-            cost=costs,
-            obstacles=replaced(self.obstacles, box, closed),
-            unknown=self._unknown_with(patch, box, unknown),
-        )
-        # To look once at a map of which most is new takes less time than to look at the patch.
-        if (costs is None) == (
-            self.cost is None
-        ) and 2 * patch.size <= self.occupancy.size:
-            last_versions = self._history.versions[-MAX_PATCHES:]
-            versions = *last_versions, (object(), box)
-            patched._set(_history=History(self._history.lineage, versions))
-        return patched
+        return Box(slice(y, y + height), slice(x, x + width))
 
-    def _unknown_with(
+    def _patched_cost(
+        self, patch: Occupancy, box: Box, cost: ArrayLike | None
+    ) -> NDArray[np.int8] | None:
+        """Return the costs after a patch of some cells, whose costs may be new."""
+        if self.cost is None and cost is None:
+            return None
+        old_cost = self.cost
+        if old_cost is None:
+            old_cost = np.zeros(self.occupancy.shape, dtype=np.int8)
+        if cost is None:
+            cost = old_cost[box]
+        return replaced(old_cost, box, _costs(cost, patch))
+
+    def _patched_unknown(
         self, patch: Occupancy, box: Box, unknown: ArrayLike | None
     ) -> Occupancy | None:
         """Return the unknown cells after a patch of some cells."""
-        new = np.zeros(patch.shape, dtype=np.bool_)
+        new_unknown = np.zeros(patch.shape, dtype=np.bool_)
         if unknown is not None:
-            new = patch & arguments.as_mask("unknown", unknown, patch.shape)
-        before = self.unknown
-        if before is None:
-            if not new.any():
+            new_unknown = patch & arguments.as_mask("unknown", unknown, patch.shape)
+        old_unknown = self.unknown
+        if old_unknown is None:
+            if not new_unknown.any():
                 return None
-            before = np.zeros(self.occupancy.shape, dtype=np.bool_)
-        after: Occupancy = replaced(before, box, new)
-        return after
+            old_unknown = np.zeros(self.occupancy.shape, dtype=np.bool_)
+        return replaced(old_unknown, box, new_unknown)
 
     def patches_since(self, older: GridMap) -> list[Box] | None:
-        """Return the boxes, rows and columns, that `with_patch` replaced since an older map."""
-        # None if it is no such map, or has other layers, or there were more than `MAX_PATCHES`.
-        if self._history.lineage is not older._history.lineage:
-            return None
-        names = "forbidden", "slowness"
-        if not all(getattr(self, name) is getattr(older, name) for name in names):
-            return None
-        versions = [version for version, _ in self._history.versions]
-        older_version, _ = older._history.versions[-1]
-        if older_version not in versions:
-            return None
-        return [
-            box
-            for _, box in self._history.versions[versions.index(older_version) + 1 :]
-        ]
+        """Return the boxes that `with_patch` replaced since an older map.
+
+        None if this map was not made of the older one, if it has other directions or
+        times, or after more than `MAX_PATCHES`.
+        """
+        is_same = self.forbidden is older.forbidden and self.slowness is older.slowness
+        return self._history.patches_since(older._history) if is_same else None
 
     def with_times_of(self, other: GridMap) -> GridMap:
-        """Return the same map with the expected times of another, and those that are hoped for."""
-        hopes = other.exploration
-        if hopes is not None:
-            hopes = Exploration(
-                hopes.share, *(self.with_times_of(each) for each in hopes[1:])
+        """Return the same map with the expected and the optimistic times of another."""
+        exploration = other.exploration
+        if exploration is not None:
+            exploration = Exploration(
+                share=exploration.share,
+                bold=self.with_times_of(exploration.bold),
+                safe=self.with_times_of(exploration.safe),
             )
-        times = {
-            name: getattr(other, name) for name in ("slowness", "seconds_per_cell")
-        }
-        return self.with_layers(**times, exploration=hopes)
+        return self.with_layers(
+            slowness=other.slowness,
+            seconds_per_cell=other.seconds_per_cell,
+            exploration=exploration,
+        )
 
-    def with_layers(self, **layers: Any) -> GridMap:
+    def with_layers(self, **layers: object) -> GridMap:
         """Return the same map with other layers, which are neither checked nor copied."""
-        kept = {field.name: getattr(self, field.name) for field in fields(self)}
-        if not layers.keys() & PATCHED:
-            kept["_history"] = self._history
-        changed = object.__new__(GridMap)
-        changed._set(**kept | layers)
-        return changed
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        if layers.keys().isdisjoint(PATCHED):
+            values["_history"] = self._history
+        values.update(layers)
+        grid = object.__new__(GridMap)
+        grid._set(**values)
+        return grid
 
     @property
     def height(self) -> int:
@@ -352,10 +335,9 @@ class GridMap:
         """Return (H, W) int32: each free cell's component, from 1 on, whatever is forbidden."""
         from scipy import ndimage
 
-        # If a diagonal move needs both side cells free, two straight moves can replace it.
-        joined = ndimage.generate_binary_structure(
-            2, 2 if MoveRule(move_rule).cuts_corners else 1
-        )
+        # If a diagonal move needs both side cells free, two straight moves replace it.
+        cuts_corners = MoveRule(move_rule).cuts_corners
+        joined = ndimage.generate_binary_structure(2, 2 if cuts_corners else 1)
         labels: NDArray[np.int32] = ndimage.label(~self.occupancy, joined)[0]
         return labels
 
@@ -377,24 +359,29 @@ class GridMap:
     def reachable(
         self, cells: ArrayLike, move_rule: MoveRule | str, backward: bool = False
     ) -> NDArray[np.bool_]:
-        """Return (H, W) bool: where paths from some free cells (N, 2) lead, or backward, begin."""
-        array = arguments.cells_inside(cells, self.occupancy.shape)
-        occupied = array[self.occupancy[array[:, 1], array[:, 0]]].tolist()
+        """Return which cells paths from some free cells lead to: (H, W) bool.
+
+        Backward, return from which cells paths lead to them.
+        """
+        path_ends = arguments.cells_inside(cells, self.occupancy.shape)
+        is_backward = arguments.as_flag("backward", backward)
+        x, y = path_ends.T
+        occupied = path_ends[self.occupancy[y, x]].tolist()
         if occupied:
             raise ValueError(
                 f"the cell {tuple(occupied[0])} is occupied; give free cells"
             )
-        backward = arguments.as_flag("backward", backward)
         reached = np.zeros(self.occupancy.shape, dtype=np.bool_)
-        reached[array[:, 1], array[:, 0]] = True
-        waiting, first = np.empty(reached.size, np.int64), np.flatnonzero(reached)
-        waiting[: first.size] = first  # each cell waits at most once
-        flood(self.layers(move_rule), backward, reached, waiting, first.size)
+        reached[y, x] = True
+        first = np.flatnonzero(reached)
+        waiting = np.empty(reached.size, np.int64)  # each cell waits at most once
+        waiting[: first.size] = first
+        flood(self.layers(move_rule), is_backward, reached, waiting, first.size)
         return reached
 
     @cached_property
     def _history(self) -> History:
-        return History(object(), ((object(), ORIGIN),))
+        return History(lineage=object(), versions=(Version(object(), ORIGIN),))
 
     @cached_property
     def fingerprint(self) -> str:
@@ -402,14 +389,15 @@ class GridMap:
         digest = hashlib.sha256(f"{self.height}x{self.width}:".encode())
         digest.update(np.packbits(self.occupancy).tobytes())
         for name in LAYERS[1:]:
-            if (layer := getattr(self, name)) is not None:
+            layer = getattr(self, name)
+            if layer is not None:
                 digest.update(b"" if name == "cost" else f"{name}:".encode())
                 digest.update(layer.tobytes())
         return digest.hexdigest()[:16]
 
     @cached_property
     def _sums(self) -> tuple[int, int, float]:
-        """Of occupancy, costs and some slowness: other in most maps, and quicker to compare."""
+        """Sums of layers: they differ in most maps that differ, and compare quickly."""
         slowness = 0.0 if self.slowness is None else float(self.slowness[::16].sum())
         cost = 0 if self.cost is None else _sum_of_words(self.cost)
         return _sum_of_words(self.occupancy), cost, slowness
@@ -422,16 +410,21 @@ class GridMap:
             return not any(self.differs(other, box).any() for box in reversed(boxes))
         if self._sums != other._sums:
             return False
-        layers = ((getattr(self, name), getattr(other, name)) for name in LAYERS)
-        return all(mine is its or np.array_equal(mine, its) for mine, its in layers)
+        for name in LAYERS:
+            layer = getattr(self, name)
+            other_layer = getattr(other, name)
+            if layer is not other_layer and not np.array_equal(layer, other_layer):
+                return False
+        return True
 
     def differs(self, other: GridMap, box: Box) -> NDArray[np.bool_]:
-        """Return which cells of a box differ from those of a map of the same size and layers."""
+        """Return which cells of a box differ from a map of the same size and layers."""
         differs: NDArray[np.bool_] = self.occupancy[box] != other.occupancy[box]
-        for layer in LAYERS[1:]:
-            mine, its = getattr(self, layer), getattr(other, layer)
-            if mine is not its:
-                differs |= mine[box] != its[box]
+        for name in LAYERS[1:]:
+            layer = getattr(self, name)
+            other_layer = getattr(other, name)
+            if layer is not other_layer:
+                differs |= layer[box] != other_layer[box]
         return differs
 
     def contains(self, cell: Cell) -> bool:
@@ -484,12 +477,34 @@ class GridMap:
         )
 
 
-class History(NamedTuple):
-    """Which patches made a map of others. Objects tell maps apart: a copy's are others."""
+class Version(NamedTuple):
+    """A map among those that patches made of one map."""
 
-    lineage: object  # that of all maps which patches made of one
-    # The last versions, the map's own at the end, and the box that differs from the one before.
-    versions: tuple[tuple[object, Box], ...]
+    identity: object  # an object tells maps apart: that of a copied map is another one
+    box: Box  # where it differs from the version before it
+
+
+class History(NamedTuple):
+    """The patches that made a map of other maps."""
+
+    lineage: object  # that of all maps which patches made of one map
+    versions: tuple[Version, ...]  # the last ones, and at the end the map's own
+
+    def with_patch(self, box: Box) -> History:
+        """Return the history of the map with one more patch."""
+        last_versions = self.versions[-MAX_PATCHES:]
+        return History(self.lineage, (*last_versions, Version(object(), box)))
+
+    def patches_since(self, older: History) -> list[Box] | None:
+        """Return the boxes that were replaced since an older map; None for others."""
+        if self.lineage is not older.lineage:
+            return None
+        identities = [version.identity for version in self.versions]
+        older_identity = older.versions[-1].identity
+        if older_identity not in identities:
+            return None
+        newer_versions = self.versions[identities.index(older_identity) + 1 :]
+        return [version.box for version in newer_versions]
 
 
 class Exploration(NamedTuple):
@@ -500,8 +515,17 @@ class Exploration(NamedTuple):
     safe: GridMap  # by the share at most, so that each plan keeps it
 
 
-def _sum_of_words(layer: NDArray[Any]) -> int:
-    """Return the sum of an array's words of 64 bits, which is quicker than that of its bytes."""
+def _replaced_if_any(
+    layer: Occupancy | None, box: Box, values: Occupancy
+) -> Occupancy | None:
+    return None if layer is None else replaced(layer, box, values)
+
+
+def _sum_of_words(layer: Occupancy | NDArray[np.int8]) -> int:
+    """Return the sum of an array's words of 64 bits, and of the bytes that are left.
+
+    It is quicker than the sum of all bytes.
+    """
     octets = layer.ravel().view(np.uint8)
     words = octets[: octets.size // 8 * 8].view(np.uint64)
     return int(words.sum()) + int(octets[words.nbytes :].sum())
@@ -516,26 +540,47 @@ def check_grid(grid: object, name: str = "grid") -> None:
 def _check_place(
     origin: tuple[float, float, float], resolution: float, shape: tuple[int, ...]
 ) -> None:
-    """Raise a ValueError for a map so far away that float64 cannot tell its cells apart."""
+    """Raise a ValueError where float64 cannot tell the cells of a map apart."""
     x, y, yaw = origin
-    farthest = MAX_CELLS_AWAY * resolution
-    if math.hypot(x, y) + math.hypot(*shape) * resolution > farthest:
+    max_distance = MAX_CELLS_AWAY * resolution
+    if math.hypot(x, y) + math.hypot(*shape) * resolution > max_distance:
         problem = (
             f"origin is {origin}, where cells of {resolution:g} m cannot be told apart"
         )
-        raise ValueError(f"{problem}; give x and y in metres, at most {farthest:.3g}")
+        remedy = f"give x and y in metres, at most {max_distance:.3g}"
+        raise ValueError(f"{problem}; {remedy}")
     if abs(yaw) > MAX_YAW:
         raise ValueError(
             f"origin is {origin}; give its yaw in radians, at most {MAX_YAW:g}"
         )
 
 
+def _check_occupied(cells: Occupancy, occupancy: Occupancy, problem: str) -> None:
+    """Raise a ValueError with a problem if some cells of a mask are free."""
+    if (cells & ~occupancy).any():
+        raise ValueError(f"{problem}; give some within the occupied cells")
+
+
+def _forbidden(
+    forbidden: ArrayLike, shape: tuple[int, ...]
+) -> NDArray[np.uint8] | None:
+    """Return a copy, or None if nothing is forbidden."""
+    bits = arguments.numbers("forbidden", forbidden, shape, between=(0, 255))
+    return bits.astype(np.uint8, order="C") if bits.any() else None
+
+
+def _slowness(slowness: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Return a copy."""
+    limits = 1, arguments.MAX_SLOWNESS
+    times = arguments.numbers("slowness", slowness, shape, "iuf", limits, whole=False)
+    return times.astype(np.float32, order="C")
+
+
 def _costs(cost: ArrayLike, occupancy: Occupancy) -> NDArray[np.int8]:
     """Return a copy with 0 in occupied cells."""
-    given = arguments.numbers("cost", cost, occupancy.shape)
-    # Whole numbers are multiplied, which takes a tenth of the time; others may be infinite.
-    of_free = (
-        np.where(occupancy, 0, given) if given.dtype.kind == "f" else given * ~occupancy
-    )
-    arguments.numbers("cost", of_free, between=(UNKNOWN, OCCUPIED - 1))
-    return of_free.astype(np.int8, order="C", copy=False)
+    costs = arguments.numbers("cost", cost, occupancy.shape)
+    is_whole = costs.dtype.kind != "f"
+    # A product takes a tenth of the time, but other numbers may be infinite.
+    costs_of_free = costs * ~occupancy if is_whole else np.where(occupancy, 0, costs)
+    arguments.numbers("cost", costs_of_free, between=(UNKNOWN, OCCUPIED - 1))
+    return costs_of_free.astype(np.int8, order="C", copy=False)

@@ -1,7 +1,7 @@
 """Inflation: which cells are too near to an obstacle, and which are better avoided."""
 
 import sys
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -71,80 +71,137 @@ def inflate(
     occupancy = grid.occupancy | (metres < robot_radius * (1 - ROUNDING))
     cost = grid.cost
     if clearance_weight > 0:
-        fall = 1 + np.maximum(metres - robot_radius, 0.0) / CLEARANCE_SCALE
-        share = clearance_weight / (fall * fall * fall)  # ** 3 takes 20 times as long
-        cost = np.rint((OCCUPIED - 1) * share).astype(np.int8)
+        cost = _clearance_costs(metres - robot_radius, clearance_weight)
         if grid.cost is not None:
             cost = np.where(grid.cost == UNKNOWN, UNKNOWN, np.maximum(cost, grid.cost))
-    cost = None if cost is None else cost * ~occupancy
-    layers = {"occupancy": occupancy, "cost": cost, "obstacles": grid.occupancy}
-    return grid.with_layers(**layers, body_radius=robot_radius)
+    return grid.with_layers(
+        occupancy=occupancy,
+        cost=None if cost is None else cost * ~occupancy,
+        obstacles=grid.occupancy,
+        body_radius=robot_radius,
+    )
+
+
+def _clearance_costs(
+    metres: NDArray[np.float64], clearance_weight: float
+) -> NDArray[np.int8]:
+    """Return the costs, (H, W), of cells at some distances beyond the body."""
+    fall = 1 + np.maximum(metres, 0.0) / CLEARANCE_SCALE
+    share = clearance_weight / (fall * fall * fall)  # ** 3 takes 20 times as long
+    return np.rint((OCCUPIED - 1) * share).astype(np.int8)
 
 
 def with_unknown_free(grid: GridMap) -> GridMap:
-    """Return a map as it might be if its unknown cells were free; its costs mean nothing."""
+    """Return a map as it might be if its unknown cells were free.
+
+    Its costs do not count the clearance anew.
+    """
     if grid.unknown is None:
         return grid
-    occupancy, obstacles = grid.occupancy & ~grid.unknown, None
-    if grid.obstacles is not None:
-        obstacles = grid.obstacles & ~grid.unknown
-        if (
-            grid.body_radius > 0
-        ):  # cells that were too near to unknown ones are free, too
+    occupancy = grid.occupancy & ~grid.unknown
+    obstacles = grid.obstacles
+    if obstacles is not None:
+        obstacles = obstacles & ~grid.unknown
+        # Cells that were only too near to unknown cells are free, too.
+        if grid.body_radius > 0:
             metres = clearance(obstacles) * grid.resolution
             occupancy = obstacles | (metres < grid.body_radius * (1 - ROUNDING))
-    cost = None if grid.cost is None else grid.cost * ~occupancy
-    layers = {"occupancy": occupancy, "cost": cost, "obstacles": obstacles}
-    return grid.with_layers(**layers, unknown=None)
+    return grid.with_layers(
+        occupancy=occupancy,
+        cost=None if grid.cost is None else grid.cost * ~occupancy,
+        obstacles=obstacles,
+        unknown=None,
+    )
+
+
+class Body(NamedTuple):
+    """A robot's body, as `inflate` takes it."""
+
+    robot_radius: float
+    clearance_weight: float
+
+
+class Inflated(NamedTuple):
+    """A map, and the same map inflated for a body."""
+
+    body: Body
+    grid: GridMap
+    inflated: GridMap
 
 
 class Inflation:
-    """Inflates maps as they come: of a map like the last one, only what is near changed cells."""
+    """Inflates one map after another, and only around cells that have changed."""
 
     def __init__(self) -> None:
-        self._last: tuple[Any, ...] = (None, None, None)  # body, map, inflated map
+        self._last: Inflated | None = None
 
     def __call__(
         self, grid: GridMap, robot_radius: float, clearance_weight: float
     ) -> GridMap:
-        """Return what `inflate` returns."""
-        body, (last_body, before, inflated) = (
-            (robot_radius, clearance_weight),
-            self._last,
-        )
-        boxes = grid.patches_since(before) if any(body) and body == last_body else None
-        near = None if boxes is None else _inflate_near(boxes, grid, inflated, body)
-        inflated = near or inflate(grid, *body)
-        self._last = body, grid, inflated
+        """Return the map that `inflate` returns."""
+        body = Body(robot_radius, clearance_weight)
+        inflated = self._from_last(grid, body) or inflate(grid, *body)
+        self._last = Inflated(body, grid, inflated)
         return inflated
 
+    def _from_last(self, grid: GridMap, body: Body) -> GridMap | None:
+        """Return the inflated map if it is the last one with patches, else None."""
+        last = self._last
+        if last is None or body != last.body or not any(body):
+            return None
+        boxes = grid.patches_since(last.grid)
+        if boxes is None:
+            return None
+        return _inflated_with_patches(boxes, grid, last.inflated, body)
 
-def _inflate_near(
-    boxes: list[Box], grid: GridMap, inflated: GridMap, body: tuple[float, float]
+
+def _inflated_with_patches(
+    boxes: list[Box], grid: GridMap, inflated: GridMap, body: Body
 ) -> GridMap:
-    """Return what `inflate` returns, given what it returned before boxes of the map changed."""
-    # Farther away than this, an obstacle has no effect: the cost that it adds is rounded to 0.
-    reach = (
-        body[0] + max(np.cbrt(2 * (OCCUPIED - 1) * body[1]) - 1, 0) * CLEARANCE_SCALE
-    )
-    cells, shape = int(reach / grid.resolution) + 2, grid.occupancy.shape
-    windows = sum(cells_in(wider(box, 2 * cells, shape)) for box in boxes)
-    if boxes and windows > cells_in(wider(hull(boxes), 2 * cells, shape)):
+    """Return the inflated map after boxes of the map have changed.
+
+    Parameters
+    ----------
+    boxes : list of Box
+        Where the map has changed.
+    grid : GridMap
+        The map as it is now.
+    inflated : GridMap
+        The inflated map before the change.
+    body : Body
+    """
+    reach = _reach_in_cells(body, grid.resolution)
+    shape = grid.occupancy.shape
+    cells_of_boxes = sum(cells_in(wider(box, 2 * reach, shape)) for box in boxes)
+    if boxes and cells_of_boxes > cells_in(wider(hull(boxes), 2 * reach, shape)):
         boxes = [hull(boxes)]
     for box in boxes:
-        near, window = wider(box, cells, shape), wider(box, 2 * cells, shape)
-        given = None if grid.cost is None else grid.cost[window]
-        part = inflate(
-            GridMap(grid.occupancy[window], grid.resolution, cost=given), *body
-        )
-        unknown = None if grid.unknown is None else grid.unknown[near]
-        in_part = within(near, window)
-        cost = None if part.cost is None else part.cost[in_part]
-        corner = near[1].start, near[0].start
+        changed = wider(box, reach, shape)  # cells that may be inflated otherwise
+        window = wider(box, 2 * reach, shape)  # with all obstacles that have an effect
+        part = _inflated_part(grid, window, body)
+        in_part = within(changed, window)
         inflated = inflated.with_patch(
-            part.occupancy[in_part], *corner, cost, grid.occupancy[near], unknown
+            part.occupancy[in_part],
+            x=changed.columns.start,
+            y=changed.rows.start,
+            cost=None if part.cost is None else part.cost[in_part],
+            obstacles=grid.occupancy[changed],
+            unknown=None if grid.unknown is None else grid.unknown[changed],
         )
     return inflated
+
+
+def _reach_in_cells(body: Body, resolution: float) -> int:
+    """Return the distance at which an obstacle has no effect: its cost is rounded to 0."""
+    largest_fall = np.cbrt(2 * (OCCUPIED - 1) * body.clearance_weight)
+    metres = body.robot_radius + max(largest_fall - 1, 0) * CLEARANCE_SCALE
+    return int(metres / resolution) + 2
+
+
+def _inflated_part(grid: GridMap, window: Box, body: Body) -> GridMap:
+    cost = None if grid.cost is None else grid.cost[window]
+    part = GridMap(grid.occupancy[window], grid.resolution, cost=cost)
+    return inflate(part, *body)
 
 
 def grid_from_costmap(
@@ -159,7 +216,7 @@ def grid_from_costmap(
         values, resolution, origin, INSCRIBED, allow_unknown, use_map_costs=True
     )
     assert grid.cost is not None
-    obstacles = grid.occupancy & (np.asarray(values) != INSCRIBED)
     return grid.with_layers(
-        cost=_COSTS.take(grid.cost, mode="wrap"), obstacles=obstacles
+        cost=_COSTS.take(grid.cost, mode="wrap"),
+        obstacles=grid.occupancy & (np.asarray(values) != INSCRIBED),
     )

@@ -1,6 +1,7 @@
 """What is random on a map: the paper's static noise (section 4.3), and costs and requests."""
 
-# The trained models and the documented figures depend on it: a seed must always give the same.
+# The trained models and the documented figures depend on it: a seed must always give
+# the same.
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -31,26 +32,26 @@ def scatter_obstacles(
     random: np.random.Generator,
     reach: int = 1,  # cells beside the path: section 5.3 can be read as 0 or 1
 ) -> tuple[GridMap, int]:
-    """Return the map with 1 to 5 obstacles more, which leave a path, and the rejected draws."""
+    """Return the map with 1 to 5 more obstacles, and the number of rejected draws.
+
+    The obstacles lie within `reach` cells of the path, and leave a path from its start
+    to its goal.
+    """
     check_grid(grid)
-    path = [as_cell(cell) for cell in listed(path, "the path", "give cells (x, y)")]
-    if not path:
+    cells = [as_cell(cell) for cell in listed(path, "the path", "give cells (x, y)")]
+    if not cells:
         raise ValueError("the path has no cells; give one of two or more")
-    move_rule, reach = MoveRule(move_rule), as_whole("reach", reach, 0, MAX_REACH)
-    start, goal, offsets = path[0], path[-1], range(-reach, reach + 1)
-    near = {(x + dx, y + dy) for x, y in path for dx in offsets for dy in offsets}
-    candidates = sorted(cell for cell in near - {start, goal} if grid.is_free(cell))
+    start = cells[0]
+    goal = cells[-1]
+    move_rule = MoveRule(move_rule)
+    reach = as_whole("reach", reach, 0, MAX_REACH)
+    candidates = _free_cells_beside(cells, reach, grid)
     if not candidates:
-        where = f"within {reach} cells of" if reach else "on"
-        problem = f"no free cell lies {where} the path from {start} to {goal}"
+        place = f"within {reach} cells of" if reach else "on"
+        problem = f"no free cell lies {place} the path from {start} to {goal}"
         raise ValueError(f"{problem}; give another path, or a greater reach")
     for rejected in range(MAX_TRIES):
-        count = min(int(random.integers(1, MAX_NEW_OBSTACLES + 1)), len(candidates))
-        occupancy = grid.occupancy.copy()
-        for index in random.choice(len(candidates), size=count, replace=False):
-            x, y = candidates[index]
-            occupancy[y, x] = True
-        noisy = replace(grid, occupancy=occupancy)
+        noisy = _with_obstacles(grid, candidates, random)
         if noisy.reachable([start], move_rule)[goal[1], goal[0]]:
             return noisy, rejected
     raise ValueError(
@@ -58,29 +59,57 @@ def scatter_obstacles(
     )
 
 
+def _free_cells_beside(path: Sequence[Cell], reach: int, grid: GridMap) -> list[Cell]:
+    """Return the free cells within a reach of a path, without its ends, sorted."""
+    offsets = range(-reach, reach + 1)
+    cells = {(x + dx, y + dy) for x, y in path for dx in offsets for dy in offsets}
+    cells -= {path[0], path[-1]}
+    return sorted(cell for cell in cells if grid.is_free(cell))
+
+
+def _with_obstacles(
+    grid: GridMap, candidates: Sequence[Cell], random: np.random.Generator
+) -> GridMap:
+    """Return the map with 1 to 5 of the candidates occupied."""
+    count = min(int(random.integers(1, MAX_NEW_OBSTACLES + 1)), len(candidates))
+    occupancy = grid.occupancy.copy()
+    for index in random.choice(len(candidates), size=count, replace=False):
+        x, y = candidates[index]
+        occupancy[y, x] = True
+    return replace(grid, occupancy=occupancy)
+
+
 def random_requests(
     occupancy: Occupancy, move_rule: MoveRule, count: int, random: np.random.Generator
 ) -> list[tuple[Cell, Cell]]:
-    """Draw starts, uniform over the cells with a move, and goals, uniform over those in reach."""
-    labels = GridMap(occupancy).labels(move_rule).ravel()
-    cells = np.argsort(labels, kind="stable")[np.count_nonzero(occupancy) :]
-    label_of_cell = labels[cells]
-    sizes = np.bincount(label_of_cell)
-    first_of_label = np.cumsum(sizes) - sizes
-    candidates = np.flatnonzero(sizes[label_of_cell] > 1)
+    """Draw starts and goals.
+
+    Starts are uniform over the cells with a move, goals over the cells that paths from
+    the start lead to, without the start.
+    """
+    label = GridMap(occupancy).labels(move_rule).ravel()  # (C,), 0 where occupied
+    # The free cells, with those of each component side by side.
+    cells = np.argsort(label, kind="stable")[np.count_nonzero(occupancy) :]
+    component = label[cells]
+    size_of_component = np.bincount(component)
+    first_of_component = np.cumsum(size_of_component) - size_of_component
+    candidates = np.flatnonzero(size_of_component[component] > 1)
     if not len(candidates):
         raise ValueError(
             "no two free cells of the map are joined; give a map with a path"
         )
-    starts = random.choice(candidates, count)
-    first, size = first_of_label[label_of_cell[starts]], sizes[label_of_cell[starts]]
-    # The goal is 1 to size - 1 cells further in the list of the component, which is a ring.
+    starts = random.choice(candidates, count)  # indices in `cells`
+    first = first_of_component[component[starts]]
+    size = size_of_component[component[starts]]
+    # The goal is 1 to size - 1 cells further in the component, which is a ring.
     goals = first + (starts - first + random.integers(1, size)) % size
-    y, x = np.divmod(cells[np.stack([starts, goals], axis=1)], occupancy.shape[1])
-    return [
-        ((sx, sy), (gx, gy))
-        for (sx, gx), (sy, gy) in zip(x.tolist(), y.tolist(), strict=True)
-    ]
+    width = occupancy.shape[1]
+    requests = []
+    for start, goal in zip(cells[starts].tolist(), cells[goals].tolist(), strict=True):
+        start_cell = (start % width, start // width)
+        goal_cell = (goal % width, goal // width)
+        requests.append((start_cell, goal_cell))
+    return requests
 
 
 def random_costs(occupancy: Occupancy, random: np.random.Generator) -> NDArray[np.int8]:

@@ -7,10 +7,8 @@ from numpy.typing import NDArray
 
 from ddqn_planner.grid.grid_map import GridMap
 
-SAME_YAW = 1e-6  # radians; a forbidden direction is one of the eight along the cells of its map
-ON_EDGE = (
-    1e-6  # cells: a centre so near to an edge lies beyond it, whatever rounding says
-)
+SAME_YAW = 1e-6  # radians: the directions of two maps are the same
+ON_EDGE = 1e-6  # cells: a centre so near to an edge lies beyond it, despite rounding
 
 Indices = NDArray[np.int64]
 
@@ -38,56 +36,89 @@ def forbidden_on(grid: GridMap, zones: GridMap) -> NDArray[np.uint8] | None:
     """
     if zones.forbidden is None:
         return None
-    yaw, yaw_of_zones = grid.origin[2], zones.origin[2]
+    yaw = grid.origin[2]
+    yaw_of_zones = zones.origin[2]
     if abs(math.remainder(yaw - yaw_of_zones, 2 * math.pi)) > SAME_YAW:
-        turned = (
+        problem = (
             f"the zones are turned by {yaw_of_zones:.6g} radians, the map by {yaw:.6g}"
         )
-        raise ValueError(f"{turned}; give both one yaw")
-    dx, dy = grid.origin[0] - zones.origin[0], grid.origin[1] - zones.origin[1]
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    # The corner of the map, in cells of the zones, and the side of its cells.
+        raise ValueError(f"{problem}; give both one yaw")
+    # The corner of the map in cells of the zones, and the side of its cells. The map's
+    # own yaw counts: the zones' may differ by rounding.
+    dx = grid.origin[0] - zones.origin[0]
+    dy = grid.origin[1] - zones.origin[1]
+    cos = math.cos(yaw)
+    sin = math.sin(yaw)
     corner_x = (cos * dx + sin * dy) / zones.resolution
     corner_y = (cos * dy - sin * dx) / zones.resolution
     side = grid.resolution / zones.resolution
-    forbidden = zones.forbidden
-    forbidden = _along_axis(forbidden, 1, corner_x, side, grid.width)
-    forbidden = _along_axis(forbidden, 0, corner_y, side, grid.height)
+    in_columns = _along_axis(zones.forbidden, 1, corner_x, side, grid.width)
+    forbidden = _along_axis(in_columns, 0, corner_y, side, grid.height)
     return forbidden if forbidden.any() else None
 
 
 def _along_axis(
     zones: NDArray[np.uint8], axis: int, corner: float, side: float, count: int
 ) -> NDArray[np.uint8]:
-    """Return the zones with other cells along one axis: so many, of a side, from a corner on."""
+    """Return the zones with other cells along one axis.
+
+    Parameters
+    ----------
+    zones : (H, W) uint8
+        As `GridMap.forbidden`.
+    axis : int
+        0 for the rows, 1 for the columns.
+    corner, side : float
+        Where the new cells begin, and how long they are, in cells of the zones.
+    count : int
+        The number of the new cells.
+    """
     shape = [*zones.shape]
     shape[axis] = count
     forbidden = np.zeros(shape, dtype=np.uint8)
-    by_axis = np.moveaxis(forbidden, axis, 0)
-    zones_by_axis = np.moveaxis(zones, axis, 0)
-    zone_count = len(zones_by_axis)
+    forbidden_by_cell = np.moveaxis(forbidden, axis, 0)
+    zones_by_cell = np.moveaxis(zones, axis, 0)
     if side < 1 - ON_EDGE:
-        zone, is_inside = _cells_of_centres(count, side, corner, zone_count)
-        by_axis[is_inside] = zones_by_axis[zone[is_inside]]
+        # Each new cell is smaller than a zone's: it takes that at its centre.
+        index, is_inside = _cells_of_centres(count, side, corner, len(zones_by_cell))
+        forbidden_by_cell[is_inside] = zones_by_cell[index[is_inside]]
         return forbidden
-    cell, is_inside = _cells_of_centres(zone_count, 1 / side, -corner / side, count)
+    # Each new cell takes all zones' cells whose centres lie in it.
+    index, is_inside = _cells_of_centres(
+        len(zones_by_cell), 1 / side, -corner / side, count
+    )
     if is_inside.any():
-        cells = cell[is_inside]
-        first = np.flatnonzero(
-            np.diff(cells, prepend=-1)
-        )  # of the zones in each of these cells
-        inside = zones_by_axis[is_inside]
-        by_axis[cells[first]] = np.bitwise_or.reduceat(inside, first, axis=0)
+        cells = index[is_inside]  # in ascending order
+        first_zone = np.flatnonzero(np.diff(cells, prepend=-1))  # in each new cell
+        zones_inside = zones_by_cell[is_inside]
+        joined = np.bitwise_or.reduceat(zones_inside, first_zone, axis=0)
+        forbidden_by_cell[cells[first_zone]] = joined
     return forbidden
 
 
 def _cells_of_centres(
-    number: int, side: float, corner: float, count: int
+    centres: int, side: float, corner: float, count: int
 ) -> tuple[Indices, NDArray[np.bool_]]:
-    """Return the cells in which a number of centres lie, and which of them lie in 0..count - 1."""
-    with np.errstate(
-        all="ignore"
-    ):  # a corner may be too far away for a number of cells
-        place = corner + (np.arange(number) + 0.5) * side + ON_EDGE
+    """Return the cells in which the centres of other cells lie.
+
+    Parameters
+    ----------
+    centres : int
+        The number N of the other cells.
+    side, corner : float
+        How long they are, and where they begin.
+    count : int
+        The number of cells.
+
+    Returns
+    -------
+    (N,) int64
+        The cell of each centre, 0 for those outside.
+    (N,) bool
+        Whether it is one of the cells 0 to `count` - 1.
+    """
+    # A corner may be too far away for a number of cells.
+    with np.errstate(all="ignore"):
+        place = corner + (np.arange(centres) + 0.5) * side + ON_EDGE
     is_inside = (place >= 0) & (place < count)
     return np.where(is_inside, place, 0).astype(np.int64), is_inside

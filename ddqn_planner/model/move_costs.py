@@ -112,7 +112,8 @@ class MoveCosts(NamedTuple):
                     )
                     new = new[within(around, seen, 1)]
                     layer = replaced(layer, within(around, ORIGIN, 1), new)
-                    after = after._replace(**{name: layer.ravel()})
+                    changed: dict[str, Any] = {name: layer.ravel()}
+                    after = after._replace(**changed)
         return after
 
     def on(

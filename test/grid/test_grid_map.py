@@ -484,7 +484,7 @@ def test_maps_that_are_patched_or_kept_leave_files_for_others() -> None:
         grid = grid.with_patch([[step % 2]], step % 20, step // 20 % 20)
         if step % 5 == 0:
             kept.append(grid)
-    assert open_files() - before <= 2 * copies.MOST_ALIVE
+    assert open_files() - before <= 2 * copies.MAX_ALIVE
     kept.clear()
     assert open_files() - before <= 4  # of this map: its occupancy and its costs
     del grid
