@@ -1,10 +1,11 @@
-"""Trains the prior: a small network that foretells from the map how slow places are."""
+"""Trains the prior: a small network that predicts from the map how slow places are."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import nn
+from numpy.typing import NDArray
+from torch import Tensor, nn
 
 from ddqn_planner.experience.posterior import cells_of
 from ddqn_planner.experience.prior import (
@@ -19,22 +20,21 @@ from ddqn_planner.grid.arguments import as_seed
 
 UNITS = 16
 RIDGE = 10.0  # the weight of so many places speaks against each linear prediction
-LEARNING_RATE, WEIGHT_DECAY = 0.01, 0.3
-STEPS, CHECKED = 60, 5  # at most so many; the held-out error is seen every so many
+LEARNING_RATE = 0.01
+WEIGHT_DECAY = 0.3
+STEPS = 60  # at most
+STEPS_PER_CHECK = 5  # of the error for the places that a network leaves out
 SMALLEST_SCALE = 0.1  # a feature that hardly varies tells nothing of maps where it does
-FOLDS = 6  # networks that each leave out a part of the places; one more learns from all
-BLOCKS, PLACES = (
-    12,
-    (8, 32),
-)  # near places are alike: so many in a row are left out together
-DOUBT = (
-    2.0  # what is foretold must be so many standard errors from nothing to be believed
-)
-REPLAYED = (
-    512  # places of older maps, and as many of this one, are kept to learn from again
-)
+FOLDS = 6  # networks that each leave out some places; another one learns from all
+# Places in a row are alike: so many blocks of them are left out together.
+BLOCKS = 12
+SMALLEST_BLOCK = 8  # places
+LARGEST_BLOCK = 32
+DOUBT = 2.0  # a prediction counts if it is so many standard errors from nothing
+REPLAYED = 512  # places of older maps, and as many of this one, to learn from again
 FEWEST_PLACES = 32  # from which a prior is learned
-MOST = 6.0  # weight of a place: those on every way do not govern all
+LARGEST_WEIGHT = 6.0  # of a place: those on every path do not govern all
+MIN_SUM = 1e-9  # in place of a sum of 0 that divides
 
 
 def prior_of(
@@ -49,7 +49,7 @@ def prior_of(
     weight, log = table[seen, :2].T
     features = map_features(grid)[y[seen], x[seen]]
     new = np.column_stack(
-        [table[seen, 5:], features, log / weight, np.minimum(weight, MOST)]
+        [table[seen, 5:], features, log / weight, np.minimum(weight, LARGEST_WEIGHT)]
     )
     return train_prior(new.astype(np.float32), older, seed)
 
@@ -57,97 +57,186 @@ def prior_of(
 def train_prior(new: Float32, older: Prior | None = None, seed: int = 0) -> Prior:
     """Train a prior on places, in rows as those of `Prior.replay`.
 
-    They come in the order in which they were first driven. How long to train, and how much to
-    believe the result, is what foretells places best that were left out: none of it, if none does.
-    On a new map an older prior stays as long as it foretells these places better. Later its places
-    are replayed, so that what it knew of other maps is not forgotten.
+    Networks that leave out some places tell how long to train, and how much of the
+    prediction to believe: none of it, if it does not predict the places left out.
+
+    Parameters
+    ----------
+    new
+        Places of one map, in the order in which they were first driven.
+    older
+        A prior whose places are replayed, so that it does not forget other maps. On a
+        new map it is returned itself as long as it predicts these places better.
     """
     random = np.random.default_rng(as_seed(seed))
-    old = new[:0] if older is None else older.replay
-    known = {row.tobytes() for row in new[:, :-2]}  # a later drive tells of them anew
-    old = old[[row.tobytes() not in known for row in old[:, :-2]]]
+    old = new[:0] if older is None else _without(older.replay, new)
     rows = np.concatenate([old, new])
-    x, target, weight = rows[:, 2:-2], rows[:, -2], rows[:, -1] / rows[:, -1].mean()
-    mean, scale = x.mean(axis=0), np.maximum(x.std(axis=0), SMALLEST_SCALE)
-    level = np.average(new[:, -2], weights=new[:, -1])
-    # Other maps may be slower as a whole: theirs is a level of its own.
+    features = rows[:, 2:-2]
+    weight = rows[:, -1] / rows[:, -1].mean()
+    mean = features.mean(axis=0)
+    scale = np.maximum(features.std(axis=0), SMALLEST_SCALE)
+    scaled = np.clip((features - mean) / scale, -UNUSUAL, UNUSUAL)
+    # Other maps may be slower as a whole: this column learns their level.
     is_old = (np.arange(len(rows)) < len(old)).astype(np.float32)
-    x = np.column_stack([np.clip((x - mean) / scale, -UNUSUAL, UNUSUAL), is_old])
-    target, block = (
-        target - level,
-        np.arange(len(rows)) // np.clip(len(rows) // BLOCKS, *PLACES),
+    level = np.average(new[:, -2], weights=new[:, -1])
+    target = rows[:, -2] - level  # log slowness
+    block_size = np.clip(len(rows) // BLOCKS, SMALLEST_BLOCK, LARGEST_BLOCK)
+    block = np.arange(len(rows)) // block_size
+    fold = random.permutation(block[-1] + 1)[block] % FOLDS
+    training = _train(
+        np.column_stack([scaled, is_old]),
+        target,
+        weight,
+        left_out=(fold == np.arange(FOLDS + 1)[:, None]).astype(np.float32),
+        seed=seed,
     )
-    left_out = (
-        random.permutation(block[-1] + 1)[block] % FOLDS
-        == np.arange(FOLDS + 1)[:, None]
-    )
-    foretold, trained = _train(
-        x, target, weight, left_out.astype(np.float32), seed=seed
-    )
-    fit, size = (
-        np.bincount(block, weight * foretold * one) for one in (target, foretold)
-    )
-    share = fit.sum() / max(size.sum(), 1e-9)
-    error = np.linalg.norm(fit - share * size) / max(size.sum(), 1e-9)
-    doubt = (
-        DOUBT * error / max(share * (1 - 2 / len(fit)), 1e-9)
-    )  # fewer blocks, greater errors
-    share = min(share, 1) * (1 - min(doubt, 1) ** 2)
-    if older is not None and len(old) == len(
-        older.replay
-    ):  # it has seen none of these places
-        own, others = (share * foretold)[len(old) :], older.log_slowness(new[:, 2:-2])
-        if _error(others, new) < _error(own, new):
+    share = _share_to_believe(block, weight, training.predicted, target)
+    # All places of the older prior are replayed only where none lies on this map.
+    is_new_map = older is not None and len(old) == len(older.replay)
+    if older is not None and is_new_map:
+        predicted = (share * training.predicted)[len(old) :]
+        error_of_older = _error(older.log_slowness(new[:, 2:-2]), new)
+        if error_of_older < _error(predicted, new):
             return older
-    direct, *layers, last = (array[-1].squeeze() for array in trained)
-    kept = [
-        part[np.sort(random.permutation(len(part))[:REPLAYED])] for part in (old, new)
-    ]
-    network = share * direct[:FEATURES], *layers, share * last, np.concatenate(kept)
+    replay = [_some_rows(old, random), _some_rows(new, random)]
+    # The last network leaves out no place.
+    direct, weights_1, bias_1, weights_2, bias_2, weights_3 = (
+        tensor[-1].numpy() for tensor in training.weights
+    )
+    arrays = {
+        "mean": mean,
+        "scale": scale,
+        "level": level,
+        "direct": share * direct[:FEATURES, 0],
+        "weights_1": weights_1,
+        "bias_1": bias_1[0],
+        "weights_2": weights_2,
+        "bias_2": bias_2[0],
+        "weights_3": share * weights_3[:, 0],
+        "replay": np.concatenate(replay),
+    }
     return Prior(
-        *(np.asarray(array, np.float32) for array in (mean, scale, level, *network))
+        **{name: np.asarray(array, np.float32) for name, array in arrays.items()}
     )
 
 
-def _error(foretold: Float32, places: Float32) -> float:
-    """Return how far off the log slowness of places is foretold, whatever their level."""
-    off, weight = places[:, -2] - foretold, places[:, -1]
-    return float(weight @ (off - np.average(off, weights=weight)) ** 2)
+def _without(old: Float32, new: Float32) -> Float32:
+    """Return the rows of places that no new row measures anew."""
+    measured = {place.tobytes() for place in new[:, :-2]}
+    is_other_place = [place.tobytes() not in measured for place in old[:, :-2]]
+    return old[is_other_place]
 
 
-def _train(*arrays: Float32, seed: int) -> tuple[Float32, list[Float32]]:
-    """Return what places left out are foretold, (N,), and the weights of all networks."""
-    x, target, weight, left_out = map(torch.from_numpy, arrays)
-    generator, networks = torch.Generator().manual_seed(seed), len(left_out)
-    layers = (FEATURES, UNITS), (1, UNITS), (UNITS, UNITS), (1, UNITS), (UNITS, 1)
-    sizes = (FEATURES + 1, 1), *layers
-    parameters = [torch.zeros(networks, *size) for size in sizes]
-    direct, weights_1, bias_1, weights_2, bias_2, weights_3 = parameters
-    for layer in weights_1, weights_2:
-        layer += (
-            torch.randn(layer.shape[1:], generator=generator) / layer.shape[1] ** 0.5
-        )
-    # The best linear prediction is where they begin; few steps then bend it.
-    learned = (1 - left_out) * weight
-    moments = torch.einsum("kn,ni,nj->kij", learned, x, torch.column_stack([x, target]))
-    penalty = RIDGE * torch.eye(FEATURES + 1)
-    direct += torch.linalg.solve(moments[..., :-1] + penalty, moments[..., -1:])
-    trained = [array.requires_grad_() for array in parameters]
-    optimiser = torch.optim.AdamW(trained, LEARNING_RATE, weight_decay=WEIGHT_DECAY)
-    learned = learned / learned.sum(dim=1, keepdim=True).clamp(min=1e-9)
-    x, least = x.expand(networks, -1, -1), float("inf")
+def _some_rows(rows: Float32, random: np.random.Generator) -> Float32:
+    """Return `REPLAYED` random rows at most, in their order."""
+    drawn = random.permutation(len(rows))[:REPLAYED]
+    return rows[np.sort(drawn)]
+
+
+def _share_to_believe(
+    block: NDArray[np.int64], weight: Float32, predicted: Float32, target: Float32
+) -> Any:
+    """Return by which share of it a prediction is the best one: 0 if that is in doubt."""
+    fit = np.bincount(block, weight * predicted * target)  # by block
+    size = np.bincount(block, weight * predicted * predicted)
+    total_size = max(size.sum(), MIN_SUM)
+    share = fit.sum() / total_size
+    standard_error = np.linalg.norm(fit - share * size) / total_size
+    # Of fewer blocks the errors are greater.
+    certain_share = max(share * (1 - 2 / len(fit)), MIN_SUM)
+    doubt = DOUBT * standard_error / certain_share
+    return min(share, 1) * (1 - min(doubt, 1) ** 2)
+
+
+def _error(predicted: Float32, places: Float32) -> float:
+    """Return the error of a predicted log slowness of places, whatever their level."""
+    weight = places[:, -1]
+    error = places[:, -2] - predicted
+    return float(weight @ (error - np.average(error, weights=weight)) ** 2)
+
+
+class _Weights(NamedTuple):
+    """The weights of K networks of `Prior`.
+
+    Their inputs are F features, and whether a place is one of other maps.
+    """
+
+    direct: Tensor  # (K, F + 1, 1)
+    weights_1: Tensor  # (K, F, UNITS)
+    bias_1: Tensor  # (K, 1, UNITS)
+    weights_2: Tensor  # (K, UNITS, UNITS)
+    bias_2: Tensor  # (K, 1, UNITS)
+    weights_3: Tensor  # (K, UNITS, 1)
+
+
+class _Training(NamedTuple):
+    """What `_train` returns, of the step with the least error."""
+
+    predicted: Float32  # (N,): the log slowness of each place, by networks without it
+    weights: _Weights
+
+
+def _train(
+    inputs: Float32, target: Float32, weight: Float32, left_out: Float32, seed: int
+) -> _Training:
+    """Train K networks on N places; network k leaves out those of row k, (K, N)."""
+    x_NI = torch.from_numpy(inputs)
+    target_N = torch.from_numpy(target)
+    weight_N = torch.from_numpy(weight)
+    left_out_KN = torch.from_numpy(left_out)
+    weight_KN = (1 - left_out_KN) * weight_N
+    weights = _initial_weights(x_NI, target_N, weight_KN, seed)
+    parameters = [tensor.requires_grad_() for tensor in weights]
+    optimiser = torch.optim.AdamW(parameters, LEARNING_RATE, weight_decay=WEIGHT_DECAY)
+    share_KN = weight_KN / weight_KN.sum(dim=1, keepdim=True).clamp(min=MIN_SUM)
+    x_KNI = x_NI.expand(len(left_out), -1, -1)
+    smallest_error = float("inf")
     for step in range(STEPS + 1):
-        hidden = torch.baddbmm(bias_1, x[..., :FEATURES], weights_1).tanh()
-        hidden = torch.baddbmm(bias_2, hidden, weights_2).tanh()
-        output = (x @ direct + hidden @ weights_3)[..., 0]
-        loss = nn.functional.huber_loss(
-            output, target.expand_as(output), reduction="none"
+        output_KN = _outputs(weights, x_KNI)
+        loss_KN = nn.functional.huber_loss(
+            output_KN, target_N.expand_as(output_KN), reduction="none"
         )
-        error = (loss * left_out * weight).sum().item()
-        if step % CHECKED == 0 and error < least:
-            least, foretold = error, (output * left_out).sum(dim=0).detach().numpy()
-            best = [array.detach().numpy().copy() for array in parameters]
+        error = (loss_KN * left_out_KN * weight_N).sum().item()
+        if step % STEPS_PER_CHECK == 0 and error < smallest_error:
+            smallest_error = error
+            predicted_N = (output_KN * left_out_KN).sum(dim=0).detach().numpy()
+            copies = [tensor.detach().clone() for tensor in parameters]
+            best = _Training(predicted_N, _Weights(*copies))
         optimiser.zero_grad()
-        (learned * loss).sum().backward()  # type: ignore[no-untyped-call]
+        (share_KN * loss_KN).sum().backward()  # type: ignore[no-untyped-call]
         optimiser.step()
-    return foretold, best
+    return best
+
+
+def _initial_weights(
+    x_NI: Tensor, target_N: Tensor, weight_KN: Tensor, seed: int
+) -> _Weights:
+    """Return networks that predict as well as linear ones can; few steps bend them."""
+    networks = len(weight_KN)
+    weights = _Weights(
+        direct=torch.zeros(networks, FEATURES + 1, 1),
+        weights_1=torch.zeros(networks, FEATURES, UNITS),
+        bias_1=torch.zeros(networks, 1, UNITS),
+        weights_2=torch.zeros(networks, UNITS, UNITS),
+        bias_2=torch.zeros(networks, 1, UNITS),
+        weights_3=torch.zeros(networks, UNITS, 1),
+    )
+    generator = torch.Generator().manual_seed(seed)
+    for layer in (weights.weights_1, weights.weights_2):
+        _, inputs, units = layer.shape
+        layer += torch.randn((inputs, units), generator=generator) / inputs**0.5
+    # The normal equations of a ridge regression.
+    x_and_target = torch.column_stack([x_NI, target_N])
+    moments = torch.einsum("kn,ni,nj->kij", weight_KN, x_NI, x_and_target)
+    penalty = RIDGE * torch.eye(FEATURES + 1)
+    direct = torch.linalg.solve(moments[..., :-1] + penalty, moments[..., -1:])
+    weights.direct.copy_(direct)
+    return weights
+
+
+def _outputs(weights: _Weights, x_KNI: Tensor) -> Tensor:
+    """Return what each network predicts of the places: (K, N)."""
+    features = x_KNI[..., :FEATURES]
+    first = torch.baddbmm(weights.bias_1, features, weights.weights_1).tanh()
+    second = torch.baddbmm(weights.bias_2, first, weights.weights_2).tanh()
+    return (x_KNI @ weights.direct + second @ weights.weights_3)[..., 0]
