@@ -48,8 +48,7 @@ def main() -> None:
 
 def positions(grid: GridMap, cells: NDArray[np.generic]) -> NDArray[np.float64]:
     """Return where places in cells (N, 2) lie, in metres."""
-    x, y = cells.T
-    return np.column_stack(grid.centres(x, y))
+    return grid.centres(cells)
 
 
 def distances(

@@ -1,4 +1,4 @@
-"""What the robot moves on: the grid map, the eight moves, shortest paths, map files and noise."""
+"""The grid map: its layers, moves, shortest paths, files, inflation and noise."""
 
 from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Cell
 from ddqn_planner.grid.grid_map import GridMap

@@ -1,4 +1,4 @@
-"""Checks of what users pass in: choices, numbers, cells, arrays. A wrong value is a ValueError."""
+"""Checks of arguments: choices, numbers, cells, arrays; wrong ones are ValueErrors."""
 
 from __future__ import annotations
 
@@ -27,7 +27,10 @@ POSITIVE = math.ulp(0.0), sys.float_info.max  # the range of finite numbers abov
 
 
 class _ByHash(EnumMeta):
-    """Finds the member of a value. Enum compares values without a hash, as arrays, one by one."""
+    """Finds the member of a value.
+
+    Enum compares values without a hash, as arrays, one by one.
+    """
 
     def __call__(cls, value: Any, *args: Any, **options: Any) -> Any:
         if not isinstance(value, Hashable):
@@ -47,12 +50,12 @@ class Choice(str, Enum, metaclass=_ByHash):
 
 
 def is_flag(value: Any) -> bool:
-    """Return whether a value is True or False, which Python counts as the numbers 1 and 0."""
+    """Return whether a value is True or False, which Python takes for 1 and 0."""
     return isinstance(value, (bool, np.bool_))
 
 
 def as_cell(cell: Any, name: str = "the cell") -> Cell:
-    """Return a pair of whole numbers of any type (a list, an array, ...) as Python ints."""
+    """Return a pair of whole numbers, as a list or an array, as Python ints."""
     try:
         if len(cell) == 2 and not any(map(is_flag, cell)):
             x, y = int(cell[0]), int(cell[1])
@@ -96,7 +99,10 @@ def listed(values: Any, name: str, remedy: str = "give a list") -> list[Any]:
 
 
 def real(value: Any) -> float:
-    """Return a number of any type as a float; NaN, which no range contains, for anything else."""
+    """Return a number of any type as a float.
+
+    Anything else becomes NaN, which no range contains.
+    """
     is_number = isinstance(value, Real) and not is_flag(value)
     try:
         return float(value) if is_number else math.nan
@@ -116,7 +122,7 @@ def as_number(
 
 
 def as_whole(name: str, value: Any, lowest: int, highest: int) -> int:
-    """Return a whole number from `lowest` to `highest`, of any type, as a Python int."""
+    """Return a whole number from `lowest` to `highest` as a Python int."""
     number = real(value)
     if lowest <= number <= highest and number.is_integer():
         return int(value)
@@ -126,7 +132,7 @@ def as_whole(name: str, value: Any, lowest: int, highest: int) -> int:
 
 
 def _short(value: Any) -> str:
-    """Return what an error shows of a value: its beginning and its end, if it is long."""
+    """Return the text of a value in an error: the beginning and end of a long one."""
     try:
         text = repr(value)
     except ValueError:  # Python writes no number of more than 4,300 digits
@@ -158,7 +164,7 @@ def numbers(
     whole: bool = True,
     remedy: str = "",
 ) -> NDArray[Any]:
-    """Return an array of one shape and of some kinds of numbers, or of those in a range."""
+    """Return an array of a shape, of some kinds of numbers, within a range."""
     try:
         array = np.asarray(values)
     except ValueError as error:  # rows of different lengths
@@ -193,7 +199,7 @@ def numbers(
 
 
 def _refuse_flags(name: str, values: ArrayLike) -> None:
-    """Refuse lists that hold True or False, which NumPy takes for 1 and 0 beside other numbers."""
+    """Refuse lists with True or False, which NumPy takes for 1 and 0 beside numbers."""
     elements = np.asarray(values, dtype=object).ravel().tolist()
     flag = next(filter(is_flag, elements), None)
     if flag is not None:

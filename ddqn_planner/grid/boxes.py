@@ -21,7 +21,7 @@ ORIGIN = Box(slice(0, 0), slice(0, 0))
 
 
 def boxes_of(is_set: NDArray[np.bool_], max_gap: int = MAX_GAP) -> list[Box]:
-    """Return at most `MAX_BOXES` boxes that hold all cells that are True, and few others."""
+    """Return at most `MAX_BOXES` boxes that hold all set cells, and few other cells."""
     boxes = []
     for rows in _runs(np.any(is_set, axis=1), max_gap):
         for columns in _runs(np.any(is_set[rows], axis=0), max_gap):

@@ -20,7 +20,7 @@ def flood(
     waiting: NDArray[np.int64],
     count: Any,
 ) -> None:  # pragma: no cover
-    """Mark all cells to which paths lead from the waiting cells, or backward, from which.
+    """Mark all cells to which paths lead from the waiting cells.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The grid map: which cells are occupied, what free cells cost, and where the map lies."""
+"""The grid map: which cells are occupied, what cells cost, and where the map lies."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import sys
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,6 +34,9 @@ from ddqn_planner.grid.layers import (
 )
 from ddqn_planner.grid.moves import MoveRule
 
+Float64 = NDArray[np.float64]
+Number = TypeVar("Number", float, Float64)
+
 LAYERS = ("occupancy", "cost", "forbidden", "slowness")  # on which its moves depend
 PATCHED = {"occupancy", "cost", "obstacles", "unknown"}  # layers that patches change
 RESOLUTIONS = 1e-6, 1e6
@@ -53,30 +56,38 @@ class GridMap:
     Parameters
     ----------
     occupancy : (H, W) bool
-        True where a cell is occupied. Row y = 0 is the first row of ``OccupancyGrid.data``.
+        True where a cell is occupied. Row y = 0 is the first row of
+        ``OccupancyGrid.data``.
     resolution : float
         Side of a cell in metres, 1e-6 to 1e6.
     origin : (float, float, float)
-        Pose of the corner of cell (0, 0) in the map frame, as in ``nav_msgs/MapMetaData``: x and y
-        in metres, at most 2^40 cells, and yaw in radians, counter-clockwise.
+        Pose of the corner of cell (0, 0) in the map frame, as in
+        ``nav_msgs/MapMetaData``: x and y in metres, at most 2^40 cells, and yaw in
+        radians, counter-clockwise.
     cost : (H, W) array of whole numbers, optional
-        Cost of each free cell: 0..99, or -1 for an unknown cell; see `cost_multiplier`. Values of
-        occupied cells are ignored and become 0. By default all free cells cost the same.
+        Cost of each free cell: 0..99, or -1 for an unknown cell; see `cost_multiplier`.
+        Values of occupied cells are ignored and become 0. By default all free cells
+        cost the same.
     obstacles : (H, W) bool, optional
-        Which occupied cells are obstacles, by default all. The others are only too near to an
-        obstacle for the robot's body, and a robot that starts there may leave; see `inflate`.
+        Which occupied cells are obstacles, by default all. The others are only too near
+        to an obstacle for the robot's body, and a robot that starts there may leave;
+        see `inflate`.
     forbidden : (H, W) array of whole numbers 0..255, optional
-        One-way zones: action a must not leave a cell where bit a is set, ``forbidden >> a & 1``.
-        The actions are those of `MOVES`, in the directions of the map's own x and y. A cell may
-        always be entered: with 56 (bits 3, 4 and 5: all moves with dx = -1) in each cell of an
-        aisle, a robot drives through it toward greater x only. Patches keep directions.
+        One-way zones: action a must not leave a cell where bit a is set, that is
+        ``forbidden >> a & 1``. The actions are those of `MOVES`, in the directions of
+        the map's own x and y. A cell may always be entered: with 56 (bits 3, 4 and 5,
+        all moves to smaller x) in each cell of an aisle, a robot drives through it
+        toward greater x only. Patches keep directions.
     slowness : (H, W) float32, optional
-        The expected time in each cell over that at nominal speed, 1 to 100; it multiplies the cost.
+        The expected time in each cell over that at nominal speed, 1 to 100; it
+        multiplies the cost.
     seconds_per_cell : float, optional
-        The time for the length of a cell at nominal speed: with it, `Plan.cost` is in seconds.
+        The time for the length of a cell at nominal speed: with it, `Plan.cost` is in
+        seconds.
     unknown : (H, W) bool, optional
-        Which occupied cells are occupied only because nothing is known of them, by default none.
-        Where they are the reason that a plan has no path, its reason says so.
+        Which occupied cells are occupied only because nothing is known of them, by
+        default none. Where they are the reason that a plan has no path, its reason says
+        so.
     body_radius : float
         Metres: cells nearer than this to an obstacle are occupied, too; see `inflate`.
     """
@@ -150,11 +161,13 @@ class GridMap:
         Parameters
         ----------
         values : (H, W) array of integers -128..127
-            Occupancy in percent. Any value below 0 is unknown, any above 100 is occupied.
+            Occupancy in percent. Any value below 0 is unknown, any above 100 is
+            occupied.
         resolution, origin, forbidden
             As for `GridMap`.
         occupied_threshold : int
-            A cell of this value or more is occupied, 1..100; map_server has 65 by default.
+            A cell of this value or more is occupied, 1..100; map_server has 65 by
+            default.
         allow_unknown : bool
             Whether unknown cells are free.
         use_map_costs : bool
@@ -187,7 +200,9 @@ class GridMap:
         obstacles: ArrayLike | None = None,
         unknown: ArrayLike | None = None,
     ) -> GridMap:
-        """Return the same map with other cells from (x, y) on; patch a map before you inflate it.
+        """Return the same map with other cells from (x, y) on.
+
+        Patch a map before you inflate it.
 
         Parameters
         ----------
@@ -196,13 +211,15 @@ class GridMap:
         x, y : int
             The cell of ``occupancy[0, 0]``.
         cost : (h, w) array of whole numbers, optional
-            Costs of the new free cells, as for `GridMap`. By default free cells keep their costs,
-            and those that were occupied cost 0. On a map without costs, the other cells cost 0.
+            Costs of the new free cells, as for `GridMap`. By default free cells keep
+            their costs, and those that were occupied cost 0. On a map without costs,
+            the other cells cost 0.
         obstacles : (h, w) bool, optional
-            Which of the new occupied cells are obstacles, as for `GridMap`; by default all. On a
-            map without obstacles of its own they are ignored.
+            Which of the new occupied cells are obstacles, as for `GridMap`; by default
+            all. On a map without obstacles of its own they are ignored.
         unknown : (h, w) bool, optional
-            Which of the new occupied cells are unknown, as for `GridMap`; by default none.
+            Which of the new occupied cells are unknown, as for `GridMap`; by default
+            none.
         """
         patch = arguments.as_mask("occupancy", occupancy)
         box = self._box_of_patch(x, y, patch.shape)
@@ -224,7 +241,7 @@ class GridMap:
         return patched
 
     def _box_of_patch(self, x: int, y: int, shape: tuple[int, ...]) -> Box:
-        """Return the rows and columns of a patch; ValueError if some are off the map."""
+        """Return the rows and columns of a patch; ValueError outside the map."""
         x, y = arguments.as_cell((x, y), "the first cell of the patch")
         height, width = shape
         has_columns = 0 <= x <= self.width - width
@@ -289,7 +306,7 @@ class GridMap:
         )
 
     def with_layers(self, **layers: object) -> GridMap:
-        """Return the same map with other layers, which are neither checked nor copied."""
+        """Return the map with other layers, which are neither checked nor copied."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         if layers.keys().isdisjoint(PATCHED):
             values["_history"] = self._history
@@ -315,7 +332,7 @@ class GridMap:
 
     @cached_property
     def cost_multiplier(self) -> NDArray[np.float32]:
-        """(H, W) float32: what a path costs per cell of its length: 1 to 5, times the slowness."""
+        """(H, W) float32: cost of a path per cell of length: 1 to 5, times slowness."""
         slowness = self.slowness
         if self.cost is None:
             if slowness is None:
@@ -328,11 +345,14 @@ class GridMap:
 
     @cached_property
     def exploration(self) -> Exploration | None:
-        """What plans may hope for, see `Experience.apply`; a map with other layers has none."""
+        """The optimistic maps, see `Experience.apply`; None if layers are replaced."""
         return None
 
     def labels(self, move_rule: MoveRule | str) -> NDArray[np.int32]:
-        """Return (H, W) int32: each free cell's component, from 1 on, whatever is forbidden."""
+        """Return each free cell's component, from 1 on: (H, W) int32.
+
+        Forbidden moves join cells, too.
+        """
         from scipy import ndimage
 
         # If a diagonal move needs both side cells free, two straight moves replace it.
@@ -342,7 +362,7 @@ class GridMap:
         return labels
 
     def legal_moves(self, move_rule: MoveRule | str) -> NDArray[np.bool_]:
-        """Return which moves are legal in each cell, see `legal_moves`: (8, H, W) bool."""
+        """Return which moves are legal, see `legal_moves`: (8, H, W) bool."""
         return legal_moves(self.occupancy, move_rule, self.forbidden)
 
     def layers(self, move_rule: MoveRule | str) -> Layers:
@@ -439,7 +459,10 @@ class GridMap:
         return self.contains((x, y)) and not self.occupancy[y, x]
 
     def is_obstacle(self, cell: Cell) -> bool:
-        """Return whether a cell is an obstacle, not just too near to one; ValueError if outside."""
+        """Return whether a cell is an obstacle, and not only too near to one.
+
+        A cell outside the map is a ValueError.
+        """
         x, y = arguments.cell_inside(cell, self.occupancy.shape)
         obstacles = self.occupancy if self.obstacles is None else self.obstacles
         return bool(obstacles[y, x])
@@ -449,32 +472,48 @@ class GridMap:
         return [(x, y) for y, x in np.argwhere(~self.occupancy).tolist()]
 
     def world_to_cell(self, x: float, y: float) -> Cell:
-        """Return the cell of a point, in metres; it owns its lower edges, and may lie outside."""
-        column, row = self.in_cells(arguments.real(x), arguments.real(y))
+        """Return the cell of a point in metres, which may lie outside the map.
+
+        A cell owns its lower edges.
+        """
+        column, row = self._from_metres(arguments.real(x), arguments.real(y))
         if not (math.isfinite(column) and math.isfinite(row)):
             raise ValueError(f"the point is {(x, y)}; give finite metres x, y")
         return math.floor(column), math.floor(row)
 
-    def in_cells(self, x: Any, y: Any) -> tuple[Any, Any]:
-        """Return a point in metres, or each of many (arrays), in cells from the map's corner."""
-        origin_x, origin_y, yaw = self.origin
-        dx, dy = x - origin_x, y - origin_y
-        column = (math.cos(yaw) * dx + math.sin(yaw) * dy) / self.resolution
-        row = (-math.sin(yaw) * dx + math.cos(yaw) * dy) / self.resolution
-        return column, row
+    def in_cells(self, points: Float64) -> Float64:
+        """Return points (..., 2) in metres in cells from the corner of cell (0, 0)."""
+        columns, rows = self._from_metres(points[..., 0], points[..., 1])
+        return np.stack([columns, rows], axis=-1)
 
     def cell_to_world(self, cell: Cell) -> tuple[float, float]:
         """Return the centre of a cell in the map frame, in metres."""
-        return self.centres(*arguments.as_cell(cell))
+        x, y = arguments.as_cell(cell)
+        return self._to_metres(x + 0.5, y + 0.5)
 
-    def centres(self, x: Any, y: Any) -> tuple[Any, Any]:
-        """Return the centre of a cell, or of each of many (arrays), in the map frame, in metres."""
+    def centres(self, cells: ArrayLike) -> Float64:
+        """Return the centres of cells (..., 2) in the map frame, in metres."""
+        middles: Float64 = np.asarray(cells) + 0.5
+        x, y = self._to_metres(middles[..., 0], middles[..., 1])
+        return np.stack([x, y], axis=-1)
+
+    def _from_metres(self, x: Number, y: Number) -> tuple[Number, Number]:
+        """Return the column and the row of a point; numbers, or arrays of them."""
         origin_x, origin_y, yaw = self.origin
-        along_x, along_y = (x + 0.5) * self.resolution, (y + 0.5) * self.resolution
-        return (
-            origin_x + math.cos(yaw) * along_x - math.sin(yaw) * along_y,
-            origin_y + math.sin(yaw) * along_x + math.cos(yaw) * along_y,
-        )
+        dx = x - origin_x
+        dy = y - origin_y
+        along_columns = math.cos(yaw) * dx + math.sin(yaw) * dy
+        along_rows = -math.sin(yaw) * dx + math.cos(yaw) * dy
+        return along_columns / self.resolution, along_rows / self.resolution
+
+    def _to_metres(self, column: Number, row: Number) -> tuple[Number, Number]:
+        """Return the point at a column and a row; numbers, or arrays of them."""
+        origin_x, origin_y, yaw = self.origin
+        along_columns = column * self.resolution
+        along_rows = row * self.resolution
+        x = origin_x + math.cos(yaw) * along_columns - math.sin(yaw) * along_rows
+        y = origin_y + math.sin(yaw) * along_columns + math.cos(yaw) * along_rows
+        return x, y
 
 
 class Version(NamedTuple):

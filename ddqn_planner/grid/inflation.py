@@ -13,22 +13,28 @@ from ddqn_planner.grid.layers import MAX_COST_MULTIPLIER
 
 # Linear and exponential costs, with paths as long, kept no clearly greater distances.
 CLEARANCE_SCALE = 1.0
-"""Metres s beyond the body over which costs fall to an eighth: as 1 / (1 + distance / s)^3."""
+"""Metres s beyond the body, over which costs fall to an eighth.
+
+They are proportional to 1 / (1 + distance / s)^3.
+"""
 
 ROUNDING = 1e-6  # a message has float32: 0.2 m must be 4 cells of 0.05 m, not 3.9999999
-INSCRIBED = 99  # the value of a free cell that is so near to an obstacle that the robot touches it
+INSCRIBED = 99  # the value of a free cell in which the robot touches an obstacle
 
 _COSTMAP_COST = 1 + (np.arange(INSCRIBED) - 1) * 251 / 97
-"""The smallest cost of a costmap, 1 to 252, that its publisher writes as each value, 1 to 98."""
+"""The smallest cost of a costmap, 1 to 252, that is published as value 1 to 98."""
 
 # Nav2's NavFn: 50 for a free cell plus 0.8 times the costmap's cost.
 _COSTS = np.rint(0.8 * _COSTMAP_COST / 50 / (MAX_COST_MULTIPLIER - 1) * OCCUPIED)
 _COSTS = np.append(_COSTS.clip(0, OCCUPIED - 1), UNKNOWN).astype(np.int8)
-"""(100,) int8: the cost in a `GridMap` of each value, 0 to 98, and last of an unknown cell, -1."""
+"""(100,) int8: the cost in a `GridMap` of each value, 0 to 98, and of unknown cells."""
 
 
 def clearance(obstacles: Occupancy) -> NDArray[np.float64]:
-    """Return (H, W) float64: cells from each centre to the nearest obstacle's; inf without any."""
+    """Return the distance of each cell to the nearest obstacle: (H, W) float64.
+
+    In cells, between centres; infinite without obstacles.
+    """
     obstacles = as_mask("obstacles", obstacles)
     if not obstacles.any():
         return np.full(obstacles.shape, np.inf)
@@ -41,7 +47,7 @@ def clearance(obstacles: Occupancy) -> NDArray[np.float64]:
 def inflate(
     grid: GridMap, robot_radius: float, clearance_weight: float = 0.0
 ) -> GridMap:
-    """Return the map for a robot with a body: cells too near to an obstacle become occupied.
+    """Return the map for a robot with a body: cells near obstacles become occupied.
 
     Distances are measured between the centres of cells, as in Nav2's inflation layer.
 
@@ -50,11 +56,12 @@ def inflate(
     grid : GridMap
         Its occupied cells become the obstacles of the new map.
     robot_radius : float
-        In metres, finite and >= 0: cells nearer than this to an obstacle become occupied.
+        In metres, finite and >= 0: cells nearer than this to an obstacle become
+        occupied.
     clearance_weight : float
-        0..1: cost of a free cell next to an obstacle, as a share of the greatest cost. It falls
-        with the distance, see `CLEARANCE_SCALE`. Where a cell already has a cost, the greater one
-        counts. Costs never make a path impossible.
+        0..1: cost of a free cell next to an obstacle, as a share of the greatest cost.
+        It falls with the distance, see `CLEARANCE_SCALE`. Where a cell already has a
+        cost, the greater one counts. Costs never make a path impossible.
 
     Raises
     ------
@@ -192,7 +199,7 @@ def _inflated_with_patches(
 
 
 def _reach_in_cells(body: Body, resolution: float) -> int:
-    """Return the distance at which an obstacle has no effect: its cost is rounded to 0."""
+    """Return the distance from which on an obstacle's cost is rounded to 0."""
     largest_fall = np.cbrt(2 * (OCCUPIED - 1) * body.clearance_weight)
     metres = body.robot_radius + max(largest_fall - 1, 0) * CLEARANCE_SCALE
     return int(metres / resolution) + 2
@@ -211,7 +218,8 @@ def grid_from_costmap(
     allow_unknown: bool = False,
 ) -> GridMap:
     """Make a grid map from a costmap that Nav2 publishes as an ``OccupancyGrid``."""
-    # A robot that starts in an inscribed cell may leave: such cells are occupied, no obstacles.
+    # A robot that starts in an inscribed cell may leave: such cells are occupied, but
+    # no obstacles.
     grid = GridMap.from_occupancy_values(
         values, resolution, origin, INSCRIBED, allow_unknown, use_map_costs=True
     )

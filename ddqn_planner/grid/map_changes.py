@@ -21,8 +21,8 @@ CHANGED_SHARE = 0.02
 def shift_between(old: GridMap, new: GridMap) -> Cell | None:
     """Return the cell of a newer map in which cell (0, 0) of an older map lies.
 
-    It may lie outside the newer map. None if the maps have different layers, or if their
-    cells do not coincide.
+    It may lie outside the newer map. None if the maps have different layers, or if
+    their cells do not coincide.
     """
     for layer in LAYERS:
         if (getattr(old, layer) is None) != (getattr(new, layer) is None):
@@ -76,7 +76,7 @@ def changed_cells(
 def _cells_where(
     differs_in: Callable[[Box], NDArray[np.bool_]], boxes: list[Box], max_changes: float
 ) -> Cells | None:
-    """Return the cells of boxes that differ; None if there are more than `max_changes`."""
+    """Return the cells of boxes that differ; None for more than `max_changes`."""
     parts = [np.empty((0, 2), np.int64)]
     changes = 0
     for box in boxes:

@@ -39,7 +39,8 @@ KEYS = {
     "mode",
 }
 
-# In other layouts Pillow drops bits, or map_server takes the fourth byte of a pixel as its opacity.
+# In other layouts Pillow drops bits, or map_server takes the fourth byte of a pixel as
+# its opacity.
 LAYOUTS = {"1", "1;I", "L", "L;2", "L;4", "LA", "I;16B", "P", "P;1", "P;2", "P;4"}
 LAYOUTS |= {"RGB", "RGBA", "BGR", "BGRA", "CMYK;I"}
 """Pillow's names of the pixel layouts in files that it reads as map_server does."""
@@ -71,8 +72,9 @@ class MapMetadataError(MapFileError):
 class MapFile:
     """The content of a map file; a value out of its range is a ValueError."""
 
-    # Percent 0..100, or -1 where unknown. Row 0 is the bottom row of a ROS map's image, but the
-    # first row of a MovingAI file, so that x and y of its scenario files are valid.
+    # Percent 0..100, or -1 where unknown. Row 0 is the bottom row of a ROS map's image,
+    # but the first row of a MovingAI file, so that x and y of its scenario files are
+    # valid.
     values: NDArray[np.int8]
     resolution: float = 1.0
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -104,7 +106,7 @@ class MapFile:
         allow_unknown: bool = False,
         use_map_costs: bool = False,
     ) -> GridMap:
-        """Return the grid map; for the parameters see `GridMap.from_occupancy_values`."""
+        """Return the grid map; for parameters see `GridMap.from_occupancy_values`."""
         options = (occupied_threshold, allow_unknown, use_map_costs, self.forbidden)
         return GridMap.from_occupancy_values(
             self.values, self.resolution, self.origin, *options
@@ -119,19 +121,24 @@ def load_map(
 ) -> GridMap:
     """Read a ROS map (.yaml or .yml) or a map of the MovingAI benchmark (.map).
 
-    A ROS map is read as Nav2's map_server 1.3.7 and later reads it, with these differences:
+    A ROS map is read as Nav2's map_server 1.3.7 and later reads it, with these
+    differences:
 
-    - Images that Pillow reads differently from map_server are refused: colours of 16 bits, PPM and
-      PGM whose greatest value is not 255 (or 65535 for grey), BMP of 16 or 32 bits without an alpha
-      channel, and PNG with a transparent colour outside a palette.
-    - The YAML may hold ``ddqn_planner: {start: [x, y], goal: [x, y], directions: FILE}``: the cells
-      of a scenario, and an image of the same size in 8-bit grey (PGM or PNG), whose values are
-      those of `GridMap.forbidden`: 0, black, where all moves are legal. map_server ignores it.
+    - Images that Pillow reads differently from map_server are refused: colours of 16
+      bits, PPM and PGM whose greatest value is not 255 (or 65535 for grey), BMP of 16
+      or 32 bits without an alpha channel, and PNG with a transparent colour outside a
+      palette.
+    - The YAML may hold
+      ``ddqn_planner: {start: [x, y], goal: [x, y], directions: FILE}``: the cells of a
+      scenario, and an image of the same size in 8-bit grey (PGM or PNG), whose values
+      are those of `GridMap.forbidden`: 0, black, where all moves are legal. map_server
+      ignores it.
 
     Parameters
     ----------
     path : str or Path
-        A file, whose leading ``~`` stands for the home folder, or the name of a shipped map.
+        A file, whose leading ``~`` stands for the home folder, or the name of a shipped
+        map.
     occupied_threshold, allow_unknown, use_map_costs
         As for `GridMap.from_occupancy_values`.
 
@@ -154,8 +161,9 @@ def load_map(
 def read_map_file(path: str | Path, only_below: bool = False) -> MapFile:
     """Read all that a map file holds; see `load_map` for the path and the errors.
 
-    With `only_below` its images must lie in the folder of the YAML file or below it, so that a
-    path from elsewhere, as in a service's request, cannot show any file of this machine.
+    With `only_below` its images must lie in the folder of the YAML file or below it, so
+    that a path from elsewhere, as in a service's request, cannot show any file of this
+    machine.
     """
     try:
         path = as_path(path)
@@ -285,7 +293,8 @@ def _image_path(
 
 
 def _is_below(file: Path, path: Path) -> bool:
-    # In a linked colcon workspace the YAML file is itself a link: allow the folder of either.
+    # In a linked colcon workspace the YAML file is itself a link: allow the folder of
+    # either.
     folders = path.parent.resolve(), path.resolve().parent
     return any(file.resolve().is_relative_to(folder) for folder in folders)
 
@@ -321,15 +330,17 @@ def _read_image(
 
 
 def _check_layout(image: Any, layouts: set[str]) -> None:
-    """Raise a ValueError for an image that is too large, or of other layouts than these."""
+    """Raise a ValueError for an image that is too large, or of another layout."""
     if image.width * image.height > MAX_CELLS:
         raise ValueError(f"{image.width} x {image.height} pixels")
     codec, *_, arguments = image.tile[0]
     layout, *rest = [arguments] if isinstance(arguments, str) else arguments
-    # The last argument of a PPM is its greatest value, unless that is the greatest of its bytes.
+    # The last argument of a PPM is its greatest value, unless that is the greatest of
+    # its bytes.
     greatest = 65535 if image.mode == "I" else 255
     if codec.startswith("ppm") and rest not in ([], [greatest]):
-        right = "255, or 65535 for grey"  # versions of map_server disagree on what others mean
+        # Versions of map_server disagree on the meaning of other greatest values.
+        right = "255, or 65535 for grey"
         raise ValueError(
             f"its greatest value is {rest[0]}; give {right}, or an 8-bit grey PNG"
         )
@@ -344,7 +355,10 @@ def _check_layout(image: Any, layouts: set[str]) -> None:
 
 
 def _grey(image: Any) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Return map_server's grey values (16-bit Rec. 601 luma), and which pixels are not opaque."""
+    """Return map_server's grey values, and which pixels are not opaque.
+
+    The values are 16-bit Rec. 601 luma.
+    """
     if image.mode.startswith("I"):
         grey = np.asarray(image) // 257
     elif image.mode in ("1", "L", "LA"):
@@ -361,7 +375,7 @@ def _grey(image: Any) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
 
 
 def _value(document: dict[str, Any], key: str) -> Any:
-    """Return the value of a key; a ValueError for a missing one names one that looks like it."""
+    """Return the value of a key; a ValueError names a key that looks like it."""
     if key in document:
         return document[key]
     near = difflib.get_close_matches(key, document.keys() - KEYS, 1)
@@ -377,7 +391,7 @@ def _choice(document: dict[str, Any], key: str, choices: Sequence[str]) -> str:
 
 
 def _numbers(document: dict[str, Any], key: str) -> Any:
-    """Return a number, or a list of them; whoever takes them checks how many there are."""
+    """Return a number or a list of numbers, of any length."""
     value = _value(document, key)
     try:
         return [*map(as_float, value)] if isinstance(value, list) else as_float(value)

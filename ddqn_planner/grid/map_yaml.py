@@ -44,9 +44,13 @@ NO: Final = ("n", "no", "false", "off")
 
 
 class _Loader(yaml.BaseLoader):
-    """Reads each scalar as text. It knows no tags and no merge keys, so that nothing can run."""
+    """Reads each scalar as text.
 
-    # PyYAML allows tabs within scalars and comments only, and takes the last of equal keys.
+    It knows no tags and no merge keys, so that no code can run.
+    """
+
+    # PyYAML allows tabs within scalars and comments only, and takes the last of equal
+    # keys.
 
     def check_printable(self, data: Any) -> None:
         """Accept each character: most that are not printable stand in comments."""
@@ -96,7 +100,8 @@ class _Loader(yaml.BaseLoader):
 def read_yaml(content: bytes) -> Any:
     """Return the first document of a YAML file: text, lists and dictionaries.
 
-    Bytes that are no UTF-8 are kept as `os.fsdecode` keeps them; a ValueError says what is no YAML.
+    Bytes that are no UTF-8 are kept as `os.fsdecode` keeps them; a ValueError says what
+    is no YAML.
     """
     text = _decoded(content).translate(NOT_SPECIAL)
     begin = DIRECTIVES.match(text)
@@ -138,7 +143,10 @@ def as_float(text: Any) -> float:
 
 
 def as_truth(text: Any) -> bool:
-    """Return whether a scalar is a whole number but 0, or a word for yes; else a ValueError."""
+    """Return whether a scalar is true: a whole number except 0, or a word for yes.
+
+    A scalar that is neither true nor false is a ValueError.
+    """
     if isinstance(text, str):
         if whole := INTEGER.fullmatch(text):
             sign, hexadecimal, octal, decimal = whole.groups()

@@ -15,7 +15,7 @@ MOVES: NDArray[np.int64] = np.array(
     [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)],
     dtype=np.int64,
 )
-"""(8, 2) int64: (dx, dy) of each action, counter-clockwise; action k points at k * pi / 4."""
+"""(8, 2) int64: (dx, dy) of each action; action k points at the angle k * pi / 4."""
 
 LENGTHS: NDArray[np.float64] = np.hypot(MOVES[:, 0], MOVES[:, 1])
 """(8,) float64: the length of each action in cells, 1 or sqrt(2)."""
@@ -31,12 +31,12 @@ BIT_OF_STEP = (1 << ACTION_OF_STEP).astype(np.uint8)
 
 
 class MoveRule(Choice):
-    """Which diagonal moves are legal. A move to an occupied cell or off the map never is."""
+    """Which diagonal moves are legal between free cells of the map."""
 
     ROBOT_SAFE = "robot_safe"
-    """A diagonal move needs both side cells free (the rule of the MovingAI benchmark)."""
+    """A diagonal move needs both side cells free, as in the MovingAI benchmark."""
     CORNER_CUTTING = "corner_cutting"
-    """A diagonal move needs only its target cell free (the paper's length 22.97 implies it)."""
+    """A diagonal move needs its target cell free; by it the paper's length is 22.97."""
 
     @property
     def cuts_corners(self) -> bool:

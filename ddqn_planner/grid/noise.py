@@ -1,4 +1,4 @@
-"""What is random on a map: the paper's static noise (section 4.3), and costs and requests."""
+"""Random obstacles (the paper's static noise, section 4.3), costs and requests."""
 
 # The trained models and the documented figures depend on it: a seed must always give
 # the same.
@@ -120,6 +120,6 @@ def random_costs(occupancy: Occupancy, random: np.random.Generator) -> NDArray[n
 def unknown_costs(
     occupancy: Occupancy, share: float, random: np.random.Generator
 ) -> NDArray[np.int8]:
-    """Draw (H, W) costs: each free cell is `UNKNOWN` with probability `share`, otherwise 0."""
+    """Draw (H, W) costs: a free cell is `UNKNOWN` with probability `share`, else 0."""
     unknown = (random.random(occupancy.shape) < share) & ~occupancy
     return np.where(unknown, UNKNOWN, 0).astype(np.int8)

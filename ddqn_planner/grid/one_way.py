@@ -25,9 +25,10 @@ def forbidden_on(grid: GridMap, zones: GridMap) -> NDArray[np.uint8] | None:
     Returns
     -------
     (H, W) uint8 or None
-        As `GridMap.forbidden`. A cell of ``grid`` forbids what the zone at its centre forbids; a
-        cell as large as those of ``zones``, or larger, forbids what any zone's cell forbids whose
-        centre lies in it, so that no zone is lost. None if the zones forbid nothing on the map.
+        As `GridMap.forbidden`. A cell of ``grid`` forbids what the zone at its centre
+        forbids; a cell as large as those of ``zones``, or larger, forbids what any
+        zone's cell forbids whose centre lies in it, so that no zone is lost. None if
+        the zones forbid nothing on the map.
 
     Raises
     ------

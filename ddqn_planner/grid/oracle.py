@@ -16,7 +16,7 @@ from ddqn_planner.grid.moves import MOVES, MoveRule
 def shortest_distances(
     grid: GridMap, goal: Cell, move_rule: MoveRule | str
 ) -> NDArray[np.float64]:
-    """Return (H, W) float64: the exact least cost of a path to the goal, inf without one."""
+    """Return the least cost of a path to the goal: (H, W) float64, inf without one."""
     distance = _shortest_paths(grid, goal, move_rule).distance
     return distance.reshape(grid.height, grid.width)
 
@@ -24,7 +24,7 @@ def shortest_distances(
 def shortest_path(
     grid: GridMap, start: Cell, goal: Cell, move_rule: MoveRule | str
 ) -> list[Cell]:
-    """Return the cells of one cheapest path, from start to goal; empty if there is none."""
+    """Return the cells of a cheapest path, from start to goal; empty without one."""
     start = cell_inside(start, grid.occupancy.shape, "the start")
     goal = cell_inside(goal, grid.occupancy.shape, "the goal")
     next_cell = _shortest_paths(grid, goal, move_rule).next_cell

@@ -28,7 +28,7 @@ class Rotation(NamedTuple):
 
     @property
     def yaw(self) -> float:
-        """The heading of the turned x axis in the plane, radians; of any norm above 0."""
+        """The heading of the turned x axis in the plane, radians, for any norm > 0."""
         ahead = self.w**2 + self.x**2 - self.y**2 - self.z**2
         aside = 2 * (self.x * self.y + self.w * self.z)
         return math.atan2(aside, ahead)

@@ -175,8 +175,7 @@ def along(points: Float64, spacing: float = math.inf) -> tuple[Float64, Float64]
 
 def centres(cells: Cells, grid: GridMap) -> Float64:
     """Return the centres of cells in metres, (N, 2)."""
-    x, y = np.asarray(cells, dtype=np.float64).reshape(-1, 2).T
-    return np.column_stack(grid.centres(x, y))
+    return grid.centres(np.asarray(cells, dtype=np.float64).reshape(-1, 2))
 
 
 def frame_of(path: Path) -> str:

@@ -147,11 +147,10 @@ class MapServerNode(BaseNode):
             return False, str(error)
         new = noisy.occupancy & ~grid.occupancy
         self._serve(np.where(new, np.int8(OCCUPIED), self._loaded.values))
-        rows, columns = np.nonzero(new)
-        places = zip(*grid.centres(columns, rows), strict=True)
+        places = grid.centres(np.argwhere(new)[:, ::-1]).tolist()
         cells = ", ".join(f"({x:.3f}, {y:.3f})" for x, y in places)
         message = (
-            f"{len(rows)} new obstacles at {cells} m; {rejected} draws thrown away"
+            f"{len(places)} new obstacles at {cells} m; {rejected} draws thrown away"
         )
         self.get_logger().info(message)
         return True, message

@@ -61,7 +61,7 @@ def exact_path(
         corners = _corners_between(
             path, grid, _in_cells(begin, grid), _in_cells(end, grid)
         )
-        parts += [np.column_stack(grid.centres(*corners.T)), end]
+        parts += [grid.centres(corners), end]
         begin = end
     path_points = np.vstack(parts)
     is_new = np.append(True, np.diff(path_points, axis=0).any(axis=1))
@@ -87,13 +87,13 @@ def _point_in(grid: GridMap, cell: NDArray[np.int32], point: Point) -> Float64:
     """Return a point (2,) if it lies in a cell, else the cell's centre."""
     x, y = cell.tolist()
     return np.array(
-        point if grid.world_to_cell(*point) == (x, y) else grid.centres(x, y)
+        point if grid.world_to_cell(*point) == (x, y) else grid.centres(cell)
     )
 
 
 def _in_cells(points: Float64, grid: GridMap) -> Float64:
     """Return points (..., 2) in cells from the centre of cell (0, 0)."""
-    return np.stack(grid.in_cells(points[..., 0], points[..., 1]), axis=-1) - 0.5
+    return grid.in_cells(points) - 0.5
 
 
 def _corners_between(path: Path, grid: GridMap, begin: Float64, end: Float64) -> Path:

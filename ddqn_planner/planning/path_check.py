@@ -62,9 +62,8 @@ def invalid_poses(
         return np.array(
             [n for n in numbers if touches(path[n : n + 1], points, bits)], np.int64
         )
-    x, y, _ = poses[first:end].T
     cells = np.floor(
-        np.column_stack(grid.in_cells(x, y))
+        grid.in_cells(poses[first:end, :2])
     )  # float64: they may be far away
     is_invalid = _is_closed(cells, closed)
     cell = None if robot is None else grid.world_to_cell(*robot)

@@ -67,9 +67,9 @@ def points_of(corners: Float64, resolution: float) -> Body:
 
 def in_cells(poses: Float64, grid: GridMap) -> Float64:
     """Return poses (N, 3) with x and y in cells from the centre of cell (0, 0), turned with it."""
-    x, y, yaw = np.reshape(poses, (-1, 3)).T
-    column, row = grid.in_cells(x, y)
-    return np.column_stack([column - 0.5, row - 0.5, yaw - grid.origin[2]])
+    poses = np.reshape(poses, (-1, 3))
+    cells = grid.in_cells(poses[:, :2]) - 0.5
+    return np.column_stack([cells, poses[:, 2] - grid.origin[2]])
 
 
 def nearest_pose(

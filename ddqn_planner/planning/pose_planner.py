@@ -381,7 +381,10 @@ class PosePlanner:
                 return PosePlan(PlanStatus.NO_PATH, field_ms=field_ms)
             x, y, yaw, spent = found
             poses = np.column_stack(
-                [*grid.centres(x, y), turn_between(0, yaw + grid.origin[2])]
+                [
+                    grid.centres(np.column_stack([x, y])),
+                    turn_between(0, yaw + grid.origin[2]),
+                ]
             )
             cells = paths.cells_of(np.column_stack([x, y]))
             field.way = paths.Way(poses, cells, spent.copy(), float(spent[-1]) / bound)

@@ -53,7 +53,7 @@ def test_the_planners_path_stays_valid_however_it_is_sent(
     grid = GridMap(plain.occupancy, 0.05, (1.0, -2.0, yaw))
     start = data.draw(st.sampled_from(grid.free_cells()))
     path = ANY_MAP.plan(grid, start, goal).path
-    x, y = grid.centres(*np.repeat(path, 2, axis=0).T)
+    x, y = grid.centres(np.repeat(path, 2, axis=0)).T
     poses = np.column_stack([x, y, np.zeros(len(x))])
     shifted = GridMap(plain.occupancy, 0.05, (1.0 + 0.016, -2.0 - 0.016, yaw))
     for sent in (

@@ -508,7 +508,7 @@ def test_a_start_that_is_not_free_is_left_by_the_shortest_way(
         min(math.dist(end, goal) for end in tied)
     )
     assert rest == ANY_MAP.plan(grid, way[-1], goal, rule).cells
-    poses = np.column_stack([*grid.centres(*plan.path.T), np.zeros(len(plan.path))])
+    poses = np.column_stack([grid.centres(plan.path), np.zeros(len(plan.path))])
     robot = grid.cell_to_world(start)
     assert not len(
         invalid_poses(poses, grid, robot=robot, clearing_radius=clearing_radius)

@@ -574,7 +574,7 @@ def test_the_rest_of_a_path_is_free_unless_a_box_stands_ahead(
     x, y = grid.world_to_cell(*poses[at, :2])
     blocked = grid.with_patch(np.ones((2, 2), np.bool_), x, y)
     box = shapely.Polygon(
-        [blocked.centres(x + a - 0.5, y + b - 0.5) for a, b in SQUARE]
+        [blocked.centres((x + a - 0.5, y + b - 0.5)) for a, b in SQUARE]
     )
     shape = shapely.Polygon(read_footprint(BODIES[motion]))
     for robot_at in (0, at, len(poses) - 1):
