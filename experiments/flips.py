@@ -17,8 +17,8 @@ from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.moves import cells_along
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.planning import PlanRequest
+from ddqn_planner.planning.path_finder import last_step
 from ddqn_planner.planning.paths import rest_of_path
-from ddqn_planner.planning.planner import last_step
 from ddqn_planner.planning.segments import cost_along
 
 RULE = MoveRule.ROBOT_SAFE

@@ -16,8 +16,8 @@ from ddqn_planner.grid import MapFile
 from ddqn_planner.grid.inflation import clearance
 from ddqn_planner.grid.noise import scatter_obstacles
 from ddqn_planner.planning.path_check import invalid_poses
+from ddqn_planner.planning.path_finder import last_step
 from ddqn_planner.planning.plan import PlanRequest
-from ddqn_planner.planning.planner import last_step
 from ddqn_planner.robot.footprint import read_footprint
 from ddqn_planner.robot.motions import make_motions, read_lattice
 from ddqn_planner.training.environment import Scenario

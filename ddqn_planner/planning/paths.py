@@ -14,7 +14,6 @@ from ddqn_planner.grid.moves import cells_along
 from ddqn_planner.planning.field import Goals
 from ddqn_planner.planning.plan import ROUNDING, PlanRequest, PlanStatus
 from ddqn_planner.planning.segments import (
-    SAME_COST,
     Path,
     cost_along,
     legal_segments,
@@ -184,26 +183,31 @@ def rest_of_path(
     return cells[:0]
 
 
-def keep_or_switch(request: PlanRequest, new: Path) -> tuple[Path, float | None]:
-    """Return the path under way's rest and its extra cost, as a share, or the new path and None."""
-    # The rest may end at the new path's end or at other goals, and cost more by the threshold.
-    grid, rule, (x, y) = request.grid, request.move_rule, new[0].tolist()
-    rest = rest_of_path(request.under_way, (x, y), grid, rule)
-    if not len(rest) or rest[-1].tolist() not in [
-        new[-1].tolist(),
-        *map(list, request.goals),
-    ]:
-        return new, None
-    way = straightened(rest, grid, rule) if request.simplified else rest
-    stands, cost, new_cost = (cost_along(path, grid, rule) for path in (rest, way, new))
-    most = (1 + request.switch_threshold) * new_cost * SAME_COST
-    if cost > most:
-        return new, None
-    if (
-        stands > most
-    ):  # it was pulled straight through what has opened: that is a new path
-        return way, None
-    return way, cost / new_cost - 1 if new_cost else 0.0
+def keep_or_switch(request: PlanRequest, new_path: Path) -> tuple[Path, float | None]:
+    """Return the rest of the path under way and the share that it costs more.
+
+    Or the new path and None, if the rest costs more by the threshold, or ends neither
+    where the new path does nor at another goal.
+    """
+    grid = request.grid
+    rule = request.move_rule
+    start_x, start_y = new_path[0].tolist()
+    rest = rest_of_path(request.under_way, (start_x, start_y), grid, rule)
+    if not len(rest):
+        return new_path, None
+    new_end_x, new_end_y = new_path[-1].tolist()
+    rest_end_x, rest_end_y = rest[-1].tolist()
+    if (rest_end_x, rest_end_y) not in {(new_end_x, new_end_y), *request.goals}:
+        return new_path, None
+    path = straightened(rest, grid, rule) if request.simplified else rest
+    cost = cost_along(path, grid, rule)
+    new_cost = cost_along(new_path, grid, rule)
+    if not request.keeps(cost, new_cost):
+        return new_path, None
+    # Only pulled straight through cells that are free by now: that is a new path.
+    if not request.keeps(cost_along(rest, grid, rule), new_cost):
+        return path, None
+    return path, cost / new_cost - 1 if new_cost else 0.0
 
 
 def _legal_from(cells: Path, grid: GridMap, move_rule: MoveRule | str) -> int:

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any, Generic, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, path_length
-from ddqn_planner.grid.arguments import Cells, Choice, numbers
+from ddqn_planner.grid.arguments import Choice, numbers
+from ddqn_planner.planning.segments import SAME_COST
 
 ROUNDING = 1 + 1e-6  # so that 0.15 m in cells of 0.05 m reach 3 cells, not 2.9999999
 
@@ -37,22 +39,46 @@ class PlanMethod(Choice):
     """By greedy steps, or where they are trapped by a search in the order of the Q field."""
 
 
+Pose: TypeAlias = tuple[float, float, float]  # metres, metres, radians; map frame
+Place = TypeVar("Place", Cell, Pose)
+
+
 @dataclass(frozen=True)
-class PlanRequest:
-    """All that a path is planned with, so that a request may wait; see `Planner.plan`."""
+class PathRequest(Generic[Place]):
+    """The request for a path of cells or of poses, so that it may wait.
+
+    Parameters
+    ----------
+    grid : GridMap
+    start : cell or pose
+    goals : tuple of cells or poses
+        The goal that the cheapest path reaches counts.
+    under_way : (N, 2) cells or (N, 3) poses
+        The path that the robot follows; empty for none.
+    switch_threshold : float
+        The share by which the rest of that path may cost more than a new one.
+    """
 
     grid: GridMap
-    start: Cell
-    goals: tuple[Cell, ...]  # the nearest one counts; with a tolerance there is but one
+    start: Place
+    goals: tuple[Place, ...]
+    under_way: Any = field(default=(), compare=False, kw_only=True)
+    switch_threshold: float = field(default=0.0, kw_only=True)
+
+    def keeps(self, cost: float, new_cost: float) -> bool:
+        """Return whether a path under way is kept, by its cost and that of a new one."""
+        return cost <= (1 + self.switch_threshold) * new_cost * SAME_COST
+
+
+@dataclass(frozen=True)
+class PlanRequest(PathRequest[Cell]):
+    """The request for a path of cells, see `Planner.plan`."""
+
     move_rule: MoveRule
     method: PlanMethod = PlanMethod.GREEDY
-    tolerance: float = 0.0
+    tolerance: float = 0.0  # cells; with a tolerance there is one goal
     simplified: bool = False
-    under_way: Cells = field(default=(), compare=False)  # what the robot follows
-    switch_threshold: float = (
-        0.0  # the share by which the rest of it may cost more than a new path
-    )
-    start_clearing_radius: float = 0.0
+    start_clearing_radius: float = 0.0  # cells
 
     @property
     def reach(self) -> float:
@@ -61,16 +87,45 @@ class PlanRequest:
 
     @property
     def cells(self) -> tuple[Cell, ...]:
-        """Those of the start and the goals."""
+        """The cells of the start and of the goals."""
         return self.start, *self.goals
 
-    def to_nearest(self, others: Sequence[Cell]) -> PlanRequest:
-        """Return the request for a path to the nearest of several goals, none of which moves."""
-        return replace(self, tolerance=0.0, goals=(*self.goals, *others))
+    def to_nearest(self, goals: Sequence[Cell]) -> PlanRequest:
+        """Return the request for a path to the nearest goal, also of more goals.
+
+        None of them moves.
+        """
+        return replace(self, tolerance=0.0, goals=(*self.goals, *goals))
 
     def after(self, leg: Plan, goal: Cell) -> PlanRequest:
         """Return the request for the next leg."""
         return replace(self, start=leg.cells[-1], goals=(goal,))
+
+
+@dataclass(frozen=True)
+class PoseRequest(PathRequest[Pose]):
+    """The request for a path of poses, see `Planner.plan_poses`."""
+
+    tolerance: tuple[float, float] = (0.0, 0.0)  # metres, radians; for one goal
+    bound: float = 1.2
+
+    @property
+    def cells(self) -> tuple[Cell, ...]:
+        """The cells of the start and of the goals."""
+        poses = self.start, *self.goals
+        return tuple(self.grid.world_to_cell(x, y) for x, y, _ in poses)
+
+    def to_nearest(self, goals: Sequence[Pose]) -> PoseRequest:
+        """Return the request for a path to the nearest goal, also of more goals.
+
+        None of them moves.
+        """
+        return replace(self, tolerance=(0.0, 0.0), goals=(*self.goals, *goals))
+
+    def after(self, leg: PosePlan, goal: Pose) -> PoseRequest:
+        """Return the request for the next leg."""
+        x, y, yaw = leg.poses[-1].tolist()
+        return replace(self, start=(x, y, yaw), goals=(goal,))
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 import threading
-import time
-from collections.abc import Generator, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Generator, Iterator
+from dataclasses import replace
 from functools import lru_cache
 from itertools import compress
-from typing import Any, Final, TypeAlias
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,14 @@ from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.grid.inflation import with_unknown_free
 from ddqn_planner.planning import pose_paths as paths
 from ddqn_planner.planning import unknown_space
-from ddqn_planner.planning.plan import ROUNDING, PlanStatus, PosePlan
+from ddqn_planner.planning.path_finder import Clock, Finding, PathFinder
+from ddqn_planner.planning.plan import (
+    ROUNDING,
+    PlanStatus,
+    Pose,
+    PosePlan,
+    PoseRequest,
+)
 from ddqn_planner.planning.pose_field import PoseField
 from ddqn_planner.planning.pose_world import (
     State,
@@ -28,12 +34,7 @@ from ddqn_planner.planning.pose_world import (
     standing,
     world_of,
 )
-from ddqn_planner.planning.segments import SAME_COST
 from ddqn_planner.robot.motions import HEADINGS, turn_between
-
-Pose: TypeAlias = tuple[
-    float, float, float
-]  # metres, metres, radians; in the map frame
 
 VISITS = 2**16  # states that a field visits in one step of a plan: some 30 ms
 # Whether a path leads through unknown space is looked for in so many such steps, some 0.5 s, within
@@ -53,38 +54,7 @@ ON_PATH = (
 )  # a start so near to a pose, in cells and radians, lies on it
 
 
-@dataclass(frozen=True)
-class PoseRequest:
-    """All that a path for a body is planned with; see `Planner.plan_poses`."""
-
-    grid: GridMap
-    start: Pose
-    goals: tuple[Pose, ...]  # the nearest one counts
-    tolerance: tuple[float, float] = (0.0, 0.0)
-    bound: float = 1.2
-    under_way: Any = field(default=(), compare=False)  # (N, 3) what the robot follows
-    switch_threshold: float = (
-        0.0  # the share by which the rest of it may cost more than a new path
-    )
-
-    @property
-    def cells(self) -> tuple[Cell, ...]:
-        """Those of the start and the goals."""
-        return tuple(
-            self.grid.world_to_cell(x, y) for x, y, _ in (self.start, *self.goals)
-        )
-
-    def to_nearest(self, others: Sequence[Pose]) -> PoseRequest:
-        """Return the request for a path to the nearest of several goals, none of which moves."""
-        return replace(self, tolerance=(0.0, 0.0), goals=(*self.goals, *others))
-
-    def after(self, leg: PosePlan, goal: Pose) -> PoseRequest:
-        """Return the request for the next leg."""
-        x, y, yaw = leg.poses[-1].tolist()
-        return replace(self, start=(x, y, yaw), goals=(goal,))
-
-
-class PosePlanner:
+class PosePlanner(PathFinder[PoseRequest, PosePlan]):
     """Keeps the fields of the goals used last. Several threads may use it."""
 
     def __init__(self, network: Any) -> None:
@@ -114,27 +84,41 @@ class PosePlanner:
         self._forget()
 
     def steps(self, request: PoseRequest) -> Iterator[PosePlan | None]:
-        """Yield None before each slow step, and last the plan."""
+        """Yield None before each slow step, and last the plan.
+
+        On a map with an exploration, the path is the one on the safe map, and its cost
+        the expected one.
+        """
+        exploration = request.grid.exploration
+        if exploration is None:
+            yield from super().steps(request)
+            return
+        safe_request = replace(request, grid=exploration.safe)
+        for plan in super().steps(safe_request):
+            if plan is None or len(plan.poses) < 2:
+                yield plan
+            else:
+                yield _with_expected_cost(plan, request.grid, exploration.safe)
+
+    def _find(self, request: PoseRequest, clock: Clock) -> Finding[PosePlan]:
+        """Return the plan, whose reason is its status in words."""
         with self._lock:
-            plan = self._rest_of_path(request)
+            plan = self._from_last_path(request)
         if plan is None:
-            plan = yield from self._find(request)
+            plan = yield from self._from_grown_field(request, clock)
         is_outside = plan.status in (
             PlanStatus.START_OUTSIDE_MAP,
             PlanStatus.GOAL_OUTSIDE_MAP,
         )
-        has_path = len(request.under_way) > 0 and not is_outside
-        if has_path:
+        if len(request.under_way) and not is_outside:
             plan = self._keep_or_switch(request, plan)
-        if unknown_space.has_more_to_say(request.grid, plan, len(request.goals) > 1):
-            yield None
-            reason = yield from self._reason(request, plan)
-            plan = replace(plan, reason=reason)
-        yield plan
+        return plan
 
-    def _find(self, request: PoseRequest) -> Generator[None, None, PosePlan]:
-        """Return a new plan, after None before each slow step."""
-        grid, began = request.grid, time.perf_counter()
+    def _from_grown_field(
+        self, request: PoseRequest, clock: Clock
+    ) -> Finding[PosePlan]:
+        """Return the plan by a field that is grown as far as the start."""
+        grid = request.grid
         self._check(grid)
         is_start_inside, *inside = (grid.contains(cell) for cell in request.cells)
         if not any(inside):
@@ -155,7 +139,7 @@ class PosePlanner:
             states = self._around(request, start, world) if may_move else states
             if not len(states):
                 continue
-            while (found := self._grow(request, states, start, began)) is None:
+            while (found := self._grow(request, states, start, clock)) is None:
                 yield
             plan = found
             if plan.poses.size:
@@ -238,6 +222,10 @@ class PosePlanner:
             return unknown_space.IN_UNKNOWN_SPACE
         return "is so near to unknown space that the robot's body touches it"
 
+    def rest_of_path(self, request: PoseRequest) -> NDArray[np.float64]:
+        """Return the rest of the path under way, (N, 3)."""
+        return self.rest_of(request.under_way, request.start, request.grid)
+
     def rest_of(
         self,
         way: Any,
@@ -260,7 +248,7 @@ class PosePlanner:
         if not len(rest) or paths.nearest_pose(ends, rest[-1], grid, SAME_END) < 0:
             return plan
         cost, new = (paths.cost_of_poses(way, grid) for way in (rest, plan.poses))
-        if has_plan and cost > (1 + request.switch_threshold) * new * SAME_COST:
+        if has_plan and not request.keeps(cost, new):
             return plan
         share, least = (
             cost / new if new else 1.0,
@@ -321,7 +309,7 @@ class PosePlanner:
         states = np.column_stack([column + columns[place], line + rows[row], end])
         return states[: standing(states, world)]
 
-    def _rest_of_path(self, request: PoseRequest) -> PosePlan | None:
+    def _from_last_path(self, request: PoseRequest) -> PosePlan | None:
         """Return the rest of the path that was planned last, if the start lies on it."""
         for asked, known in self._fields.items():
             if (
@@ -366,7 +354,7 @@ class PosePlanner:
         request: PoseRequest,
         states: NDArray[np.int64],
         start: State,
-        began: float,
+        clock: Clock,
     ) -> PosePlan | None:
         """Grow the field by a step; return the path from the start if it is known then."""
         grid = request.grid
@@ -375,10 +363,10 @@ class PosePlanner:
             bound = field.reach(start, request.bound, VISITS)
             if bound is None:
                 return None
-            grown = time.perf_counter()
-            field_ms, found = 1e3 * (grown - began), field.rollout(start)
+            clock.end_field()
+            found = field.rollout(start)
             if found is None:
-                return PosePlan(PlanStatus.NO_PATH, field_ms=field_ms)
+                return PosePlan(PlanStatus.NO_PATH, field_ms=clock.field_ms)
             x, y, yaw, spent = found
             poses = np.column_stack(
                 [
@@ -389,6 +377,15 @@ class PosePlanner:
             cells = paths.cells_of(np.column_stack([x, y]))
             field.way = paths.Way(poses, cells, spent.copy(), float(spent[-1]) / bound)
             plan = field.way.plan(0, grid)
-        return replace(
-            plan, field_ms=field_ms, rollout_ms=1e3 * (time.perf_counter() - grown)
-        )
+        return replace(plan, field_ms=clock.field_ms, rollout_ms=clock.rollout_ms)
+
+
+def _with_expected_cost(
+    plan: PosePlan, expected: GridMap, planned: GridMap
+) -> PosePlan:
+    """Return a plan with the cost on the map of expected times, not that of its map."""
+    expected_cost = paths.cost_of_poses(plan.poses, expected)
+    expected_seconds = expected_cost * (expected.seconds_per_cell or 1.0)
+    planned_cost = paths.cost_of_poses(plan.poses, planned)
+    planned_seconds = planned_cost * (planned.seconds_per_cell or 1.0)
+    return replace(plan, cost=(plan.cost or 0.0) * expected_seconds / planned_seconds)

@@ -11,7 +11,7 @@ from networks import robot_model
 from ddqn_planner import GridMap, Planner
 from ddqn_planner.grid.grid_map import Exploration
 from ddqn_planner.planning import PlanStatus
-from ddqn_planner.planning.planner import last_step
+from ddqn_planner.planning.path_finder import last_step
 from ddqn_planner.planning.pose_paths import cost_of_poses
 from ddqn_planner.planning.pose_planner import PoseRequest
 

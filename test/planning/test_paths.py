@@ -37,8 +37,8 @@ from ddqn_planner.grid import (
 from ddqn_planner.grid.moves import cells_along
 from ddqn_planner.planning import PlanRequest
 from ddqn_planner.planning.path_check import invalid_poses
+from ddqn_planner.planning.path_finder import last_step
 from ddqn_planner.planning.paths import REACH, keep_or_switch, rest_of_path, search
-from ddqn_planner.planning.planner import last_step
 from ddqn_planner.planning.segments import cost_along, legal_segments
 
 

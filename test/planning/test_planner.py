@@ -30,8 +30,8 @@ from ddqn_planner.planning import (
     simplify,
 )
 from ddqn_planner.planning.field import OBJECTS, DistanceField
+from ddqn_planner.planning.path_finder import last_step
 from ddqn_planner.planning.plan import ROUNDING
-from ddqn_planner.planning.planner import last_step
 from ddqn_planner.planning.segments import cost_along
 
 
@@ -188,7 +188,7 @@ def test_a_field_grows_in_steps_and_others_are_answered(
 ) -> None:
     grid = GridMap(np.zeros((40, 40))).with_patch(np.ones((1, 39)), 0, 20)
     whole = new_planner().plan(grid, (0, 0), (0, 39))
-    monkeypatch.setattr("ddqn_planner.planning.planner.VISITS", 20)
+    monkeypatch.setattr("ddqn_planner.planning.cell_planner.VISITS", 20)
     planner = new_planner()
     steps = planner.steps(PlanRequest(grid, (0, 0), ((0, 39),), MoveRule.ROBOT_SAFE))
     waited = 0

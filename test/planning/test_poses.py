@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from ddqn_planner import GridMap
 from ddqn_planner.grid.inflation import INSCRIBED, grid_from_costmap
 from ddqn_planner.planning import pose_field
+from ddqn_planner.planning.path_finder import last_step
 from ddqn_planner.planning.plan import PlanStatus, PosePlan
-from ddqn_planner.planning.planner import last_step
 from ddqn_planner.planning.pose_paths import cost_of_poses
 from ddqn_planner.planning.pose_planner import Pose, PosePlanner, PoseRequest
 from ddqn_planner.planning.pose_space import way_left

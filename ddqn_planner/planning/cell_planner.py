@@ -1,0 +1,266 @@
+"""Plans for a robot whose place is a cell: from a Q field, by greedy steps."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ddqn_planner.grid import Cell, GridMap, MoveRule
+from ddqn_planner.grid.arguments import Cells
+from ddqn_planner.model import QNetwork
+from ddqn_planner.model.move_costs import MoveCosts
+from ddqn_planner.planning import unknown_space
+from ddqn_planner.planning.field import DistanceField, FieldCache, Goals, QField
+from ddqn_planner.planning.path_finder import Clock, Finding, PathFinder, last_step
+from ddqn_planner.planning.paths import (
+    keep_or_switch,
+    rest_of_path,
+    search,
+    way_and_ends,
+)
+from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus
+from ddqn_planner.planning.segments import SAME_COST, Path, cost_along, straightened
+
+VISITS = 2**18  # about how many cells a field visits in one step of a plan: some 30 ms
+
+
+@dataclass
+class _Task:
+    """A request, and what the attempts before have shown of it."""
+
+    request: PlanRequest
+    clock: Clock
+    goals: Goals  # those that are free
+    costs: MoveCosts | None = None  # of the map's moves, once they are known
+    failed: Plan | None = None  # the last rollout, which found no path
+    escape_path: tuple[Cell, ...] = ()  # from an occupied start to its first free cell
+    field: QField | None = None  # toward the goals that such a path can reach
+
+
+class CellPlanner(PathFinder[PlanRequest, Plan]):
+    """Finds paths of cells with a Q-network.
+
+    Parameters
+    ----------
+    network : QNetwork
+    fields : FieldCache
+        The fields of that network.
+    """
+
+    def __init__(self, network: QNetwork, fields: FieldCache) -> None:
+        self.network = network
+        self.fields = fields
+
+    def rest_of_path(self, request: PlanRequest) -> Path:
+        """Return the rest of the path under way, (N, 2)."""
+        return rest_of_path(
+            request.under_way, request.start, request.grid, request.move_rule
+        )
+
+    def _reason(self, request: PlanRequest, plan: Plan) -> Finding[str]:
+        """Return why there is no path, in words."""
+        yield from ()
+        return unknown_space.reason_of(request, plan)
+
+    def _find(self, request: PlanRequest, clock: Clock) -> Finding[Plan]:
+        """Return the plan, whose reason is its status in words."""
+        if request.grid.exploration is None:
+            plan = yield from self._find_on_map(request, clock)
+        else:
+            plan = yield from self._explore(request, clock)
+        return plan
+
+    def _explore(self, request: PlanRequest, clock: Clock) -> Finding[Plan]:
+        """Plan on the optimistic map; fall back if the path costs more than the share.
+
+        The share is that by which it may cost more than the best path that is expected.
+        """
+        grid = request.grid
+        rule = request.move_rule
+        hopes = grid.exploration
+        assert hopes is not None
+        plan = yield from self._find_on_map(replace(request, grid=hopes.bold), clock)
+        if not plan.path.size:
+            return plan
+        # A path under way was judged when it was new.
+        if plan.extra_cost is None:
+            best_request = replace(request, under_way=())
+            best = yield from self._find_on_map(best_request, clock)
+            best_cost = best.cost or math.inf
+            greatest_cost = (1 + hopes.share) * best_cost * SAME_COST
+            if _cost(plan.path, grid, rule) > greatest_cost:
+                safe_request = replace(request, grid=hopes.safe)
+                plan = yield from self._find_on_map(safe_request, clock)
+        if not plan.path.size:
+            return plan
+        return replace(plan, cost=_cost(plan.path, grid, rule))
+
+    def _find_on_map(self, request: PlanRequest, clock: Clock) -> Finding[Plan]:
+        """Return the plan on a map of expected costs: by the first attempt that answers."""
+        grid = request.grid
+        free_goals = {goal for goal in request.goals if grid.is_free(goal)}
+        goals = tuple(sorted(free_goals))
+        status = self._refusal(request, goals)
+        if status is not None:
+            return Plan(status, move_rule=request.move_rule)
+        task = _Task(request, clock, goals)
+        plan = self._from_known_field(task)
+        if plan is not None:
+            return plan
+        for attempt in (self._from_grown_field, self._by_escape, self._by_search):
+            plan = yield from attempt(task)
+            if plan is not None:
+                return plan
+        assert task.failed is not None
+        return replace(task.failed, goal=task.goals[0], field_ms=clock.field_ms)
+
+    def _refusal(self, request: PlanRequest, free_goals: Goals) -> PlanStatus | None:
+        """Return why there is no path, where one look at start and goals says so."""
+        grid = request.grid
+        if not grid.contains(request.start):
+            return PlanStatus.START_OUTSIDE_MAP
+        if not free_goals and not any(map(grid.contains, request.goals)):
+            return PlanStatus.GOAL_OUTSIDE_MAP
+        if grid.is_obstacle(request.start) and request.start_clearing_radius == 0:
+            return PlanStatus.START_OCCUPIED
+        if not free_goals and request.reach < 1:
+            return PlanStatus.GOAL_OCCUPIED
+        if not self.network.supports((grid.height, grid.width)):
+            return PlanStatus.MAP_SIZE_UNSUPPORTED
+        return None
+
+    def _from_known_field(self, task: _Task) -> Plan | None:
+        """Return the plan by a field that is known as far as the start, at once."""
+        request = task.request
+        if not request.grid.is_free(request.start):
+            return None
+        field = self.fields.find(request.grid, task.goals, request.move_rule)
+        if field is None or not field.is_known(request.start):
+            return None
+        return _roll_out(task, field)
+
+    def _from_grown_field(self, task: _Task) -> Finding[Plan | None]:
+        """Return the plan by a field that is grown as far as the start."""
+        if task.failed is not None:  # the field is known, and leads nowhere
+            return None
+        yield
+        request = task.request
+        grid = request.grid
+        task.costs = self.fields.costs(grid, request.move_rule)
+        if task.costs is None:  # a network that gives no costs of moves
+            if len(task.goals) > 1:
+                task.goals = self._nearest_alone(request, task.goals)
+            return None
+        if not task.goals or not grid.is_free(request.start):
+            return None
+        field = self.fields.get(
+            grid, task.goals, request.move_rule, request.start, task.costs
+        )
+        if isinstance(field, DistanceField):
+            while not field.grow(request.start, VISITS):
+                yield
+        return _roll_out(task, field)
+
+    def _by_escape(self, task: _Task) -> Finding[Plan | None]:
+        """Return the plan from the first free cell, to a goal that it can reach.
+
+        A look at the whole map finds both, or why there is no path.
+        """
+        request = task.request
+        if task.failed is not None and request.reach >= 1:
+            yield
+        found = way_and_ends(request, task.goals)
+        if isinstance(found, PlanStatus):
+            return Plan(found, move_rule=request.move_rule)
+        task.escape_path, task.goals = found
+        task.field = self.fields.get(
+            request.grid,
+            task.goals,
+            request.move_rule,
+            task.escape_path[-1],
+            task.costs,
+        )
+        return _roll_out(task, task.field)
+
+    def _by_search(self, task: _Task) -> Finding[Plan | None]:
+        """Return the plan by a search in the order of the Q field, if it is allowed."""
+        request = task.request
+        if request.method is not PlanMethod.ASTAR_FALLBACK or task.field is None:
+            return None
+        yield
+        task.clock.end_field()
+        cells = search(
+            task.escape_path[-1],
+            task.field.goal,
+            request.grid,
+            request.move_rule,
+            task.field.value,
+        )
+        return _finished(task, np.array(cells), PlanMethod.ASTAR_FALLBACK)
+
+    def _nearest_alone(self, request: PlanRequest, goals: Goals) -> Goals:
+        """Return the nearest of several goals, by a field toward each."""
+        plans = []
+        for goal in goals:
+            request_of_goal = replace(request, goals=(goal,), under_way=())
+            plan = last_step(self.steps(request_of_goal))
+            if plan.path.size:
+                plans.append(plan)
+        if not plans:
+            return goals[:1]
+        nearest = min(plans, key=lambda plan: plan.cost or plan.length)
+        return nearest.cells[-1:]
+
+
+def _roll_out(task: _Task, field: QField) -> Plan | None:
+    """Return the plan by greedy steps in a field; None where another attempt follows."""
+    request = task.request
+    task.clock.end_field()
+    start = task.escape_path[-1] if task.escape_path else request.start
+    rollout = field.rollout(start, request.simplified)
+    if rollout.path.size:
+        return _finished(task, rollout.path, rollout.method)
+    # The whole map was looked at in vain, unless another goal may do.
+    is_cut_off = rollout.status is PlanStatus.NO_PATH and request.reach < 1
+    if is_cut_off and not task.escape_path:
+        return replace(rollout, field_ms=task.clock.field_ms)
+    task.failed = rollout
+    return None
+
+
+def _finished(task: _Task, found: Path, method: PlanMethod) -> Plan:
+    """Return the plan by a path that was found: straight, or by the path under way."""
+    request = task.request
+    grid = request.grid
+    rule = request.move_rule
+    path = found
+    extra_cost = None
+    if request.simplified:
+        path = straightened(path, grid, rule)
+    if len(request.under_way):
+        path, extra_cost = keep_or_switch(request, path)
+    goal = (int(path[-1, 0]), int(path[-1, 1]))
+    if len(task.escape_path) > 1:
+        path = np.concatenate([task.escape_path[:-1], path], dtype=np.int32)
+        # From the first free cell on it is the path under way; is it as a whole?
+        under_way = np.asarray(request.under_way)
+        if not np.array_equal(path, under_way[-len(path) :]):
+            extra_cost = None
+    return Plan(
+        PlanStatus.SUCCEEDED,
+        path,
+        method,
+        rule,
+        cost=_cost(path, grid, rule) if grid.has_costs else None,
+        goal=goal,
+        extra_cost=extra_cost,
+        field_ms=task.clock.field_ms,
+        rollout_ms=task.clock.rollout_ms,
+    )
+
+
+def _cost(path: Cells, grid: GridMap, rule: MoveRule) -> float:
+    """Return what a path costs: seconds, on a map of expected times."""
+    return cost_along(path, grid, rule) * (grid.seconds_per_cell or 1.0)

@@ -1,0 +1,110 @@
+"""The flow of a request for a path: the same for cells and for poses."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Generator, Iterator
+from dataclasses import replace
+from typing import Any, Generic, TypeVar
+
+from numpy.typing import NDArray
+
+from ddqn_planner.planning import unknown_space
+from ddqn_planner.planning.plan import PathRequest, Plan
+
+AnyPlan = TypeVar("AnyPlan", bound=Plan)
+Request = TypeVar("Request", bound="PathRequest[Any]")
+Result = TypeVar("Result")
+# A part of the flow: it yields before each slow step, and returns its result.
+Finding = Generator[None, None, Result]
+
+
+class Clock:
+    """The time that a request takes, without the pauses between its steps."""
+
+    def __init__(self) -> None:
+        self._seconds_before = 0.0  # until the last pause
+        self._began = time.perf_counter()
+        self._seconds_of_field = 0.0
+
+    def pause(self) -> None:
+        """Stop until `resume`."""
+        self._seconds_before = self._seconds()
+
+    def resume(self) -> None:
+        """Go on after a pause."""
+        self._began = time.perf_counter()
+
+    def end_field(self) -> None:
+        """Count all that follows as the time of the rollout."""
+        self._seconds_of_field = self._seconds()
+
+    @property
+    def field_ms(self) -> float:
+        """The time until the field was known, in milliseconds."""
+        return 1e3 * self._seconds_of_field
+
+    @property
+    def rollout_ms(self) -> float:
+        """The time since then, in milliseconds."""
+        return 1e3 * (self._seconds() - self._seconds_of_field)
+
+    def _seconds(self) -> float:
+        return self._seconds_before + time.perf_counter() - self._began
+
+
+class PathFinder(ABC, Generic[Request, AnyPlan]):
+    """Finds paths of a space, those of cells or those of poses.
+
+    Several threads may use it.
+    """
+
+    def steps(self, request: Request) -> Iterator[AnyPlan | None]:
+        """Yield None before each slow step (a part of a field, a search).
+
+        Last of all, yield the plan.
+        """
+        clock = Clock()
+        for plan in _with_plan_last(self._answer(request, clock)):
+            clock.pause()
+            yield plan
+            clock.resume()
+
+    def _answer(self, request: Request, clock: Clock) -> Finding[AnyPlan]:
+        """Return the plan; without a path, its reason names unknown space, too."""
+        plan = yield from self._find(request, clock)
+        has_several_goals = len(request.goals) > 1
+        if unknown_space.has_more_to_say(request.grid, plan, has_several_goals):
+            yield
+            reason = yield from self._reason(request, plan)
+            plan = replace(plan, reason=reason)
+        return plan
+
+    @abstractmethod
+    def _find(self, request: Request, clock: Clock) -> Finding[AnyPlan]:
+        """Return the plan, whose reason is its status in words."""
+
+    @abstractmethod
+    def _reason(self, request: Request, plan: AnyPlan) -> Generator[None, None, str]:
+        """Return why there is no path, in words."""
+
+    @abstractmethod
+    def rest_of_path(self, request: Request) -> NDArray[Any]:
+        """Return the rest of the path under way, from the start on.
+
+        It is empty if the start is far from that path, or the rest is not free.
+        """
+
+
+def _with_plan_last(finding: Finding[AnyPlan]) -> Iterator[AnyPlan | None]:
+    """Yield None as a finding does, and then the plan that it returns."""
+    plan = yield from finding
+    yield plan
+
+
+def last_step(steps: Iterator[AnyPlan | None]) -> AnyPlan:
+    """Take all steps that are left of `PathFinder.steps`, and return the plan."""
+    *_, plan = steps
+    assert plan is not None
+    return plan
