@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ddqn_planner.grid import LENGTHS, MOVES, OCCUPIED, UNKNOWN, Cell, GridMap, MoveRule
 from ddqn_planner.model.certificate import MOVE_RULES, Certificate, certify
 from ddqn_planner.model.move_costs import (
+    CENTRE,
     MAX_MULTIPLIER,
     VALUES,
     MoveCosts,
@@ -22,18 +23,22 @@ from ddqn_planner.robot.body_certificate import BodyCertificate
 
 Array: TypeAlias = NDArray[np.float32]
 
-# Shapes: A = 8 actions, B = a batch, I and O = inputs and outputs of a layer, P = patches, F =
-# filters, L = windows of a convolution, K = F * L, U = outputs after it, C = cells, one more for
-# what is outside the map.
+# Shapes: A = 8 actions, B = a batch, I and O = inputs and outputs of a layer, P = patches,
+# F = filters. In the paper's network, L = windows of the convolution, U = outputs of the
+# layer after it, C = cells, with one more that stands for all outside the map. In cost
+# multipliers, L = the values of a cell, see `move_costs`.
 
-# A move of at least this probability counts as one that always succeeds: the sigmoid function never
-# reaches 1, and its rest must not decide between paths.
+# A move of at least this probability counts as one that always succeeds: the sigmoid
+# function never reaches 1, and the difference must not decide between paths.
 CERTAIN = 0.99
-NOISE = 0.02  # weights of prices below that count as 0: training leaves some where none belong
+# Weights of cost multipliers below this count as 0: training leaves some where none
+# belong.
+NOISE = 0.02
 BATCH = 2**12  # patches per evaluation: the layers' outputs then fit into a cache
 
-# The paper (section 4) uses four values and does not give them. With ours the robot stands out.
-# With a smaller value for the robot, the many obstacles outweigh it and training is less stable.
+# The paper (section 4) uses four values and does not give them. With ours the robot
+# stands out. With a smaller value for the robot, the many obstacles outweigh it and
+# training is less stable.
 FREE, OBSTACLE, GOAL, ROBOT = 0.0, -0.1, 1.0, 3.0
 
 
@@ -103,70 +108,91 @@ def observation_background(
 
 
 class PaperQNetwork(QNetwork):
-    """The paper's network (Fig. 3), for maps of its own size: a 3x3 convolution, dense layers."""
+    """The paper's network (Fig. 3), for maps of its own size.
 
-    # The paper gives no padding. Without ours of 1, no filter covers the last row and column of a
-    # map of even size. Its text can mean a hidden layer of `hidden_units`; 0 is for none.
+    It has a 3x3 convolution and fully connected layers.
+    """
+
+    # The paper gives no padding. Without our padding of 1, no filter covers the last row
+    # and column of a map of even size. The paper's text can mean a hidden layer of
+    # `hidden_units`; 0 stands for none.
     name = "paper"
     size_names = ("height", "width", "filters", "hidden_units")
 
     @classmethod
     def _layers(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
-        height, width, filters, units = (sizes[name] for name in cls.size_names)
-        features = filters * ((height + 1) // 2) * ((width + 1) // 2)
-        hidden = {"hidden": (units, features)} if units else {}
-        last = {"fully_connected": (len(MOVES), units or features)}
-        return {"convolution": (filters, 1, 3, 3), **hidden, **last}
+        filters = sizes["filters"]
+        units = sizes["hidden_units"]
+        windows = ((sizes["height"] + 1) // 2) * ((sizes["width"] + 1) // 2)
+        features = filters * windows
+        layers: dict[str, tuple[int, ...]] = {"convolution": (filters, 1, 3, 3)}
+        if units:
+            layers["hidden"] = (units, features)
+        layers["fully_connected"] = (len(MOVES), units or features)
+        return layers
 
     def supports(self, shape: tuple[int, int]) -> bool:
         """Say whether maps of shape (H, W) have the network's size."""
         return shape == (self.sizes["height"], self.sizes["width"])
 
     def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Array:
-        """Evaluate a robot in each cell: Q(s, a) toward one goal, (8, H, W), whatever the rule."""
-        # In double precision: differences of large sums stay exact enough, and do not overflow.
-        tensors = [
-            self.tensors[name].astype(np.float64) for name in self.shapes(self.sizes)
-        ]
-        kernel_F9, bias_F, layer_UK, layer_bias_U, *last = tensors
-        kernel_9F, filters = kernel_F9.reshape(-1, 9).T, len(bias_F)
-        cut_L9, cells = window_cells(grid.occupancy.shape), grid.occupancy.size
-        layer_LFU = layer_UK.reshape(-1, filters, len(cut_L9)).T.copy()
-        shown = np.append(
-            observation_background(grid.occupancy, goal), 0.0
-        )  # 0 outside the map
-        before_LF = shown[cut_L9] @ kernel_9F + bias_F
-        after_LF = np.maximum(before_LF, 0)
-        output_CU = np.tile(
-            layer_bias_U + np.tensordot(after_LF, layer_LFU, 2), (cells + 1, 1)
-        )
-        # Each window is seen with a robot in each of its cells. What that changes adds up.
-        robot_L9F = (ROBOT - shown[cut_L9])[..., None] * kernel_9F
-        change_L9F = np.maximum(before_LF[:, None] + robot_L9F, 0) - after_LF[:, None]
-        change_9LU = (change_L9F @ layer_LFU).swapaxes(0, 1)
-        for cell_L, change_LU in zip(cut_L9.T, change_9LU, strict=True):
-            output_CU[cell_L] += change_LU
-        if last:
-            output_CU = np.maximum(output_CU, 0) @ last[0].T + last[1]
+        """Evaluate a robot in each cell: Q(s, a) toward one goal, (8, H, W).
+
+        The move rule does not matter: the network was trained for one.
+        """
+        # In double precision: differences of large sums stay exact enough, and do not
+        # overflow.
+        weights = {
+            name: self.tensors[name].astype(np.float64)
+            for name in self.shapes(self.sizes)
+        }
+        kernel_9F = weights["convolution.weight"].reshape(-1, 9).T
+        bias_F = weights["convolution.bias"]
+        has_hidden = self.sizes["hidden_units"] > 0
+        layer = "hidden" if has_hidden else "fully_connected"
+        # The cells of a window, and their values without the robot; 0 outside the map.
+        cell_L9 = window_cells(grid.occupancy.shape)
+        background_C = np.append(observation_background(grid.occupancy, goal), 0.0)
+        value_L9 = background_C[cell_L9]
+        layer_LFU = weights[f"{layer}.weight"]  # (U, F * L) in the file
+        layer_LFU = layer_LFU.reshape(-1, len(bias_F), len(cell_L9)).T.copy()
+        sum_LF = value_L9 @ kernel_9F + bias_F
+        feature_LF = np.maximum(sum_LF, 0)
+        output_U = weights[f"{layer}.bias"] + np.tensordot(feature_LF, layer_LFU, 2)
+        # Each window is seen with a robot in each of its cells. The changes add up.
+        robot_L9F = (ROBOT - value_L9)[..., None] * kernel_9F
+        feature_L9F = np.maximum(sum_LF[:, None] + robot_L9F, 0)
+        change_L9U = (feature_L9F - feature_LF[:, None]) @ layer_LFU
+        output_CU = np.tile(output_U, (len(background_C), 1))
+        for place in range(9):
+            output_CU[cell_L9[:, place]] += change_L9U[:, place]
+        if has_hidden:
+            last_AU = weights["fully_connected.weight"]
+            hidden_CU = np.maximum(output_CU, 0)
+            output_CU = hidden_CU @ last_AU.T + weights["fully_connected.bias"]
         with np.errstate(over="ignore"):
             q_AC: Array = output_CU[:-1].T.astype(np.float32)
         return q_AC.reshape(-1, *grid.occupancy.shape)
 
 
 def window_cells(shape: tuple[int, int]) -> NDArray[np.int64]:
-    """Return the cells of each window of the convolution, (L, 9), or H * W outside the map."""
+    """Return the cells of each window of the convolution, (L, 9); H * W stands for outside."""
     cells = shape[0] * shape[1]
     padded = np.pad(np.arange(cells).reshape(shape), 1, constant_values=cells)
-    cut = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))[::2, ::2]
-    cell_L9: NDArray[np.int64] = cut.reshape(-1, 9)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))[::2, ::2]
+    cell_L9: NDArray[np.int64] = windows.reshape(-1, 9)
     return cell_L9
 
 
 class PropagationQNetwork(QNetwork):
-    """A Q-network for maps of any size: Q(s, a) = p(s, a) (r + γ V(s')) + (1 - p(s, a)) r_o."""
+    """A Q-network for maps of any size.
 
-    # Learned is p(s, a), from the 3x3 patch. Related: value iteration networks (VIN, Tamar et al.
-    # 2016) learn their reward too, and VProp (Nardelli et al. 2019) how values propagate.
+    Q(s, a) = p(s, a) (r + γ V(s')) + (1 - p(s, a)) r_o.
+    """
+
+    # Learned is p(s, a), from the 3x3 patch. Related: value iteration networks (VIN,
+    # Tamar et al. 2016) learn their reward, too; VProp (Nardelli et al. 2019) learns how
+    # values propagate.
     name = "propagation"
     size_names = ("filters",)
     inputs: ClassVar[int] = 9  # features
@@ -175,32 +201,45 @@ class PropagationQNetwork(QNetwork):
     )
 
     def __init__(self, sizes: Mapping[str, int], tensors: Mapping[str, Array]) -> None:
-        prices = {name: t for name, t in tensors.items() if name.startswith("prices")}
-        clear = {name: np.where(np.abs(t) < NOISE, 0, t) for name, t in prices.items()}
-        super().__init__(sizes, {**tensors, **clear})
-        # What holds for all maps, so that it is computed once: by the rules, and by the arguments
-        # of `_proved_costs`. A cache of a bound method would keep the network in a cycle.
+        super().__init__(sizes, tensors)
+        for name, tensor in tensors.items():
+            if name.startswith("prices"):
+                self.tensors[name] = np.where(np.abs(tensor) < NOISE, 0, tensor)
+        # These hold for all maps, so they are computed once: by the rules, and by the
+        # arguments of `_proved_costs`. A cache of a bound method would keep the network
+        # in a cycle.
         self._certificates: dict[tuple[MoveRule, ...], Certificate] = {}
         self._proved: dict[tuple[MoveRule, bool, bool], MoveCosts | None] = {}
 
     @classmethod
     def _layers(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
-        filters, outputs = sizes["filters"], len(MOVES)
-        layers: dict[str, tuple[int, ...]] = {"convolution": (filters, cls.inputs)}
-        layers |= {"hidden": (filters, filters), "moves": (outputs, filters)}
-        return {**layers, "prices": (outputs, cls.inputs)} if cls.uses_costs else layers
+        filters = sizes["filters"]
+        layers: dict[str, tuple[int, ...]] = {
+            "convolution": (filters, cls.inputs),
+            "hidden": (filters, filters),
+            "moves": (len(MOVES), filters),
+        }
+        if cls.uses_costs:
+            layers["prices"] = (len(MOVES), cls.inputs)
+        return layers
 
     @classmethod
     def features(cls, patch_B9: NDArray[np.int8], move_rule: MoveRule) -> Array:
         """Return which cells of patches are occupied, (B, 9), see `patches`.
 
-        Then, with costs, which cells cost what, 0..1, and which are unknown; the rule: (B, 28).
+        With costs, the costs of the cells follow, 0..1, then which cells are unknown, and
+        the rule: (B, 28).
         """
-        occupied, unknown = patch_B9 == OCCUPIED, patch_B9 == UNKNOWN
-        cost_B9 = np.where(occupied | unknown, 0, patch_B9) / 100
+        occupied_B9 = patch_B9 == OCCUPIED
+        if not cls.uses_costs:
+            plain_BI: Array = occupied_B9.astype(np.float32)
+            return plain_BI
+        unknown_B9 = patch_B9 == UNKNOWN
+        cost_B9 = np.where(occupied_B9 | unknown_B9, 0, patch_B9) / 100
         rule_B1 = np.full((len(patch_B9), 1), move_rule.cuts_corners)
-        others = [cost_B9, unknown, rule_B1] if cls.uses_costs else []
-        return np.concatenate([occupied, *others], axis=1, dtype=np.float32)
+        features = [occupied_B9, cost_B9, unknown_B9, rule_B1]
+        feature_BI: Array = np.concatenate(features, axis=1, dtype=np.float32)
+        return feature_BI
 
     def success(self, feature_BI: Array) -> Array:
         """Return p(s, a) in 0..1: (B, 8), given features (B, I)."""
@@ -234,14 +273,14 @@ class PropagationQNetwork(QNetwork):
         return self._certificates[rules]
 
     def move_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts | None:
-        """Return the costs of a map's moves if the possible ones are exactly the legal ones."""
+        """Return the costs of a map's moves if exactly the legal moves are possible."""
         timed = grid.slowness is not None
         with_costs = self.uses_costs and grid.cost is not None and not timed
-        kind = move_rule, with_costs, timed
-        if kind not in self._proved:
-            self._proved[kind] = self._proved_costs(*kind)
-        costs = self._proved[kind]
-        return costs and costs.on(grid)
+        key = move_rule, with_costs, timed
+        if key not in self._proved:
+            self._proved[key] = self._proved_costs(move_rule, with_costs, timed)
+        costs = self._proved[key]
+        return None if costs is None else costs.on(grid)
 
     def _proved_costs(
         self, move_rule: MoveRule, with_costs: bool, timed: bool
@@ -252,53 +291,80 @@ class PropagationQNetwork(QNetwork):
         if with_costs:
             return self._sums_of_prices(move_rule, legal_PA)
         table_PA = self._costs_of(patch_P9, move_rule, timed)
-        table_PA[patch_P9[:, 4] == OCCUPIED] = np.inf
+        table_PA[patch_P9[:, CENTRE] == OCCUPIED] = np.inf
         is_right = np.array_equal(np.isfinite(table_PA), legal_PA)
         return MoveCosts.of_table(table_PA) if is_right else None
 
     def _sums_of_prices(
         self, move_rule: MoveRule, legal_PA: NDArray[np.bool_]
     ) -> MoveCosts | None:
-        """Return costs that are sums over the two cells of a move, if they are proved to be."""
+        """Return costs by the costs of a move's two cells, if proved to be such sums."""
         if not self.certificate(move_rule).proved:
             return None
+        term_9AL = self._price_terms(move_rule)
+        action_A = np.arange(len(MOVES))
+        target_A = CENTRE + MOVES @ [
+            1,
+            3,
+        ]  # the cell of the patch to which a move leads
+        term_2AL = np.stack([term_9AL[CENTRE], term_9AL[target_A, action_A]])
+        # No move leads to an occupied cell: its term has no meaning.
+        term_2AL[..., -1] = term_2AL[..., -2]
+        other_9AL = term_9AL.copy()
+        other_9AL[CENTRE] = 0
+        other_9AL[target_A, action_A] = 0
+        highest_A = 1 + term_2AL.max(axis=2).sum(axis=0)
+        highest = float(highest_A.max())
+        if other_9AL.any() or term_2AL.min() < 0 or highest > MAX_MULTIPLIER:
+            return None  # the cost of a move does not follow from its two cells
         lengths_PA = np.where(legal_PA, LENGTHS, np.inf).astype(np.float32)
         costs = MoveCosts.of_table(lengths_PA)
-        # The layer is linear, so that its output is a sum over the patch's cells.
-        weight_AI, bias_A = self.tensors["prices.weight"], self.tensors["prices.bias"]
+        half = np.float32(0.5)  # of the 1 to which both terms are added
+        return costs._replace(
+            terms=term_2AL.ravel() + half,
+            highest=costs.highest * highest,
+            low=_least_multipliers(term_2AL),
+        )
+
+    def _price_terms(self, move_rule: MoveRule) -> Array:
+        """Return the terms of the cost multipliers minus 1, by cell, action and value.
+
+        The layer is linear, so its output is a sum over the patch's cells: (9, 8, L).
+        """
+        weight_AI = self.tensors["prices.weight"]
         occupied_9A, cost_9A, unknown_9A = weight_AI[:, :27].T.reshape(3, 9, -1)
-        terms_9AL = np.empty((9, len(MOVES), VALUES), dtype=np.float32)
-        terms_9AL[..., 0], terms_9AL[..., -1] = unknown_9A, occupied_9A
-        terms_9AL[..., 1:-1] = cost_9A[..., None] * (np.arange(OCCUPIED) / 100)
-        terms_9AL[4] += (bias_A + weight_AI[:, 27] * move_rule.cuts_corners)[:, None]
-        actions, after = np.arange(len(MOVES)), 4 + MOVES @ [1, 3]
-        terms_2AL = np.stack([terms_9AL[4], terms_9AL[after, actions]])
-        terms_2AL[..., -1] = terms_2AL[..., -2]  # no move leads there
-        terms_9AL[4] = terms_9AL[after, actions] = 0
-        greatest = 1 + float(terms_2AL.max(axis=2).sum(axis=0).max())
-        if terms_9AL.any() or terms_2AL.min() < 0 or greatest > MAX_MULTIPLIER:
-            return None  # what a move costs does not follow from its two cells
-        from_on = np.minimum.accumulate(terms_2AL[..., ::-1], axis=2)[..., ::-1]
-        low_L = 1 + np.minimum(terms_2AL[..., :1], from_on).sum(axis=0).min(axis=0)
-        terms = terms_2AL.ravel() + np.float32(0.5)
-        return costs._replace(terms=terms, highest=costs.highest * greatest, low=low_L)
+        term_9AL = np.empty((9, len(MOVES), VALUES), dtype=np.float32)
+        term_9AL[..., 0] = unknown_9A
+        term_9AL[..., 1:-1] = cost_9A[..., None] * (np.arange(OCCUPIED) / 100)
+        term_9AL[..., -1] = occupied_9A
+        # All other terms are those of the centre.
+        rule_A = weight_AI[:, 27] * move_rule.cuts_corners
+        term_9AL[CENTRE] += (self.tensors["prices.bias"] + rule_A)[:, None]
+        return term_9AL
 
     def believed_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts:
-        """Return the costs of a map's moves, right or not: Q is minus the cheapest path's cost."""
-        # A move counts as possible where p > 1/2, and is tried until it succeeds. The progress and
-        # detour terms of the paper's reward (section 4.2) add up to a constant along a path.
+        """Return the costs of a map's moves, right or not.
+
+        Q is minus the cost of the cheapest path.
+        """
+        # A move counts as possible where p > 1/2, and is tried until it succeeds. The
+        # progress and detour terms of the paper's reward (section 4.2) add up to a
+        # constant along a path.
         timed = grid.slowness is not None
-        patch_C, patch_P9 = None, every_patch()
+        patch_C = None
+        patch_P9 = every_patch()
         if self.uses_costs and grid.cost is not None and not timed:
             patch_C, patch_P9 = unique_patches(grid.occupancy, grid.cost)
-        return MoveCosts.of_table(self._costs_of(patch_P9, move_rule, timed)).on(
-            grid, patch_C
-        )
+        table_PA = self._costs_of(patch_P9, move_rule, timed)
+        return MoveCosts.of_table(table_PA).on(grid, patch_C)
 
     def _costs_of(
         self, patch_P9: NDArray[np.int8], move_rule: MoveRule, timed: bool
     ) -> Array:
-        """Return each move's cost, infinite if not possible, or the tries if `timed`: (P, 8)."""
+        """Return each move's cost, infinite if it is not possible: (P, 8).
+
+        If `timed`, the cost is the length times the tries, without a multiplier.
+        """
         costs = []
         for batch_B9 in np.split(patch_P9, range(BATCH, len(patch_P9), BATCH)):
             feature_BI = self.features(batch_B9, move_rule)
@@ -310,8 +376,21 @@ class PropagationQNetwork(QNetwork):
         return np.concatenate(costs, dtype=np.float32)
 
 
+def _least_multipliers(term_2AL: Array) -> Array:
+    """Return the least multiplier on a map by the least value of its cells: (L,)."""
+    # A cell of the map has the least value, a greater one, or it is unknown.
+    from_greatest_2AL = np.minimum.accumulate(term_2AL[..., ::-1], axis=2)
+    least_known_2AL = from_greatest_2AL[..., ::-1]
+    least_2AL = np.minimum(term_2AL[..., :1], least_known_2AL)
+    least_L: Array = 1 + least_2AL.sum(axis=0).min(axis=0)
+    return least_L
+
+
 class AnyMapQNetwork(PropagationQNetwork):
-    """A propagation network that knows both move rules and learns r(s, a) = -length * m(s, a)."""
+    """A propagation network that knows both move rules and costs of cells.
+
+    It learns r(s, a) = -length * m(s, a).
+    """
 
     name = "any_map"
     inputs = 28

@@ -21,8 +21,8 @@ from ddqn_planner.model.certificate import (
     MAX_FILTERS,
     MOVE_RULES,
     Certificate,
-    _margins,
     certify,
+    logit_margins,
 )
 from ddqn_planner.model.move_costs import every_patch, legal_in_patches
 from ddqn_planner.planning import Planner
@@ -118,11 +118,11 @@ def test_no_margin_of_any_network_is_above_a_sampled_one(
     assert isinstance(network, PropagationQNetwork)
     plain_B9 = np.where(patch_B9 == OCCUPIED, OCCUPIED, 0).astype(np.int8)
     legal_BA = legal_in_patches(patch_B9, rule)
-    margin_BA, _ = _margins(network, network.features(plain_B9, rule), legal_BA)
+    margins = logit_margins(network, network.features(plain_B9, rule), legal_BA)
     sampled_BA = np.where(legal_BA, 1, -1) * logits(
         network, network.features(patch_B9, rule)
     )
-    assert (margin_BA <= sampled_BA).all()
+    assert (margins.margin <= sampled_BA).all()
 
 
 @cache
