@@ -1,18 +1,13 @@
-"""What a trainer node learns from drives: those of its robot, or of a fleet."""
+"""A learner from drives: those of the node's robot, or of a fleet."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from action_msgs.msg import GoalStatus, GoalStatusArray
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import OccupancyGrid
-from numpy.typing import NDArray
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
@@ -23,51 +18,72 @@ from ddqn_planner.experience.drives import (
     DriveRecorder,
     read_drives,
 )
+from ddqn_planner.experience.prior import Prior
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.clocks import STEADY
 from ddqn_planner.nodes.conversions import occupancy_message
+from ddqn_planner.nodes.learning_node import (
+    Answer,
+    Float64,
+    LearningNode,
+    MapInFrame,
+    Recording,
+    explained,
+)
 from ddqn_planner.nodes.poses import Frames, listen
 from ddqn_planner.nodes.quality import LATCHED
-from ddqn_planner.resources import with_remedy
-
-if TYPE_CHECKING:
-    from ddqn_planner.nodes.trainer_node import TrainerNode
 
 NAVIGATION = "navigate_to_pose/_action/status"
-Float64 = NDArray[np.float64]
 SLOWEST = 10.0  # the slowness that ``~/slowness`` shows as 100
-WRONG = np.log(1.5)  # of the nominal speed, compared with that of drives
-MORE_PLACES = 1.1  # times as many as the last time
+# Of the logarithm of a speed: where drives differ more, the nominal speed is wrong.
+WRONG_SPEED = np.log(1.5)
+# With so many times the places of the last time, the prior is trained again.
+MORE_PLACES = 1.1
+REPLAY_STRIDE = 5  # poses; a replay of all poses would take long
+LOOK_UP_PERIOD = 0.05  # seconds
 NOT_RECORDING = "no drives are being recorded; call ~/start first"
-NO_MAP = "no map was received yet; start a map server, or set map_file"
-
-
-class MapInFrame(NamedTuple):
-    """A map, and the frame of its origin."""
-
-    grid: GridMap
-    frame: str
 
 
 class DrivingRobot:
-    """Divides what it hears of the robot of a namespace into drives."""
+    """Divides the poses, goals and navigation states of a robot into drives.
+
+    Parameters
+    ----------
+    node
+        The node that listens.
+    frames
+        Transforms poses into the map's frame.
+    name
+        The robot's namespace; empty for the node's own robot.
+    on_drive
+        Called with words for the robot, such as " by r1", and with each drive.
+    """
 
     def __init__(
-        self, node: TrainerNode, frames: Frames, name: str, on_drive: Callable[..., Any]
+        self,
+        node: LearningNode,
+        frames: Frames,
+        name: str,
+        on_drive: Callable[[str, Drive], None],
     ) -> None:
-        self._node, self._frames, self._name = node, frames, name
-        self._space = f"{name}/" if name else ""  # before its topics and its frame
-        self.recorder = DriveRecorder(partial(on_drive, f" by {name}" if name else ""))
-        self._aborted: set[bytes] | None = None
-        listen(node, f"{self._space}goal_pose", 10, node.diagnostics, self._on_goal)
+        self._node = node
+        self._frames = frames
+        self._name = name
+        self._prefix = f"{name}/" if name else ""  # of its topics and its frame
+        by_robot = f" by {name}" if name else ""
+        self.recorder = DriveRecorder(partial(on_drive, by_robot))
+        # Goals that its navigation has aborted; None before the first status.
+        self._aborted_goals: set[bytes] | None = None
+        listen(node, f"{self._prefix}goal_pose", 10, node.diagnostics, self._on_goal)
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        topic = f"{self._space}{NAVIGATION}"
+        topic = f"{self._prefix}{NAVIGATION}"
         node.create_subscription(GoalStatusArray, topic, self._on_status, latched)
         if node.value("pose_source") == "tf":
             frames.listen()
-            node.create_timer(0.05, self._look_up, clock=STEADY)  # every pose counts
+            node.create_timer(LOOK_UP_PERIOD, self._look_up, clock=STEADY)
         else:
-            listen(node, f"{self._space}odom", 1000, node.diagnostics, self._on_pose)
+            # The queue is long, as every pose counts.
+            listen(node, f"{self._prefix}odom", 1000, node.diagnostics, self._on_pose)
 
     def _on_pose(self, pose: PoseStamped) -> None:
         """Record a pose; a ValueError refuses it."""
@@ -80,12 +96,15 @@ class DrivingRobot:
         self.recorder.add(seconds, *position)
 
     def _look_up(self) -> None:
-        if (place := self._node.map) is None:
+        """Record the pose that TF has now."""
+        on_map = self._node.map
+        if on_map is None:
             return
-        with self._node.diagnostics.receiving(f"{self._space}tf", is_frequent=True):
-            frame = f"{self._space}{self._node.value('robot_frame')}".lstrip("/")
+        topic = f"{self._prefix}tf"
+        with self._node.diagnostics.receiving(topic, is_frequent=True):
+            frame = f"{self._prefix}{self._node.value('robot_frame')}".lstrip("/")
             try:
-                pose = self._frames.origin_of(frame, place.frame)
+                pose = self._frames.origin_of(frame, on_map.frame)
             except ValueError as error:
                 raise ValueError(f"{error}, or set robot_frame") from None
             self._on_pose(pose)
@@ -96,216 +115,262 @@ class DrivingRobot:
             self.recorder.set_goal(*position)
 
     def _position(self, name: str, pose: PoseStamped) -> tuple[float, float] | None:
-        """Return a pose's position in the frame of the map, if there is one, or a ValueError."""
-        if self._node.map is None:
+        """Return the position of a pose in the map's frame, metres.
+
+        None without a map. A ValueError refuses the pose, which it calls by its name.
+        """
+        on_map = self._node.map
+        if on_map is None:
             return None
-        position = self._frames.to_map(name, pose, self._node.map.frame).pose.position
+        position = self._frames.to_map(name, pose, on_map.frame).pose.position
         return position.x, position.y
 
     def _on_status(self, message: GoalStatusArray) -> None:
-        """End the drive where the robot's navigation gives up."""
-        aborted = {
+        """End the drive where the robot's navigation aborts a goal."""
+        aborted_goals = {
             bytes(status.goal_info.goal_id.uuid)
             for status in message.status_list
             if status.status == GoalStatus.STATUS_ABORTED
         }
-        if self._aborted is not None and aborted - self._aborted:
+        if self._aborted_goals is None:
+            # What failed before the node listened failed elsewhere.
+            self._aborted_goals = aborted_goals
+            return
+        if aborted_goals - self._aborted_goals:
             self.recorder.abort()
-        # What failed before the node listened failed elsewhere.
-        self._aborted = aborted.union(self._aborted or ())
+        self._aborted_goals |= aborted_goals
 
-    def told(self) -> dict[str, str]:
-        """Return what the diagnostics say of it."""
-        places = {"robot": self.recorder.position, "goal": self.recorder.goal}
-        return {
-            f"{what} {self._name}".rstrip(): f"({at[0]:.6g}, {at[1]:.6g})"
-            if at
-            else "unknown"
-            for what, at in places.items()
-        }
+    def describe(self) -> dict[str, str]:
+        """Return the lines of the diagnostics about the robot."""
+        positions = {"robot": self.recorder.position, "goal": self.recorder.goal}
+        lines: dict[str, str] = {}
+        for role, position in positions.items():
+            words = "unknown"
+            if position:
+                words = f"({position[0]:.6g}, {position[1]:.6g})"
+            lines[f"{role} {self._name}".rstrip()] = words
+        return lines
 
 
 class Driving:
-    """Records the drives of a node's robot in its ``output_folder``, and learns from them."""
+    """Records drives in the node's ``output_folder``, and learns from them."""
 
-    def __init__(self, node: TrainerNode) -> None:
+    def __init__(self, node: LearningNode) -> None:
         self._node = node
         self._folder: DriveFolder | None = None  # while drives are recorded
-        self._values = {"last drive": ""}  # what the diagnostics say of them
+        self._lines = {"last drive": ""}  # of the diagnostics
         self._is_disk_full = False
         self._shown: GridMap | None = None
         self._slowness = node.create_publisher(OccupancyGrid, "~/slowness", LATCHED)
-        frames, names = Frames(node), node.value("robots")
-        self._robots = [
+        frames = Frames(node)
+        names: list[str] = node.value("robots")
+        self.robots = [
             DrivingRobot(node, frames, name, self._on_drive) for name in names
         ]
-        self._places_of_prior, self._is_speed_wrong = 0, False
-        group = MutuallyExclusiveCallbackGroup()  # it awaits the worker
-        self._learning = node.create_timer(1.0, self._learn_prior, group, clock=STEADY)
+        self._is_speed_wrong = False
+        self._places_of_prior = 0
+        group = MutuallyExclusiveCallbackGroup()  # the callback awaits the worker
+        self._prior_timer = node.create_timer(
+            1.0, self.train_prior, group, clock=STEADY
+        )
         self.start()
 
     def _on_drive(self, by_robot: str, drive: Drive) -> None:
-        place, folder = self._node.map, self._folder
-        if place is None or folder is None:
+        on_map = self._node.map
+        folder = self._folder
+        if on_map is None or folder is None:
             return
         try:
-            learned = folder.add(drive, place.grid)
+            learned = folder.add(drive, on_map.grid)
         except Exception as error:  # the node must survive
-            self._node.fail("a drive taught nothing", error)
+            self._node.fail("the drive could not be learned from", error)
             return
-        last = f"{folder.drives}{by_robot}: {drive.metres:.1f} m, {drive.outcome.value}"
-        if learned:
-            self._node.get_logger().info(f"drive {last}")
-        else:
-            last = f"{last}; it taught nothing: {learned.reason}"
-            self._node.get_logger().warning(f"drive {last}")
-        self._values["last drive"] = last
-        self._node.draw(place.frame, drive.positions)
-
-    def _tell_saved(self, folder: DriveFolder) -> None:
-        self._shown = None
-        speed, given = folder.experience.learned_speed, folder.experience.nominal_speed
-        slow, was_wrong = folder.experience.evidence, self._is_speed_wrong
-        # Where most places are slow, the fastest ones must be, too, to tell of a slow robot.
-        self._is_speed_wrong = slow.open < -WRONG or slow.fastest > WRONG
-        if self._is_speed_wrong and not was_wrong:
-            wrong = f"the robot drives {speed:.3g} m/s in the open, nominal_speed is {given:g}"
-            self._node.get_logger().warning(f"{wrong}; set it before you learn anew")
-        self._values |= {
-            "drives": str(folder.drives),
-            "learned speed (m/s)": f"{speed:.3f}",
-            "places": str(len(slow.table)),
-            "folder": str(folder.folder),
-        }
-        data, path = folder.experience.to_bytes(), folder.experience_path
-        self._node.tell_saved(data, path, folder.save_error)
-
-    async def _learn_prior(self) -> None:
-        """Train the prior, and again once drives have shown a tenth more places."""
-        place, folder = self._node.map, self._folder
-        if place is None or folder is None:
-            return
-        evidence, before = folder.experience.evidence, self._places_of_prior
-        known = len(evidence.table)
-        if not known or before <= known < MORE_PLACES * before:
-            return
-        self._places_of_prior = known
-        given = (
-            place.grid,
-            evidence.table.copy(),
-            evidence.prior,
-            self._node.value("seed"),
+        words = (
+            f"{folder.drives}{by_robot}: {drive.metres:.1f} m, {drive.outcome.value}"
         )
-        training = "ddqn_planner.training.prior_training"  # it imports torch
+        if learned:
+            self._node.get_logger().info(f"drive {words}")
+        else:
+            words = f"{words}; it taught nothing: {learned.reason}"
+            self._node.get_logger().warning(f"drive {words}")
+        self._lines["last drive"] = words
+        self._node.draw(on_map.frame, drive.positions)
+
+    def _on_saved(self, folder: DriveFolder) -> None:
+        experience = folder.experience
+        self._shown = None
+        self._check_speed(folder)
+        self._lines["drives"] = str(folder.drives)
+        self._lines["learned speed (m/s)"] = f"{experience.learned_speed:.3f}"
+        self._lines["places"] = str(len(experience.evidence.table))
+        self._lines["folder"] = str(folder.folder)
+        self._node.tell_saved(
+            experience.to_bytes(), folder.experience_path, folder.save_error
+        )
+
+    def _check_speed(self, folder: DriveFolder) -> None:
+        """Warn when the nominal speed turns out to be wrong."""
+        experience = folder.experience
+        evidence = experience.evidence
+        # Where most places are slow, the fastest places are slow, too, if the robot is.
+        is_wrong = evidence.open < -WRONG_SPEED or evidence.fastest > WRONG_SPEED
+        if is_wrong and not self._is_speed_wrong:
+            speeds = (
+                f"the robot drives {experience.learned_speed:.3g} m/s in the open, "
+                f"nominal_speed is {experience.nominal_speed:g}"
+            )
+            self._node.get_logger().warning(f"{speeds}; set it before you learn anew")
+        self._is_speed_wrong = is_wrong
+
+    async def train_prior(self) -> None:
+        """Train the prior, and again once drives have shown a tenth more places."""
+        on_map = self._node.map
+        folder = self._folder
+        if on_map is None or folder is None:
+            return
+        evidence = folder.experience.evidence
+        places = len(evidence.table)
+        if not self._is_prior_due(places):
+            return
+        self._places_of_prior = places
+        seed: int = self._node.value("seed")
         try:
-            prior = await self._node.worker.call(
-                lambda: import_module(training).prior_of(*given)
+            # A copy of the table, as drives change it meanwhile.
+            prior: Prior | None = await self._node.worker.call(
+                _trained_prior,
+                on_map.grid,
+                evidence.table.copy(),
+                evidence.prior,
+                seed,
             )
         except Exception as error:  # the node must survive
             if isinstance(error, ImportError):
-                self._node.destroy_timer(self._learning)
-            self._node.get_logger().warning(
-                f"the map foretells nothing: {explained(error)}"
-            )
+                self._node.destroy_timer(self._prior_timer)
+            reason = f"the prior was not trained: {explained(error)}"
+            self._node.get_logger().warning(reason)
             return
+        # Meanwhile the drives may have been forgotten, or another folder begun.
         evidence = folder.experience.evidence
-        if (
-            folder is self._folder and len(evidence.table) >= known
-        ):  # else it was forgotten
+        if folder is self._folder and len(evidence.table) >= places:
             folder.experience.prior = prior
             folder.try_to_save()
 
+    def _is_prior_due(self, places: int) -> bool:
+        if places == 0:
+            return False
+        was_forgotten = places < self._places_of_prior
+        return was_forgotten or places >= MORE_PLACES * self._places_of_prior
+
     def _show_slowness(self) -> None:
-        place, folder = self._node.map, self._folder
-        if place is None or folder is None or self._shown is (grid := place.grid):
+        on_map = self._node.map
+        folder = self._folder
+        if on_map is None or folder is None or self._shown is on_map.grid:
             return
         if not self._slowness.get_subscription_count():
             return
+        grid = on_map.grid
         self._shown = grid
-        slowness = folder.experience.slowness(grid)
-        percent = np.clip(100 * np.log(slowness) / np.log(SLOWEST), 0, 100).round()
+        slowness = folder.experience.slowness(grid)  # (H, W), 1 at the nominal speed
+        percent = 100 * np.log(slowness) / np.log(SLOWEST)
+        percent = np.clip(percent, 0, 100).round()
         percent[grid.occupancy] = -1
-        header = self._node.header(place.frame)
+        header = self._node.header(on_map.frame)
         self._slowness.publish(
             occupancy_message(percent, grid.resolution, grid.origin, header)
         )
 
-    # Services, and what the node asks of whatever it learns from
-
-    def start(self) -> tuple[bool, str]:
-        """Record drives, which begin anew."""
+    def start(self) -> Answer:
+        """Record drives; those of before are forgotten where they were not complete."""
+        node = self._node
         if self._folder is not None:
-            return False, "drives are being recorded already; call ~/stop first"
-        names = "nominal_speed", "robot_width", "experience"
+            return Answer(False, "drives are being recorded already; call ~/stop first")
         try:
-            folder = DriveFolder(self._node.folder, *map(self._node.value, names))
+            folder = DriveFolder(
+                node.folder,
+                nominal_speed=node.value("nominal_speed"),
+                robot_width=node.value("robot_width"),
+                older=node.value("experience"),
+            )
         except Exception as error:  # the node must survive
-            self._node.state, self._is_disk_full = "failed", isinstance(error, OSError)
-            return self._node.fail("the recording cannot start", error)
-        self._folder, self._node.state, self._node.error = folder, "recording", ""
-        folder.on_saved = self._tell_saved
-        for robot in self._robots:
+            node.state = "failed"
+            self._is_disk_full = isinstance(error, OSError)
+            return node.fail("the recording cannot start", error)
+        self._folder = folder
+        node.state = "recording"
+        node.error = ""
+        folder.on_saved = self._on_saved
+        for robot in self.robots:
             robot.recorder.forget()
-        self._node.get_logger().info(f"recording drives in {folder.folder}")
+        node.get_logger().info(f"recording drives in {folder.folder}")
         folder.try_to_save()
-        return True, f"recording in {folder.folder} after drive {folder.drives}"
+        return Answer(True, f"recording in {folder.folder} after drive {folder.drives}")
 
-    def stop(self) -> tuple[bool, str]:
-        """Record the drive that is under way, save, and record no more."""
-        if (folder := self._folder) is None:
+    def stop(self) -> Answer:
+        """Record the drive that a robot is on, save, and record no more."""
+        folder = self._folder
+        if folder is None:
             self._node.state = "stopped"
-            return True, "no drives were being recorded"
-        for robot in self._robots:
+            return Answer(True, "no drives were being recorded")
+        for robot in self.robots:
             robot.recorder.end()
         folder.try_to_save()
         if folder.save_error:
-            return False, folder.save_error
+            return Answer(False, folder.save_error)
         folder.close()
-        self._folder, self._node.state = None, "stopped"
-        return True, f"stopped after drive {folder.drives}; ~/start continues"
+        self._folder = None
+        self._node.state = "stopped"
+        return Answer(True, f"stopped after drive {folder.drives}; ~/start continues")
 
-    def save(self) -> tuple[bool, str]:
+    def close(self) -> None:
+        """Record the drive that a robot is on, and save."""
+        self.stop()
+
+    def save(self) -> Answer:
         """Save now."""
-        if (folder := self._folder) is None:
-            return False, NOT_RECORDING
+        folder = self._folder
+        if folder is None:
+            return Answer(False, NOT_RECORDING)
         folder.try_to_save()
-        return not folder.save_error, folder.save_error or f"saved in {folder.folder}"
+        if folder.save_error:
+            return Answer(False, folder.save_error)
+        return Answer(True, f"saved in {folder.folder}")
 
-    def forget(self) -> tuple[bool, str]:
+    def forget(self) -> Answer:
         """Forget what was learned."""
-        if (folder := self._folder) is None:
-            return False, NOT_RECORDING
+        folder = self._folder
+        if folder is None:
+            return Answer(False, NOT_RECORDING)
         try:
-            kept = folder.forget()
+            backup = folder.forget()
         except OSError as error:
-            return False, explained(error)
+            return Answer(False, explained(error))
+        if folder.save_error:
+            return Answer(False, folder.save_error)
         name = folder.experience_path.name
         undo = f"to undo it, call ~/stop, rename that file to {name}, and call ~/start"
-        done = f"forgot all but the drives. {kept} has what was known: {undo}"
-        return not folder.save_error, folder.save_error or done
+        done = f"forgot all but the drives. {backup} has what was known"
+        return Answer(True, f"{done}: {undo}")
 
-    def recorded(self, file: Path, place: MapInFrame) -> tuple[str, Iterator[Float64]]:
-        """Return the drives of a file, and the frame of their map."""
-        # Of all poses a replay would take long.
-        return place.frame, (drive.positions[::5] for drive in read_drives(file))
+    def recorded(self, file: Path, on_map: MapInFrame) -> Recording:
+        """Return the drives of a file."""
+        paths = (drive.positions[::REPLAY_STRIDE] for drive in read_drives(file))
+        return Recording(on_map.frame, paths)
 
     def look(self) -> dict[str, str]:
-        """Try again what failed for a full disk, show what is learned, and tell of it."""
+        """Save again after a full disk, show the slowness; return diagnostics."""
         if self._folder is not None and self._folder.save_error:
             self._folder.try_to_save()
         elif self._node.state == "failed" and self._is_disk_full:
             self.start()
         self._show_slowness()
-        for robot in self._robots:
-            self._values |= robot.told()
-        return self._values
+        for robot in self.robots:
+            self._lines |= robot.describe()
+        return self._lines
 
 
-def explained(error: Exception) -> str:
-    """Return what an error says, with a remedy for the disk and for libraries."""
-    if isinstance(error, ImportError):
-        return f"training needs another library: {with_remedy(error)}"
-    if isinstance(error, OSError):
-        return f"{error}; set output_folder to a folder that can be written"
-    is_clear = isinstance(error, (ValueError, MemoryError)) and str(error)
-    return str(error) if is_clear else repr(error)
+def _trained_prior(
+    grid: GridMap, table: Float64, older: Prior | None, seed: int
+) -> Prior | None:
+    from ddqn_planner.training.prior_training import prior_of  # it imports torch
+
+    return prior_of(grid, table, older, seed)

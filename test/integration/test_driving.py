@@ -366,7 +366,7 @@ def test_a_fleet_teaches_one_trainer_and_each_robot_plans_by_all(
         sites[0].send_goal(9.0, 9.0)
         sites[0].move([UPPER[2]], 0.5)  # it is under way when the trainer is killed
         node.wait_for_log("drive 3 by three: 23")
-        node.wait_for_log("the map foretells nothing: training needs another library")
+        node.wait_for_log("the prior was not trained: training needs another library")
         folder.rename(tmp_path / "moved")
         remaps = [f"{topic}:=/fleet/{topic}" for topic in ("map", "trainer/experience")]
         parameters = {"follow_trainer": True, "move_rule": "robot_safe"}
@@ -378,7 +378,7 @@ def test_a_fleet_teaches_one_trainer_and_each_robot_plans_by_all(
             assert is_above(robot.get_plan(*ends))
     sites[0].folder = tmp_path / "moved"
     assert sites[0].outcomes == ["arrived"] * 3
-    assert node.log.count("the map foretells nothing") == 1
+    assert node.log.count("the prior was not trained") == 1
 
 
 def test_a_kill_loses_nothing_but_the_drive_under_way_and_an_end_not_even_that(

@@ -1,0 +1,150 @@
+"""What a learner knows of the trainer node, and the node of a learner."""
+
+from __future__ import annotations
+
+from collections.abc import Coroutine, Iterator
+from pathlib import Path as FilePath
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from nav_msgs.msg import Path
+from numpy.typing import NDArray
+from std_msgs.msg import String, UInt8MultiArray
+
+from ddqn_planner.files import as_path
+from ddqn_planner.grid import GridMap
+from ddqn_planner.nodes.base_node import BaseNode
+from ddqn_planner.nodes.conversions import bytes_message, path_bytes
+from ddqn_planner.nodes.declared import Parameters
+from ddqn_planner.nodes.diagnostics import Diagnostics
+from ddqn_planner.nodes.quality import LATCHED
+from ddqn_planner.nodes.worker import Worker
+from ddqn_planner.resources import with_remedy
+
+Float64 = NDArray[np.float64]
+
+NO_MAP = "no map was received yet; start a map server, or set map_file"
+
+
+class MapInFrame(NamedTuple):
+    """A map, and the frame of its origin."""
+
+    grid: GridMap
+    frame: str
+
+
+class Answer(NamedTuple):
+    """The answer of a service of ``std_srvs/Trigger``."""
+
+    success: bool
+    message: str
+
+
+class Recording(NamedTuple):
+    """Episodes or drives of a file."""
+
+    frame: str  # of the map that they are on
+    paths: Iterator[Float64]  # (N, 2) metres each
+
+
+class Learner(Protocol):
+    """What learns for the node: a training in simulation, or the drives of robots."""
+
+    def start(self) -> Answer | Coroutine[None, None, Answer]:
+        """Begin to learn, or continue."""
+
+    def stop(self) -> Answer:
+        """Save, and learn no more."""
+
+    def save(self) -> Answer:
+        """Save."""
+
+    def recorded(self, file: FilePath, on_map: MapInFrame) -> Recording:
+        """Return the paths of a file; they lie on a map unless it is known better."""
+
+    def look(self) -> dict[str, str]:
+        """Do what is due each second; return lines for the diagnostics."""
+
+    def close(self) -> None:
+        """Stop, and wait until everything is saved."""
+
+
+class LearningNode(BaseNode):
+    """The node of a learner: its map, its folder, its state, and what it publishes."""
+
+    def __init__(self, name: str, parameters: Parameters) -> None:
+        super().__init__(name, parameters)
+        self.map: MapInFrame | None = None
+        self.diagnostics = Diagnostics(self)
+        self.worker = Worker(self)
+        self.state = "idle"
+        self.error = ""
+        self.save_error = ""
+        self.is_replaying = False
+        self.is_driving: bool = self.value("learn_from") == "driving"
+        self._product = "experience" if self.is_driving else "model"
+        self._episodes = self.create_publisher(Path, "~/episode", 10)
+        self._saved_files = self.create_publisher(
+            String, f"~/{self._product}_saved", LATCHED
+        )
+        self._products = self.create_publisher(
+            UInt8MultiArray, f"~/{self._product}", LATCHED
+        )
+
+    @property
+    def folder(self) -> FilePath:
+        """The parameter ``output_folder``."""
+        return as_path(self.value("output_folder"), "output_folder").absolute()
+
+    def fail(self, activity: str, error: Exception) -> Answer:
+        """Log an error, and keep it for the diagnostics; return a service's answer."""
+        message = f"{activity}: {explained(error)}"
+        if message != self.error:  # the learner may try again each second
+            self.get_logger().error(message)
+        self.error = message
+        return Answer(False, explained(error))
+
+    def tell_saved(self, data: bytes, path: FilePath, error: str) -> None:
+        """Publish what was learned, and where it is saved.
+
+        Parameters
+        ----------
+        data
+            The model or the experience.
+        path
+            Its file.
+        error
+            Why it cannot be saved; empty if it is saved. It is logged once.
+        """
+        self._products.publish(bytes_message(self._product, data))
+        if error and not self.save_error:
+            self.get_logger().error(error)
+        if self.save_error and not error:
+            self.get_logger().info(f"the {self._product} is saved again")
+        self.save_error = error
+        if not error:
+            self._saved_files.publish(String(data=str(path)))
+
+    def draw(self, frame: str, positions: Float64) -> None:
+        """Publish an episode or a drive (N, 2), unless a replay is shown."""
+        if not self.is_replaying:
+            self.publish_episode(frame, positions)
+
+    def publish_episode(self, frame: str, positions: Float64) -> None:
+        """Publish an episode or a drive, (N, 2) metres; each pose faces the next."""
+        steps = np.diff(positions, axis=0)  # (N - 1, 2)
+        yaw = np.arctan2(steps[:, 1], steps[:, 0])
+        last_yaw = yaw[-1] if len(yaw) else 0.0
+        yaw = np.append(yaw, last_yaw)  # (N,)
+        self._episodes.publish(path_bytes(positions, yaw, self.header(frame)))
+
+
+def explained(error: Exception) -> str:
+    """Return an error in words, with a remedy for the disk and for libraries."""
+    if isinstance(error, ImportError):
+        return f"training needs another library: {with_remedy(error)}"
+    if isinstance(error, OSError):
+        return f"{error}; set output_folder to a folder that can be written"
+    if isinstance(error, (ValueError, MemoryError)) and str(error):
+        return str(error)
+    return repr(error)
