@@ -21,7 +21,9 @@ Cells: TypeAlias = (
 )  # of a path: pairs, or (N, 2)
 Occupancy: TypeAlias = NDArray[np.bool_]  # (H, W): True where a cell is occupied
 
-OCCUPIED, UNKNOWN = 100, -1  # values of ``nav_msgs/OccupancyGrid``
+# Values of ``nav_msgs/OccupancyGrid``.
+OCCUPIED = 100
+UNKNOWN = -1
 MAX_SLOWNESS = 100.0  # the time and memory of a field grow with the costliest move
 POSITIVE = math.ulp(0.0), sys.float_info.max  # the range of finite numbers above 0
 
@@ -43,9 +45,9 @@ class Choice(str, Enum, metaclass=_ByHash):
 
     @classmethod
     def _missing_(cls, value: object) -> Choice:
-        known = ", ".join(member.value for member in cls)
+        choices = ", ".join(member.value for member in cls)
         raise ValueError(
-            f"{cls.__name__} {reprlib.repr(value)} is unknown; give one of {known}"
+            f"{cls.__name__} {reprlib.repr(value)} is unknown; give one of {choices}"
         )
 
 
@@ -58,8 +60,9 @@ def as_cell(cell: Any, name: str = "the cell") -> Cell:
     """Return a pair of whole numbers, as a list or an array, as Python ints."""
     try:
         if len(cell) == 2 and not any(map(is_flag, cell)):
-            x, y = int(cell[0]), int(cell[1])
-            if (x, y) == (cell[0], cell[1]):
+            x = int(cell[0])
+            y = int(cell[1])
+            if x == cell[0] and y == cell[1]:
                 return x, y
     except (TypeError, ValueError, OverflowError, LookupError):
         pass
@@ -114,11 +117,11 @@ def as_number(
     name: str, value: Any, lowest: float, highest: float, remedy: str = ""
 ) -> float:
     """Return a number from `lowest` to `highest` as a float."""
-    if lowest <= (number := real(value)) <= highest:
+    number = real(value)
+    if lowest <= number <= highest:
         return number
-    raise ValueError(
-        f"{name} is {_short(value)}; give {remedy or f'{lowest:g} to {highest:g}'}"
-    )
+    remedy = remedy or f"{lowest:g} to {highest:g}"
+    raise ValueError(f"{name} is {_short(value)}; give {remedy}")
 
 
 def as_whole(name: str, value: Any, lowest: int, highest: int) -> int:
@@ -182,20 +185,20 @@ def numbers(
     if between is None or array.dtype.kind == "b" or array.size == 0:
         return array
     lowest, highest = between
-    fractions = (
-        whole and array.dtype.kind == "f" and not (array == np.floor(array)).all()
-    )
-    if fractions or not lowest <= array.min() <= array.max() <= highest:  # or NaN
-        right = (
-            (array >= lowest)
-            & (array <= highest)
-            & (not whole or array == np.floor(array))
-        )
-        remedy = (
-            remedy or f"{'whole numbers ' if whole else ''}{lowest:g} to {highest:g}"
-        )
-        raise ValueError(f"{name} holds {array[~right].flat[0]}; give {remedy}")
-    return array
+    are_whole = not whole or array.dtype.kind != "f" or _all_whole(array)
+    if are_whole and lowest <= array.min() <= array.max() <= highest:  # not NaN
+        return array
+    right = (array >= lowest) & (array <= highest)
+    if whole:
+        right &= array == np.floor(array)
+    if not remedy:
+        kind = "whole numbers " if whole else ""
+        remedy = f"{kind}{lowest:g} to {highest:g}"
+    raise ValueError(f"{name} holds {array[~right].flat[0]}; give {remedy}")
+
+
+def _all_whole(array: NDArray[Any]) -> bool:
+    return bool((array == np.floor(array)).all())
 
 
 def _refuse_flags(name: str, values: ArrayLike) -> None:

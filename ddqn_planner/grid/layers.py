@@ -89,10 +89,10 @@ def move_costs(multiplier: NDArray[np.float32]) -> NDArray[np.float64]:
     multiplier : (H, W) float32
         See `GridMap.cost_multiplier`.
     """
-    before = multiplier.astype(np.float64)  # (H, W)
-    padded = np.pad(before, 1, mode="edge")
-    after = np.stack([shifted(padded, dx, dy) for dx, dy in MOVES.tolist()])
-    sums = before + after  # (8, H, W)
+    multiplier_of_cell = multiplier.astype(np.float64)  # (H, W)
+    padded = np.pad(multiplier_of_cell, 1, mode="edge")
+    multipliers_of_targets = [shifted(padded, dx, dy) for dx, dy in MOVES.tolist()]
+    sums = multiplier_of_cell + np.stack(multipliers_of_targets)  # (8, H, W)
     costs: NDArray[np.float64] = LENGTHS[:, None, None] * sums / 2
     return costs
 
@@ -147,9 +147,9 @@ def cost_of_move(x: int, y: int, action: int, layers: Layers) -> Any:
     dx = MOVES[action, 0]
     dy = MOVES[action, 1]
     one = np.float64(1)
-    before = multiplier_at(x, y, one, layers)
-    after = multiplier_at(x + dx, y + dy, one, layers)
-    return LENGTHS[action] * (before + after) / 2
+    multiplier = multiplier_at(x, y, one, layers)
+    multiplier_of_target = multiplier_at(x + dx, y + dy, one, layers)
+    return LENGTHS[action] * (multiplier + multiplier_of_target) / 2
 
 
 @inlined

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,8 @@ KEYS = {
     "free_thresh",
     "mode",
 }
+
+SCENARIO_KEYS = {"start", "goal", "directions"}
 
 # In other layouts Pillow drops bits, or map_server takes the fourth byte of a pixel as
 # its opacity.
@@ -92,13 +94,17 @@ class MapFile:
         grid = GridMap(
             values == OCCUPIED, self.resolution, self.origin, forbidden=self.forbidden
         )
-        checked = {
-            name: getattr(grid, name) for name in ("resolution", "origin", "forbidden")
-        }
-        for name in ("start", "goal"):
-            if (cell := getattr(self, name)) is not None:
-                checked[name] = cell_inside(cell, values.shape, name)
-        vars(self).update(checked, values=values)  # the dataclass is frozen
+        self._set("values", values)
+        self._set("resolution", grid.resolution)
+        self._set("origin", grid.origin)
+        self._set("forbidden", grid.forbidden)
+        if self.start is not None:
+            self._set("start", cell_inside(self.start, values.shape, "start"))
+        if self.goal is not None:
+            self._set("goal", cell_inside(self.goal, values.shape, "goal"))
+
+    def _set(self, name: str, value: object) -> None:
+        object.__setattr__(self, name, value)  # the dataclass is frozen
 
     def grid(
         self,
@@ -107,9 +113,14 @@ class MapFile:
         use_map_costs: bool = False,
     ) -> GridMap:
         """Return the grid map; for parameters see `GridMap.from_occupancy_values`."""
-        options = (occupied_threshold, allow_unknown, use_map_costs, self.forbidden)
         return GridMap.from_occupancy_values(
-            self.values, self.resolution, self.origin, *options
+            self.values,
+            self.resolution,
+            self.origin,
+            occupied_threshold=occupied_threshold,
+            allow_unknown=allow_unknown,
+            use_map_costs=use_map_costs,
+            forbidden=self.forbidden,
         )
 
 
@@ -169,7 +180,8 @@ def read_map_file(path: str | Path, only_below: bool = False) -> MapFile:
         path = as_path(path)
     except ValueError as error:
         raise MapNotFoundError(str(error)) from None
-    if kind := kind_of(path):
+    kind = kind_of(path)
+    if kind:
         raise MapNotFoundError(f"{str(path)!r} is {kind}; give the path of a map file")
     if not os.path.isfile(path):
         raise MapNotFoundError(f"{str(path)!r}: no such file; give the path of a map")
@@ -178,8 +190,9 @@ def read_map_file(path: str | Path, only_below: bool = False) -> MapFile:
             f"{path}: ends in {path.suffix!r}; give a .yaml, .yml or .map file"
         )
     try:
-        is_moving_ai = path.suffix.lower() == ".map"
-        return _read_moving_ai(path) if is_moving_ai else _read_ros(path, only_below)
+        if path.suffix.lower() == ".map":
+            return _read_moving_ai(path)
+        return _read_ros(path, only_below)
     except MapFileError:
         raise
     except ValueError as error:
@@ -207,25 +220,25 @@ def _read_moving_ai(path: Path) -> MapFile:
         raise ValueError(
             f"begins with {content[:40]!r}; the first four lines must be {lines}"
         )
-    height, width = int(header[1]), int(header[2])
+    height = int(header[1])
+    width = int(header[2])
     if not 1 <= height * width <= MAX_CELLS:
         raise ValueError(
             f"height is {height}, width is {width}; give 1 to {MAX_CELLS} cells"
         )
-    rows = content[header.end() :].replace(b"\r\n", b"\n").rstrip(b"\n") + b"\n"
-    count, cells = rows.count(b"\n"), np.frombuffer(rows, dtype=np.uint8)
-    ends = cells[width :: width + 1]
-    if (
-        cells.size != height * (width + 1)
-        or count != height
-        or (ends != ord("\n")).any()
-    ):
-        right = f"{height} rows of {width}, as its header says"
+    text = content[header.end() :].replace(b"\r\n", b"\n").rstrip(b"\n") + b"\n"
+    rows = text.count(b"\n")
+    characters = np.frombuffer(text, dtype=np.uint8)
+    ends_of_rows = characters[width :: width + 1]
+    has_size = rows == height and characters.size == height * (width + 1)
+    if not has_size or (ends_of_rows != ord("\n")).any():
+        remedy = f"give {height} rows of {width}, as its header says"
         raise MapDataError(
-            f"{path}: has {count} rows, {cells.size - count} cells; give {right}"
+            f"{path}: has {rows} rows, {characters.size - rows} cells; {remedy}"
         )
-    free = np.isin(cells.reshape(height, width + 1)[:, :-1], list(b".GS"))
-    return MapFile(np.where(free, np.int8(0), np.int8(OCCUPIED)), files=(path,))
+    cells = characters.reshape(height, width + 1)[:, :-1]
+    is_free = np.isin(cells, list(b".GS"))
+    return MapFile(np.where(is_free, np.int8(0), np.int8(OCCUPIED)), files=(path,))
 
 
 def _read_ros(path: Path, only_below: bool) -> MapFile:
@@ -235,31 +248,47 @@ def _read_ros(path: Path, only_below: bool) -> MapFile:
             "not a YAML mapping; give 'key: value' lines: image, resolution, ..."
         )
     image = _image_path(path, document, "image", only_below)
-    grey, clear = _read_image(image, ("PPM", "PNG", "BMP", "JPEG"), LAYOUTS)
+    pixels = _read_image(image, ("PPM", "PNG", "BMP", "JPEG"), LAYOUTS)
     mode = _choice({"mode": "trinary", **document}, "mode", ("trinary", "scale", "raw"))
-    values = _percent_of_grey(document, mode)[grey]
+    values = _percent_of_grey(document, mode)[pixels.grey]
     if mode != "raw":
-        values[clear] = UNKNOWN
-    resolution, origin = _numbers(document, "resolution"), _numbers(document, "origin")
-    ours = document.get("ddqn_planner", {})
-    if not isinstance(ours, dict) or not ours.keys() <= {"start", "goal", "directions"}:
+        values[pixels.is_clear] = UNKNOWN
+    resolution = _numbers(document, "resolution")
+    origin = _numbers(document, "origin")
+    scenario = document.get("ddqn_planner", {})
+    if not isinstance(scenario, dict) or not scenario.keys() <= SCENARIO_KEYS:
         keys = "{start: , goal: , directions: }"
-        raise ValueError(f"ddqn_planner is {_short(ours)}; give some of {keys}")
-    forbidden, files = None, [path, image]
-    if "directions" in ours:
-        directions = _image_path(path, ours, "directions", only_below)
-        forbidden, _ = _read_image(directions, ("PPM", "PNG"), {"L"})
-        name = ours.pop("directions")
+        raise ValueError(f"ddqn_planner is {_short(scenario)}; give some of {keys}")
+    files = [path, image]
+    forbidden = None
+    if "directions" in scenario:
+        directions = _image_path(path, scenario, "directions", only_below)
         files.append(directions)
-        if forbidden.shape != values.shape:
-            has, right = (f"{w} x {h}" for h, w in (forbidden.shape, values.shape))
-            raise MapDataError(
-                f"{name!r}: has {has} pixels; give {right}, as the map's image"
-            )
-        forbidden = forbidden[::-1]
-    cells = {name: _numbers(ours, name) for name in ours}
-    place = values[::-1], resolution, origin
-    return MapFile(*place, **cells, forbidden=forbidden, files=tuple(files))
+        forbidden = _read_directions(directions, scenario["directions"], values.shape)
+    return MapFile(
+        values[::-1],
+        resolution,
+        origin,
+        start=_numbers(scenario, "start") if "start" in scenario else None,
+        goal=_numbers(scenario, "goal") if "goal" in scenario else None,
+        forbidden=forbidden,
+        files=tuple(files),
+    )
+
+
+def _read_directions(
+    file: Path, name: str, shape: tuple[int, ...]
+) -> NDArray[np.uint8]:
+    """Return the directions, (H, W), of an image that a YAML file calls `name`."""
+    forbidden = _read_image(file, ("PPM", "PNG"), {"L"}).grey
+    if forbidden.shape != shape:
+        height, width = forbidden.shape
+        map_height, map_width = shape
+        raise MapDataError(
+            f"{name!r}: has {width} x {height} pixels; give {map_width} x "
+            f"{map_height}, as the map's image"
+        )
+    return forbidden[::-1]
 
 
 def _image_path(
@@ -276,20 +305,25 @@ def _image_path(
         problem = f"{key} is {name!r}, outside of the folder of the YAML"
         reason = "a service reads no other files"
         raise ValueError(f"{problem}, and {reason}; put it beside")
-    if kind := kind_of(file):
+    kind = kind_of(file)
+    if kind:
         raise MapDataError(
             f"{str(file)!r} is {kind}; give an image as {key!r} in the YAML file"
         )
     if not os.path.isfile(file):
-        # Often the absolute path of the computer on which the map was saved.
-        beside = re.split(r"[/\\]", name)[-1]
-        remedy = f"check {key!r} in the YAML file"
-        if beside != name and beside and os.path.isfile(path.parent / beside):
-            remedy = (
-                f"{beside!r} lies beside the YAML file: write '{key}: {beside}' there"
-            )
+        remedy = _remedy_for_missing_image(path, key, name)
         raise MapDataError(f"{str(file)!r}: no such image; {remedy}")
     return file
+
+
+def _remedy_for_missing_image(path: Path, key: str, name: str) -> str:
+    # The name is often the absolute path of the computer on which the map was saved.
+    file_name = re.split(r"[/\\]", name)[-1]
+    is_other = file_name not in ("", name)
+    if is_other and os.path.isfile(path.parent / file_name):
+        remedy = f"write '{key}: {file_name}' there"
+        return f"{file_name!r} lies beside the YAML file: {remedy}"
+    return f"check {key!r} in the YAML file"
 
 
 def _is_below(file: Path, path: Path) -> bool:
@@ -299,10 +333,15 @@ def _is_below(file: Path, path: Path) -> bool:
     return any(file.resolve().is_relative_to(folder) for folder in folders)
 
 
-def _read_image(
-    file: Path, formats: tuple[str, ...], layouts: set[str]
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Return an image's grey values, and which pixels are not opaque."""
+class Pixels(NamedTuple):
+    """The pixels of an image."""
+
+    grey: NDArray[np.uint8]  # (H, W)
+    is_clear: NDArray[np.bool_]  # (H, W): whether they are not opaque
+
+
+def _read_image(file: Path, formats: tuple[str, ...], layouts: set[str]) -> Pixels:
+    """Read an image of some of Pillow's formats and layouts."""
     from PIL import Image  # 17 ms, and a planner that is sent its maps reads no image
 
     too_large = Image.DecompressionBombWarning, Image.DecompressionBombError
@@ -312,7 +351,7 @@ def _read_image(
             image = Image.open(file, formats=formats)
         with image:
             _check_layout(image, layouts)
-            return _grey(image)
+            return _pixels(image)
     except too_large as error:  # Pillow has another limit
         pixels = re.search(r"\d+", str(error))
         problem = f"{pixels[0]} pixels" if pixels else "too many pixels"
@@ -354,32 +393,40 @@ def _check_layout(image: Any, layouts: set[str]) -> None:
         )
 
 
-def _grey(image: Any) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Return map_server's grey values, and which pixels are not opaque.
-
-    The values are 16-bit Rec. 601 luma.
-    """
-    if image.mode.startswith("I"):
-        grey = np.asarray(image) // 257
-    elif image.mode in ("1", "L", "LA"):
-        grey = np.asarray(image.convert("L"))
-    else:
-        colours = image.convert("RGBA" if image.mode == "P" else "RGB")
-        red, green, blue = np.moveaxis(np.asarray(colours, dtype=np.int32), 2, 0)[:3]
-        # The luma is rounded to 16 bits, and cut to 8.
-        grey = (257 * (299 * red + 587 * green + 114 * blue) + 500) // 1000 // 257
-    clear = np.zeros(grey.shape, dtype=np.bool_)
+def _pixels(image: Any) -> Pixels:
+    """Return the pixels of an image, grey as map_server sees them."""
+    is_clear = np.zeros((image.height, image.width), dtype=np.bool_)
     if "A" in image.getbands() or "transparency" in image.info:
-        clear = np.asarray(image.convert("RGBA").getchannel("A")) < 255
-    return grey.astype(np.uint8, copy=False), clear
+        opacity = np.asarray(image.convert("RGBA").getchannel("A"))
+        is_clear = opacity < 255
+    return Pixels(_grey(image).astype(np.uint8, copy=False), is_clear)
+
+
+def _grey(image: Any) -> NDArray[np.integer[Any]]:
+    """Return map_server's grey values: 16-bit Rec. 601 luma, cut to 8 bits."""
+    if image.mode.startswith("I"):
+        return np.asarray(image) // 257
+    if image.mode in ("1", "L", "LA"):
+        return np.asarray(image.convert("L"))
+    colours = image.convert("RGBA" if image.mode == "P" else "RGB")
+    channels = np.moveaxis(np.asarray(colours, dtype=np.int32), 2, 0)
+    red = channels[0]
+    green = channels[1]
+    blue = channels[2]
+    luma = 257 * (299 * red + 587 * green + 114 * blue)
+    rounded_luma = (luma + 500) // 1000  # 16 bits
+    grey: NDArray[np.int32] = rounded_luma // 257
+    return grey
 
 
 def _value(document: dict[str, Any], key: str) -> Any:
     """Return the value of a key; a ValueError names a key that looks like it."""
     if key in document:
         return document[key]
-    near = difflib.get_close_matches(key, document.keys() - KEYS, 1)
-    remedy = f"write '{key}:' instead of '{near[0]}:'" if near else f"add '{key}: ...'"
+    remedy = f"add '{key}: ...'"
+    similar_keys = difflib.get_close_matches(key, document.keys() - KEYS, 1)
+    if similar_keys:
+        remedy = f"write '{key}:' instead of '{similar_keys[0]}:'"
     raise ValueError(f"{key} is missing; {remedy}")
 
 
@@ -394,45 +441,51 @@ def _numbers(document: dict[str, Any], key: str) -> Any:
     """Return a number or a list of numbers, of any length."""
     value = _value(document, key)
     try:
-        return [*map(as_float, value)] if isinstance(value, list) else as_float(value)
+        if isinstance(value, list):
+            return [as_float(number) for number in value]
+        return as_float(value)
     except ValueError:
         raise ValueError(f"{key} is {_short(value)}; give numbers") from None
 
 
 def _percent_of_grey(document: dict[str, Any], mode: str) -> NDArray[np.int8]:
     """Return (256,) int8: the occupancy of each grey value, by map_server's rules."""
-    keys = "free_thresh", "occupied_thresh"
-    free_thresh, occupied_thresh = (
-        as_number(key, _numbers(document, key), 0, 1) for key in keys
+    free_thresh = as_number("free_thresh", _numbers(document, "free_thresh"), 0, 1)
+    occupied_thresh = as_number(
+        "occupied_thresh", _numbers(document, "occupied_thresh"), 0, 1
     )
     if free_thresh > occupied_thresh:
         raise ValueError(
             f"free_thresh is {free_thresh}; give at most {occupied_thresh}"
         )
-    negate = _value(document, "negate")
-    try:
-        is_negated = as_truth(negate)
-    except ValueError:
-        problem = f"negate is {_short(negate)}"
-        raise ValueError(f"{problem}; give 0 or 1, or true or false") from None
+    is_negated = _truth(document, "negate")
     grey = np.arange(256)
     if mode == "raw":
-        return np.where(grey <= 100, grey, -1).astype(np.int8)
+        return np.where(grey <= 100, grey, UNKNOWN).astype(np.int8)
     # map_server computes in single precision, and a grey value may equal a threshold.
-    free, occupied = np.float32(free_thresh), np.float32(occupied_thresh)
-    p = grey.astype(np.float32) / np.float32(255)
+    free = np.float32(free_thresh)
+    occupied = np.float32(occupied_thresh)
+    darkness = grey.astype(np.float32) / np.float32(255)
     if not is_negated:
-        p = np.float32(1) - p
-    percent = np.full(256, -1.0)
+        darkness = np.float32(1) - darkness
+    percent = np.full(256, float(UNKNOWN))
     if mode == "scale":
-        between = (free < p) & (p < occupied)
+        is_between = (free < darkness) & (darkness < occupied)
         # map_server subtracts the thresholds in double precision.
-        scaled = (
-            (p[between] - free)
-            / np.float32(occupied_thresh - free_thresh)
-            * np.float32(100)
-        )
-        percent[between] = np.floor(scaled) + (scaled - np.floor(scaled) >= 0.5)
-    percent[p >= occupied] = 100
-    percent[p <= free] = 0
+        width = np.float32(occupied_thresh - free_thresh)
+        scaled = (darkness[is_between] - free) / width * np.float32(100)
+        rounded_down = np.floor(scaled)
+        percent[is_between] = rounded_down + (scaled - rounded_down >= 0.5)
+    percent[darkness >= occupied] = 100
+    percent[darkness <= free] = 0
     return percent.astype(np.int8)
+
+
+def _truth(document: dict[str, Any], key: str) -> bool:
+    """Return the truth value of a key."""
+    value = _value(document, key)
+    try:
+        return as_truth(value)
+    except ValueError:
+        problem = f"{key} is {_short(value)}"
+        raise ValueError(f"{problem}; give 0 or 1, or true or false") from None

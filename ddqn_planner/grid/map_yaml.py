@@ -118,18 +118,20 @@ def read_yaml(content: bytes) -> Any:
 
 
 def _decoded(content: bytes) -> str:
-    encoding = "utf-8"
-    for mark, name in ENCODINGS:
-        if content.startswith(mark):
-            encoding = name
-            break
-    else:
-        for pattern, name in WITHOUT_MARK:
-            if re.match(pattern, content):
-                encoding = name
-                break
+    encoding = _encoding_of(content)
     errors = "surrogateescape" if encoding.startswith("utf-8") else "replace"
     return content.decode(encoding, errors)
+
+
+def _encoding_of(content: bytes) -> str:
+    """Return the encoding that yaml-cpp takes the first bytes of a file for."""
+    for mark, encoding in ENCODINGS:
+        if content.startswith(mark):
+            return encoding
+    for pattern, encoding in WITHOUT_MARK:
+        if re.match(pattern, content):
+            return encoding
+    return "utf-8"
 
 
 def as_float(text: Any) -> float:
@@ -147,16 +149,28 @@ def as_truth(text: Any) -> bool:
 
     A scalar that is neither true nor false is a ValueError.
     """
-    if isinstance(text, str):
-        if whole := INTEGER.fullmatch(text):
-            sign, hexadecimal, octal, decimal = whole.groups()
-            number = int(
-                hexadecimal or octal or decimal,
-                16 if hexadecimal else 8 if octal else 10,
-            )
-            if number < 2**31 + (sign == "-"):
-                return number != 0
-        word = text.lower()
-        if word in YES + NO and text in (word, word.upper(), word.capitalize()):
-            return word in YES
+    if not isinstance(text, str):
+        raise ValueError(f"{text!r} is no truth value")
+    integer = INTEGER.fullmatch(text)
+    if integer is not None and _fits_into_int(integer):
+        return _magnitude(integer) != 0
+    word = text.lower()
+    if word in YES + NO and text in (word, word.upper(), word.capitalize()):
+        return word in YES
     raise ValueError(f"{text!r} is no truth value")
+
+
+def _fits_into_int(integer: re.Match[str]) -> bool:
+    """Return whether C++ can hold a match of `INTEGER` as an int."""
+    is_negative = integer[1] == "-"
+    return _magnitude(integer) < 2**31 + is_negative
+
+
+def _magnitude(integer: re.Match[str]) -> int:
+    """Return the number of a match of `INTEGER`, without its sign."""
+    _, hexadecimal, octal, decimal = integer.groups()
+    if hexadecimal:
+        return int(hexadecimal, 16)
+    if octal:
+        return int(octal, 8)
+    return int(decimal)
