@@ -3,12 +3,14 @@
 import json
 import os
 import reprlib
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final, get_origin
+from typing import Final
 
 import numpy as np
 import safetensors.numpy
+from numpy.typing import NDArray
 from safetensors import SafetensorError
 
 from ddqn_planner.files import as_path, kind_of, read_file, write_atomically
@@ -47,9 +49,17 @@ class ModelMetadata:
     package_version: str
 
 
-# The types of its entries in JSON.
-TYPES: Any = {f.name: (get_origin(f.type) or f.type,) for f in fields(ModelMetadata)}
-TYPES |= {"move_rule": (str,), "gamma": (float, int)}
+# The types of the entries of `ModelMetadata` in JSON.
+TYPES: Final[dict[str, tuple[type, ...]]] = {
+    "network": (str,),
+    "sizes": (dict,),
+    "move_rule": (str,),
+    "gamma": (float, int),
+    "map_fingerprint": (str,),
+    "steps": (int,),
+    "seed": (int,),
+    "package_version": (str,),
+}
 
 
 def package_version() -> str:
@@ -69,7 +79,8 @@ def find_model(name: str | Path) -> Path:
     except ValueError as error:
         raise ModelFileError(str(error)) from None
     if path.suffix == MODEL_SUFFIX or path.name != str(name):
-        if kind := kind_of(path):
+        kind = kind_of(path)
+        if kind:
             raise ModelFileError(
                 f"the model {str(path)!r} is {kind}; give a model file"
             )
@@ -90,13 +101,19 @@ def save_model(path: str | Path, network: QNetwork, description: ModelMetadata) 
 
 
 def model_bytes(network: QNetwork, description: ModelMetadata) -> bytes:
-    """Return what a model file holds."""
+    """Return the content of a model file."""
     text = json.dumps(asdict(description))
     return bytes(safetensors.numpy.save(network.tensors, {METADATA_KEY: text}))
 
 
 def load_model(name: str | Path) -> tuple[QNetwork, ModelMetadata]:
-    """Read a model file, given by path or a shipped model's name; else raise ModelFileError."""
+    """Read a model file, given by its path or by a shipped model's name.
+
+    Raises
+    ------
+    ModelFileError
+        If there is no such file, or it cannot be used.
+    """
     path = find_model(name)
     try:
         content = read_file(path, MAX_FILE_BYTES)
@@ -112,79 +129,107 @@ def load_model(name: str | Path) -> tuple[QNetwork, ModelMetadata]:
 
 
 def model_of(data: bytes) -> tuple[QNetwork, ModelMetadata]:
-    """Return the model of which `model_bytes` made the bytes; a ValueError if they are none."""
+    """Return the model that `model_bytes` made bytes of.
+
+    Raises
+    ------
+    ValueError
+        If the bytes are no model; the message says why and what to do.
+    """
     try:
         tensors = safetensors.numpy.load(data)
-    except (
-        SafetensorError,
-        KeyError,
-    ) as error:  # or of numbers that NumPy does not have
-        problem = f"cannot be read as safetensors ({error}); it is truncated or of another kind"
-        raise ValueError(f"{problem}: save or copy it again") from None
-    header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+    except (SafetensorError, KeyError) as error:  # KeyError: a type that NumPy lacks
+        raise ValueError(
+            f"cannot be read as safetensors ({error}); it is truncated or of another "
+            "kind: save or copy it again"
+        ) from None
+    header_length = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + header_length])
     text = (header.get("__metadata__") or {}).get(METADATA_KEY)
     if text is None:
-        found = f"is safetensors, but no model of {PACKAGE} (it has no metadata {METADATA_KEY!r})"
         raise ValueError(
-            f"{found}; give a file that ddqn-planner or trainer_node saved"
+            f"is safetensors, but no model of {PACKAGE} (it has no metadata "
+            f"{METADATA_KEY!r}); give a file that ddqn-planner or trainer_node saved"
         )
     try:
-        description = _parse(json.loads(text))
+        description = _description_of(json.loads(text))
     except (ValueError, RecursionError) as error:
         raise ValueError(
             f"its metadata is wrong ({error}); train the model again"
         ) from None
-    network_class, sizes = NETWORKS[description.network], description.sizes
-    held = {name: (tensor.dtype.name, tensor.shape) for name, tensor in tensors.items()}
+    network_class = NETWORKS[description.network]
+    _check_tensors(tensors, network_class, description.sizes)
+    return network_class(description.sizes, tensors), description
+
+
+def _check_tensors(
+    tensors: Mapping[str, NDArray[np.generic]],
+    network_class: type[QNetwork],
+    sizes: Mapping[str, int],
+) -> None:
+    """Raise a ValueError unless the tensors are those of a network."""
+    kinds = {
+        name: (tensor.dtype.name, tensor.shape) for name, tensor in tensors.items()
+    }
     expected = {
         name: ("float64" if name in network_class.doubles else "float32", shape)
         for name, shape in network_class.shapes(sizes).items()
     }
-    if held != expected:
+    if kinds != expected:
         raise ValueError(
-            f"holds tensors {reprlib.repr(held)}, not {expected}; train it again"
+            f"holds tensors {reprlib.repr(kinds)}, not {expected}; train it again"
         )
     if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
         raise ValueError("its weights are not all finite; train it again")
-    return network_class(sizes, tensors), description
 
 
-def _parse(values: object) -> ModelMetadata:
+def _description_of(values: object) -> ModelMetadata:
+    """Return the description of a network, from JSON; a ValueError says what is wrong."""
     if not isinstance(values, dict):
         raise ValueError(f"it is {reprlib.repr(values)}; it must be a JSON object")
-    wrong = sorted(values.keys() ^ TYPES.keys())
-    if wrong:
-        raise ValueError(f"it lacks, or should not have, {reprlib.repr(wrong)}")
+    wrong_keys = sorted(values.keys() ^ TYPES.keys())
+    if wrong_keys:
+        raise ValueError(f"it lacks, or should not have, {reprlib.repr(wrong_keys)}")
     for key, types in TYPES.items():
         if type(values[key]) not in types:
-            names = " or ".join(known.__name__ for known in types)
+            names = " or ".join(kind.__name__ for kind in types)
             raise ValueError(
                 f"{key} is {reprlib.repr(values[key])}; it must be {names}"
             )
-    network, sizes = values["network"], values["sizes"]
+    network = values["network"]
     if network not in NETWORKS:
         raise ValueError(
             f"network is {reprlib.repr(network)}; this version knows {[*NETWORKS]}"
         )
-    if (
-        network == "paper"
-    ):  # missing in files of version 0.1.0, whose networks have none
-        sizes = {"hidden_units": 0, **sizes}
-    size_names = NETWORKS[network].size_names
-    if sizes.keys() != set(size_names):
-        raise ValueError(
-            f"sizes is {reprlib.repr(sizes)}; it must have {[*size_names]}"
-        )
-    for name, size in sizes.items():
-        least, most = 0 if name == "hidden_units" else 1, NETWORKS[network].max_size
-        if type(size) is not int or not least <= size <= most:
-            limits = f"{least} to {most}"
-            raise ValueError(
-                f"size {name} is {reprlib.repr(size)}; it must lie in {limits}"
-            )
+    sizes = _sizes_of(values["sizes"], NETWORKS[network])
     if not 0 <= values["gamma"] <= 1:
         raise ValueError(f"gamma is {values['gamma']}; it must lie in 0 to 1")
     move_rule = values["move_rule"]
     if move_rule == "unit":  # until version 0.9; the same moves are legal
         move_rule = MoveRule.CORNER_CUTTING
     return ModelMetadata(**{**values, "sizes": sizes, "move_rule": MoveRule(move_rule)})
+
+
+def _sizes_of(
+    values: Mapping[str, object], network_class: type[QNetwork]
+) -> dict[str, int]:
+    """Return the sizes of a network, from JSON; a ValueError says what is wrong."""
+    size_names = network_class.size_names
+    if network_class is PaperQNetwork:
+        # Missing in files of version 0.1.0, whose networks have no hidden units.
+        values = {"hidden_units": 0, **values}
+    if values.keys() != set(size_names):
+        raise ValueError(
+            f"sizes is {reprlib.repr(dict(values))}; it must have {[*size_names]}"
+        )
+    sizes: dict[str, int] = {}
+    for name, size in values.items():
+        smallest = 0 if name == "hidden_units" else 1
+        largest = network_class.max_size
+        if type(size) is not int or not smallest <= size <= largest:
+            raise ValueError(
+                f"size {name} is {reprlib.repr(size)}; it must lie in {smallest} to "
+                f"{largest}"
+            )
+        sizes[name] = size
+    return sizes

@@ -1,9 +1,9 @@
-"""The network that knows a robot's body: which primitives succeed among which occupied cells."""
+"""The network that knows a robot's body: which primitives occupied cells forbid."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +17,18 @@ from ddqn_planner.robot.units import units_of
 
 Float64: TypeAlias = NDArray[np.float64]
 
-# Shapes: P = primitives, U = units of the network, S x S cells with the robot in the middle.
+# Shapes: P = primitives, U = units of the network, S x S cells with the robot in the
+# middle, N = poses of all primitives, M = corners of the footprint.
 
 
 class RobotNetwork(QNetwork):
-    """Whether a primitive succeeds: p(s, a) = sigmoid(b - sum of the weights of occupied cells)."""
+    """Whether a primitive succeeds among occupied cells.
 
-    # Weights are at least 0: what is below counts as 0. One unit serves all primitives that are
-    # quarter turns of each other. What else the tensors hold is given, not learned.
+    p(s, a) = sigmoid(b - sum of the weights of occupied cells).
+    """
+
+    # Weights are at least 0: a weight below counts as 0. One unit serves all primitives
+    # that are quarter turns of each other. The motions and the footprint are not learned.
     name = "robot"
     size_names = ("units", "side", "primitives", "poses", "corners")
     max_size = 2**16
@@ -33,59 +37,87 @@ class RobotNetwork(QNetwork):
     @classmethod
     def shapes(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
         """Return the shape of each tensor."""
-        units, side, primitives, poses, corners = (
-            sizes[name] for name in cls.size_names
-        )
-        learned = {"weight": (units, side, side), "threshold": (units,)}
-        given = {
-            "primitive": (primitives, 6),
-            "pose": (poses, 3),
-            "footprint": (corners, 2),
+        units = sizes["units"]
+        side = sizes["side"]
+        return {
+            "weight": (units, side, side),
+            "threshold": (units,),
+            "primitive": (sizes["primitives"], len(COLUMNS)),
+            "pose": (sizes["poses"], 3),
+            "footprint": (sizes["corners"], 2),
+            "angle": (HEADINGS,),
+            "resolution": (1,),
         }
-        return {**learned, **given, "angle": (HEADINGS,), "resolution": (1,)}
 
     @classmethod
     def untrained(cls, footprint: Float64, motions: Motions) -> RobotNetwork:
-        """Return the network of a robot that knows nothing yet; a ValueError for no robot."""
+        """Return the network of a robot, without a training.
+
+        Raises a ValueError if the footprint or the motions are those of no robot.
+        """
         swept_USS = swept_cells(footprint, units_of(motions).motions)
-        poses = [len(one) for one in motions.poses]
-        columns = motions.start, motions.end, *motions.offset.T, motions.cost, poses
-        tensors: dict[str, Any] = {
-            "weight": np.zeros(swept_USS.shape, np.float32),
-            "threshold": np.zeros(len(swept_USS), np.float32),
-            "primitive": np.column_stack(columns).astype(np.float64),
-            "pose": np.concatenate(motions.poses),
+        units, side, _ = swept_USS.shape
+        pose_N3 = np.concatenate(motions.poses)
+        pose_count_P = [len(poses) for poses in motions.poses]
+        column = _Primitives(
+            start=motions.start,
+            end=motions.end,
+            dx=motions.offset[:, 0],
+            dy=motions.offset[:, 1],
+            cost=motions.cost,
+            pose_count=np.array(pose_count_P),
+        )
+        tensors: dict[str, NDArray[Any]] = {
+            "weight": np.zeros((units, side, side), np.float32),
+            "threshold": np.zeros(units, np.float32),
+            "primitive": np.column_stack(column).astype(np.float64),
+            "pose": pose_N3,
             "footprint": footprint,
             "angle": motions.angles,
             "resolution": np.array([motions.resolution]),
         }
-        sizes = *swept_USS.shape[:2], len(poses), sum(poses), len(footprint)
-        return cls(dict(zip(cls.size_names, sizes, strict=True)), tensors)
+        sizes = {
+            "units": units,
+            "side": side,
+            "primitives": len(motions.poses),
+            "poses": len(pose_N3),
+            "corners": len(footprint),
+        }
+        return cls(sizes, tensors)
 
-    def __init__(self, sizes: Mapping[str, int], tensors: Mapping[str, Any]) -> None:
+    def __init__(
+        self, sizes: Mapping[str, int], tensors: Mapping[str, NDArray[Any]]
+    ) -> None:
         super().__init__(sizes, tensors)
         self.footprint = read_footprint(tensors["footprint"].tolist())
-        self.motions = _motions_of(self.tensors)
+        self.motions = _motions_of(tensors)
         self.unit, self.turns, unit_motions = units_of(self.motions)
         # (U, S, S): the cells that the body sweeps on one primitive of each unit
         self.swept_by_unit = swept_cells(self.footprint, unit_motions)
-        found = dict(zip(self.size_names, self.swept_by_unit.shape[:2], strict=False))
-        if wrong := {name: size for name, size in found.items() if size != sizes[name]}:
+        units, side, _ = self.swept_by_unit.shape
+        wrong_sizes = {
+            name: size
+            for name, size in (("units", units), ("side", side))
+            if size != sizes[name]
+        }
+        if wrong_sizes:
             raise ValueError(
-                f"its body and motions need {wrong}, not {dict(sizes)}; train it again"
+                f"its body and motions need {wrong_sizes}, not {dict(sizes)}; train it "
+                "again"
             )
 
     def supports(self, shape: tuple[int, int]) -> bool:
-        """Say whether the network can plan cells on maps of shape (H, W): it plans poses."""
+        """Say whether the network can plan cells on maps: never, as it plans poses."""
         return False
 
     def of_primitives(self, array_USS: NDArray[Any]) -> NDArray[Any]:
-        """Return what each primitive has of its unit, in the directions of the map: (P, S, S)."""
+        """Return the arrays of all primitives, turned from those of units: (P, S, S)."""
         turned = [np.rot90(array_USS, -turns, axes=(1, 2)) for turns in range(4)]
-        return np.stack(turned)[self.turns, self.unit]
+        turned_4USS = np.stack(turned)
+        return turned_4USS[self.turns, self.unit]
 
     def certificate(self, move_rule: MoveRule | None = None) -> BodyCertificate:
-        """Return what is proved of its primitives, for all patterns of occupied cells."""
+        """Return the proof of its primitives, for all patterns of occupied cells."""
         return certify_body(
             weight_USS=self.tensors["weight"],
             threshold_U=self.tensors["threshold"],
@@ -103,37 +135,73 @@ class RobotNetwork(QNetwork):
         return self.of_primitives(learned_USS)
 
 
-def _motions_of(tensors: Mapping[str, Any]) -> Motions:
+class _Primitives(NamedTuple):
+    """The columns of the tensor `primitive`: (P,) each."""
+
+    start: NDArray[Any]  # the heading before
+    end: NDArray[Any]  # and after
+    dx: NDArray[Any]  # cells from begin to end
+    dy: NDArray[Any]
+    cost: NDArray[Any]
+    pose_count: NDArray[Any]
+
+
+COLUMNS: Final = _Primitives._fields
+
+
+def _motions_of(tensors: Mapping[str, NDArray[Any]]) -> Motions:
     """Return the motions that tensors hold; a ValueError if they are none."""
-    *whole, cost, count = tensors["primitive"].T
-    start, end, dx, dy, count = (column.astype(np.int64) for column in (*whole, count))
-    angle, pose = tensors["angle"], tensors["pose"]
-    inside = ((start >= 0) & (start < HEADINGS) & (end >= 0) & (end < HEADINGS)).all()
-    is_whole = np.array_equal(
-        np.column_stack([*whole, count]), np.c_[start, end, dx, dy, count]
+    column = _Primitives(*tensors["primitive"].T)  # float64
+    start = column.start.astype(np.int64)
+    end = column.end.astype(np.int64)
+    offset = np.column_stack([column.dx, column.dy]).astype(np.int64)
+    pose_count = column.pose_count.astype(np.int64)
+    pose_N3 = tensors["pose"]
+    angles = tensors["angle"]
+    is_damaged = (
+        not _are_headings(start)
+        or not _are_headings(end)
+        or not np.array_equal(column.start, start)
+        or not np.array_equal(column.end, end)
+        or not np.array_equal(np.column_stack([column.dx, column.dy]), offset)
+        or not np.array_equal(column.pose_count, pose_count)
+        or not (pose_count >= 1).all()
+        or pose_count.sum() != len(pose_N3)
+        or not (column.cost > 0).all()
+        or not tensors["resolution"] > 0
     )
-    poses_fit = (count >= 1).all() and count.sum() == len(pose)
-    if not (
-        inside
-        and is_whole
-        and poses_fit
-        and (cost > 0).all()
-        and tensors["resolution"] > 0
-    ):
+    if is_damaged:
         raise ValueError("its primitives are damaged; train the robot again")
-    offset, last = np.column_stack([dx, dy]), np.cumsum(count)
-    for places, cells, heading in (
-        (last - count, 0 * offset, start),
-        (last - 1, offset, end),
-    ):
-        off = np.abs(pose[places, :2] - cells).max()
-        turned = np.abs(turn_between(pose[places, 2], angle[heading])).max()
-        if off > 0.01 or turned > 0.01 or len(np.unique(heading)) < HEADINGS:
-            raise ValueError(
-                "its primitives do not begin and end where they say; train it again"
-            )
-    poses = tuple(np.split(pose, last[:-1]))
-    cost = cost.astype(np.float32)
+    pose_ends = np.cumsum(pose_count)
+    _check_ends(pose_N3[pose_ends - pose_count], np.zeros_like(offset), start, angles)
+    _check_ends(pose_N3[pose_ends - 1], offset, end, angles)
     return Motions(
-        float(tensors["resolution"][0]), angle, start, end, offset, cost, poses
+        resolution=float(tensors["resolution"][0]),
+        angles=angles,
+        start=start,
+        end=end,
+        offset=offset,
+        cost=column.cost.astype(np.float32),
+        poses=tuple(np.split(pose_N3, pose_ends[:-1])),
     )
+
+
+def _are_headings(numbers: NDArray[np.int64]) -> bool:
+    """Return whether all numbers are those of headings."""
+    return bool(((numbers >= 0) & (numbers < HEADINGS)).all())
+
+
+def _check_ends(
+    pose_P3: Float64,
+    cell_P2: NDArray[np.int64],
+    heading_P: NDArray[np.int64],
+    angles: Float64,
+) -> None:
+    """Raise a ValueError unless poses lie in the middle of cells, with headings."""
+    cells_off = np.abs(pose_P3[:, :2] - cell_P2).max()
+    radians_off = np.abs(turn_between(pose_P3[:, 2], angles[heading_P])).max()
+    has_all_headings = len(np.unique(heading_P)) == HEADINGS
+    if cells_off > 0.01 or radians_off > 0.01 or not has_all_headings:
+        raise ValueError(
+            "its primitives do not begin and end where they say; train it again"
+        )
