@@ -1,9 +1,8 @@
 """Nav2's planning actions and its service, for a node where nav2_msgs is installed."""
 
 import time
-from collections.abc import Awaitable, Callable
-from functools import partial
-from typing import Any, NamedTuple
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Any, NamedTuple, Protocol
 
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped
@@ -20,75 +19,93 @@ from ddqn_planner.nodes.other_planners import (
     OtherPlanners,
     action_name,
 )
-from ddqn_planner.nodes.outcome import ALL_GOALS, Outcome
+from ddqn_planner.nodes.outcome import ALL_GOALS, Outcome, PathQuery
 from ddqn_planner.nodes.ros_packages import apt_install
 from ddqn_planner.planning import PlanStatus
 
-# Returns the answer of another planner to a goal's handle, or the outcome if there is none.
-AskOther = Callable[[Any, GivenUp, Callable[[], bool]], Awaitable[Any]]
-RESULT_TIMEOUT = (
-    10  # seconds to keep a result, as action_server_result_timeout of Nav2's servers
-)
+# Seconds to keep a result, as action_server_result_timeout of Nav2's servers.
+RESULT_TIMEOUT = 10
 CANCELED = Outcome("CANCELED", "the goal was canceled")
 PREEMPTED = Outcome("PREEMPTED", "a newer goal of the same action came")
 
-CODES = {
-    **dict.fromkeys(
-        (PlanStatus.NO_PATH.name, PlanStatus.ROLLOUT_TRAPPED.name), "NO_VALID_PATH"
-    ),
-    # Unknown, malformed, or in a frame without TF: clearing costmaps, as after UNKNOWN, is no help.
-    **dict.fromkeys(("NO_START", "INVALID_START", "INVALID_GOAL"), "TF_ERROR"),
+# Nav2's name of a status, where it is another name. Statuses that Nav2 does not know are
+# UNKNOWN.
+ERROR_NAMES = {
+    PlanStatus.NO_PATH.name: "NO_VALID_PATH",
+    PlanStatus.ROLLOUT_TRAPPED.name: "NO_VALID_PATH",
+    # A pose that is unknown, malformed, or in a frame without TF. After UNKNOWN, behavior
+    # trees clear costmaps, which is no help here.
+    "NO_START": "TF_ERROR",
+    "INVALID_START": "TF_ERROR",
+    "INVALID_GOAL": "TF_ERROR",
     "NO_GOALS": "NO_VIAPOINTS_GIVEN",
     # As Nav2's planners time out while their costmap is not current.
-    **dict.fromkeys(("NO_MAP", "MAP_TIMEOUT"), "TIMEOUT"),
+    "NO_MAP": "TIMEOUT",
+    "MAP_TIMEOUT": "TIMEOUT",
 }
-"""What Nav2 calls a status, if by another name; UNKNOWN is all that it does not know."""
 
 
 def error_code(status: str, result: Any) -> int:
-    """Return the error code of an `Outcome` in an action's Result: 0 also for a canceled goal."""
+    """Return the code of an `Outcome` in an action's Result; 0 if canceled."""
     if status in (PlanStatus.SUCCEEDED.name, CANCELED.status):
         return 0
-    return int(getattr(result, CODES.get(status, status), result.UNKNOWN))
+    name = ERROR_NAMES.get(status, status)
+    return int(getattr(result, name, result.UNKNOWN))
 
 
-class Task(NamedTuple):
-    """What a goal asks for."""
+class AskOtherPlanner(Protocol):
+    """Asks another planner, through the server of an action."""
 
-    start: PoseStamped | None  # None: where the robot is
-    goals: list[PoseStamped]
-    planner_id: str
-    has_via_points: bool = False  # all goals but the last
+    def __call__(
+        self,
+        server: OtherPlanners,
+        handle: Any,
+        given_up: GivenUp,
+        is_preempted_there: Callable[[], bool],
+    ) -> Awaitable[Any]:
+        """Return the answer to a goal's handle, or an `Outcome` without an answer."""
 
 
-Plan = Callable[[Task, GivenUp], Awaitable[tuple[Path, Outcome]]]
+class NavigationServer(NamedTuple):
+    """The functions of a node that answer Nav2's requests."""
+
+    refusal: GivenUp  # why goals are rejected now
+    plan: Callable[[PathQuery, GivenUp], Awaitable[tuple[Path, Outcome]]]
+    ask_other: AskOtherPlanner
+    is_own: Callable[[str], bool]  # whether a planner_id is this planner's
+    on_is_path_valid: Callable[[Any, Any], Awaitable[Any]]
 
 
 class PathAction:
-    """Answers the goals of one action, of which the newest one preempts the one under way.
+    """Answers the goals of an action; the newest goal preempts the goal before it.
 
-    Releases have added fields to the action; `kind` says which of them its messages have.
+    Parameters
+    ----------
+    action_type : type
+        Of the action. Releases have added fields: its messages tell which they have.
+    server : NavigationServer
+    others : OtherPlanners, optional
+        The server of the same action of other planners.
     """
 
     def __init__(
         self,
-        kind: Any,
-        refusal: GivenUp,
-        plan: Plan,
-        ask_other: AskOther | None = None,
-        is_ours: Callable[[str], bool] = lambda planner_id: True,
+        action_type: Any,
+        server: NavigationServer,
+        others: OtherPlanners | None = None,
     ) -> None:
-        self._result, self._refusal, self._plan = kind.Result, refusal, plan
-        self._ask_other, self._is_ours = ask_other, is_ours
-        self._has_goals = hasattr(kind.Goal, "goals")
-        self._has_via_points = hasattr(kind.Goal, "viapoints")
-        self._has_error_msg = hasattr(kind.Result, "error_msg")
-        self._has_last_reached = hasattr(kind.Result, "last_reached_index")
-        self._newest: Any = None
+        self._result_type = action_type.Result
+        self._server = server
+        self._others = others
+        self._has_goals = hasattr(action_type.Goal, "goals")
+        self._has_via_points = hasattr(action_type.Goal, "viapoints")
+        self._has_error_msg = hasattr(action_type.Result, "error_msg")
+        self._has_last_reached = hasattr(action_type.Result, "last_reached_index")
+        self._newest: Any = None  # goal handle
 
     def accept(self, goal: Any) -> GoalResponse:
         """Reject goals while the node refuses them."""
-        return GoalResponse.REJECT if self._refusal() else GoalResponse.ACCEPT
+        return GoalResponse.REJECT if self._server.refusal() else GoalResponse.ACCEPT
 
     def begin(self, handle: Any) -> None:
         """Let a goal preempt the one before."""
@@ -103,64 +120,74 @@ class PathAction:
                 return CANCELED
             return None if handle is self._newest else PREEMPTED
 
-        began = time.monotonic()
+        start_time = time.monotonic()
         path = Path()
-        if self._is_others(handle):
-            answer = await self._answer_of_other(handle, given_up)
+        if self._others is not None and self._is_for_other(handle):
+            answer = await self._answer_of_other(self._others, handle, given_up)
             if not isinstance(answer, Outcome):
                 return answer
             outcome = answer
         else:
-            path, outcome = await self._plan(self._task(handle.request), given_up)
-        result = self._result(path=path)
-        result.planning_time = Duration(seconds=time.monotonic() - began).to_msg()
-        result.error_code = error_code(outcome.status, self._result)
+            query = self._query(handle.request)
+            path, outcome = await self._server.plan(query, given_up)
+        seconds = time.monotonic() - start_time
+        set_state(handle, outcome.status == PlanStatus.SUCCEEDED.name)
+        return self._result(path, outcome, seconds)
+
+    def _result(self, path: Path, outcome: Outcome, seconds: float) -> Any:
+        result = self._result_type(path=path)
+        result.planning_time = Duration(seconds=seconds).to_msg()
+        result.error_code = error_code(outcome.status, self._result_type)
         is_partial = outcome.last_reached != ALL_GOALS
-        if self._has_error_msg:
-            result.error_msg = outcome.reason if result.error_code or is_partial else ""
+        if self._has_error_msg and (result.error_code or is_partial):
+            result.error_msg = outcome.reason
         if self._has_last_reached:
             result.last_reached_index = outcome.last_reached
-        if handle.is_cancel_requested:
-            handle.canceled()
-        elif outcome.status == PlanStatus.SUCCEEDED.name:
-            handle.succeed()
-        else:
-            handle.abort()
         return result
 
-    def _task(self, goal: Any) -> Task:
+    def _query(self, goal: Any) -> PathQuery:
         start = goal.start if goal.use_start else None
         if self._has_goals:
-            return Task(start, poses_of(goal.goals), goal.planner_id)
+            return PathQuery(start, poses_of(goal.goals), goal.planner_id)
         via_points = [*goal.viapoints] if self._has_via_points else []
-        return Task(start, [*via_points, goal.goal], goal.planner_id, bool(via_points))
+        stops = [*via_points, goal.goal]
+        return PathQuery(start, stops, goal.planner_id, bool(via_points))
 
-    def _is_others(self, handle: Any) -> bool:
-        """Return whether a goal names another planner, and there may be one."""
-        return self._ask_other is not None and not self._is_ours(
-            handle.request.planner_id
+    def _is_for_other(self, handle: Any) -> bool:
+        """Return whether a goal names another planner."""
+        return not self._server.is_own(handle.request.planner_id)
+
+    async def _answer_of_other(
+        self, others: OtherPlanners, handle: Any, given_up: GivenUp
+    ) -> Any:
+        """Return another planner's result, or an outcome if it has no result."""
+
+        def is_preempted_there() -> bool:
+            # The other server lets the newest goal preempt this one.
+            return self._newest is not handle and self._is_for_other(self._newest)
+
+        answer = await self._server.ask_other(
+            others, handle, given_up, is_preempted_there
         )
-
-    async def _answer_of_other(self, handle: Any, given_up: GivenUp) -> Any:
-        """Return another planner's result, and set the handle's state, or why there is none."""
-
-        def is_kept() -> bool:  # its server lets the newest goal preempt it
-            return self._newest is not handle and self._is_others(self._newest)
-
-        assert self._ask_other is not None
-        answer = await self._ask_other(handle, given_up, is_kept)
         if isinstance(answer, Outcome):
             return answer
-        if handle.is_cancel_requested and answer.status == GoalStatus.STATUS_CANCELED:
-            handle.canceled()
-        elif answer.status == GoalStatus.STATUS_SUCCEEDED:
-            handle.succeed()
-        else:
-            handle.abort()
+        is_canceled = answer.status == GoalStatus.STATUS_CANCELED
+        has_succeeded = answer.status == GoalStatus.STATUS_SUCCEEDED
+        set_state(handle, has_succeeded, is_canceled)
         return answer.result
 
 
-def poses_of(goals: Any) -> list[PoseStamped]:
+def set_state(handle: Any, has_succeeded: bool, is_canceled: bool = True) -> None:
+    """End a goal: canceled if a client asked for that and it was done, else aborted."""
+    if handle.is_cancel_requested and is_canceled:
+        handle.canceled()
+    elif has_succeeded:
+        handle.succeed()
+    else:
+        handle.abort()
+
+
+def poses_of(goals: Any) -> Sequence[PoseStamped]:
     """Return the poses of a sequence, or since Kilted of a nav_msgs/msg/Goals with a header."""
     if not hasattr(goals, "goals"):
         return [*goals]
@@ -172,22 +199,13 @@ def poses_of(goals: Any) -> list[PoseStamped]:
     ]
 
 
-class Planning(NamedTuple):
-    """What answers Nav2's requests."""
+def serve_nav2(
+    node: BaseNode, server: NavigationServer, other_planners: str = ""
+) -> None:
+    """Create Nav2's actions and service, or log which package is missing.
 
-    refusal: GivenUp
-    plan: Plan
-    ask_other: Callable[
-        [OtherPlanners, Any, GivenUp, Callable[[], bool]], Awaitable[Any]
-    ]
-    is_ours: Callable[[str], bool]  # a planner's name
-    on_is_path_valid: Callable[..., Any]
-
-
-def serve_nav2(node: BaseNode, planning: Planning, other_planners: str = "") -> None:
-    """Create Nav2's actions and service, or log what is missing.
-
-    ``other_planners`` is the prefix of the actions to which the goals of other planners are sent.
+    ``other_planners`` is the prefix of the actions to which the goals of other planners
+    are sent; empty if there are none.
     """
     try:
         from nav2_msgs.action import ComputePathThroughPoses, ComputePathToPose
@@ -197,26 +215,27 @@ def serve_nav2(node: BaseNode, planning: Planning, other_planners: str = "") -> 
             f"no actions for Nav2 ({error}); {apt_install('nav2-msgs')}"
         )
         return
-    # Reentrant: the newest goal must be able to preempt another one.
+    # Reentrant: the newest goal must be able to preempt the goal before it.
     group = ReentrantCallbackGroup()
-    options = {"callback_group": group, "result_timeout": RESULT_TIMEOUT, **QUEUES}
-    options["cancel_callback"] = lambda _: CancelResponse.ACCEPT
-    for name, kind in zip(
-        ACTIONS, (ComputePathToPose, ComputePathThroughPoses), strict=True
-    ):
-        ask_other = None
+    action_types = (ComputePathToPose, ComputePathThroughPoses)
+    for name, action_type in zip(ACTIONS, action_types, strict=True):
+        others = None
         if other_planners:
-            others = OtherPlanners(node, kind, action_name(other_planners, name))
-            ask_other = partial(planning.ask_other, others)
-        action = PathAction(
-            kind, planning.refusal, planning.plan, ask_other, planning.is_ours
+            other_name = action_name(other_planners, name)
+            others = OtherPlanners(node, action_type, other_name)
+        action = PathAction(action_type, server, others)
+        ActionServer(
+            node,
+            action_type,
+            name,
+            action.execute,
+            goal_callback=action.accept,
+            handle_accepted_callback=action.begin,
+            cancel_callback=lambda _: CancelResponse.ACCEPT,
+            callback_group=group,
+            result_timeout=RESULT_TIMEOUT,
+            **QUEUES,
         )
-        begin = {
-            "goal_callback": action.accept,
-            "handle_accepted_callback": action.begin,
-        }
-        ActionServer(node, kind, name, action.execute, **begin, **options)
-    on_is_path_valid = planning.on_is_path_valid
     node.create_service(
-        IsPathValid, "is_path_valid", on_is_path_valid, callback_group=group
+        IsPathValid, "is_path_valid", server.on_is_path_valid, callback_group=group
     )

@@ -82,12 +82,12 @@ class OtherPlanners:
         goal: Any,
         goal_id: Any,
         given_up: GivenUp,
-        is_kept: Callable[[], bool] = lambda: False,
+        is_preempted_there: Callable[[], bool] = lambda: False,
     ) -> Any:
         """Return the server's answer, with status and result, or the outcome if there is none.
 
         The goal keeps its id. So a goal that comes back to a node in a circle is rejected there.
-        A goal that is given up is canceled, unless `is_kept` says that a newer one preempts it.
+        A goal that is given up is canceled, unless `is_preempted_there` says that a newer one preempts it.
         """
         planner = f"the planner {planner_id!r}"
         await self._wait(
@@ -115,7 +115,7 @@ class OtherPlanners:
             return Outcome(INVALID, f"{planner} was rejected by {self._name}; {remedy}")
         answer = await self._result(accepted, given_up)
         if answer is None and (outcome := given_up()) is not None:
-            if not is_kept():
+            if not is_preempted_there():
                 accepted.cancel_goal_async()
             return outcome
         if answer is None or answer.status == GoalStatus.STATUS_UNKNOWN:

@@ -1,8 +1,10 @@
-"""The outcome of a request: a plan, or a status with its reason and a remedy."""
+"""A query for a path, and its outcome: a plan, or a status with reason and remedy."""
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from geometry_msgs.msg import PoseStamped
 from std_msgs.msg import Header
@@ -17,6 +19,16 @@ Request = PlanRequest | PoseRequest
 # Seconds in which a new listener hears a first map, odometry or TF, at a load of 20.
 PATIENCE = 5.0
 ALL_GOALS = -1  # as in ComputePathThroughPoses
+
+
+class PathQuery(NamedTuple):
+    """A query for a path, as a service or an action got it."""
+
+    start: PoseStamped | None  # None: the robot's pose
+    goals: Sequence[PoseStamped]  # through all of them
+    planner_id: str = ""
+    has_via_points: bool = False  # all goals but the last
+    tolerance: float | None = None  # metres; None: the parameter's
 
 
 class RequestError(ValueError):

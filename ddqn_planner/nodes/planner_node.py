@@ -1,70 +1,88 @@
 """The planner node: plans on the map from the robot's pose to the goal pose."""
 
 import math
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
-from geometry_msgs.msg import PoseArray, PoseStamped
+from geometry_msgs.msg import PoseArray, PoseStamped, Quaternion
 from nav_msgs.msg import Path
 from nav_msgs.srv import GetPlan
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.parameter import Parameter
-from std_msgs.msg import UInt8MultiArray
+from std_msgs.msg import Header, UInt8MultiArray
 
 from ddqn_planner.experience import Experience
 from ddqn_planner.memory import give_back, llvm_was_used, reuse_small_arrays
 from ddqn_planner.model import model_of
 from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal
 from ddqn_planner.nodes.clocks import STEADY
-from ddqn_planner.nodes.conversions import along, bytes_of, path_bytes, path_message
+from ddqn_planner.nodes.conversions import (
+    Float64,
+    along,
+    bytes_of,
+    path_bytes,
+    path_message,
+)
 from ddqn_planner.nodes.diagnostics import PlannerDiagnostics
 from ddqn_planner.nodes.display import FieldDisplay
 from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.model_source import ModelSource, read_model
-from ddqn_planner.nodes.nav2 import Planning as Nav2Planning
-from ddqn_planner.nodes.nav2 import Task, serve_nav2
+from ddqn_planner.nodes.nav2 import NavigationServer, serve_nav2
 from ddqn_planner.nodes.other_planners import GivenUp, OtherPlanners, check_prefix
 from ddqn_planner.nodes.outcome import (
     NO_REQUEST,
     NOT_ACTIVE,
     STOPPING,
     Outcome,
+    PathQuery,
     RequestError,
 )
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
+from ddqn_planner.nodes.path_validity import PathCheck, check_path
 from ddqn_planner.nodes.pending_requests import unless
 from ddqn_planner.nodes.poses import Places, check_source
 from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.nodes.requests import Requests
 from ddqn_planner.nodes.spinning import spin_until_shutdown
 from ddqn_planner.nodes.worker import Worker
-from ddqn_planner.planning import Planner
+from ddqn_planner.planning import PlanMethod, Planner
 from ddqn_planner.planning.plan import PosePlan
 from ddqn_planner.planning.segments import SAME_COST
 
 CONFIGURED = "inactive", "active"  # states with a map, a start and requests
+LOOK_PERIOD = 0.1  # seconds until the next look after a change
+IDLE_PERIOD = 1.0  # seconds between looks otherwise
+
 Planning = Coroutine[None, None, Outcome]
-LOOK_PERIOD, IDLE_PERIOD = (
-    0.1,
-    1.0,
-)  # seconds until the next look: after a change, and else
 
 
-# The executor's one thread holds all state. What takes long runs in workers: to load the model,
-# to inflate a map, the Q fields. A request that waits for a worker is a coroutine.
+class LoggedPlan(NamedTuple):
+    """A logged plan to the active goal: its reason may differ in places and lengths."""
+
+    goals: Sequence[PoseStamped]
+    goal: PoseStamped | None
+    status: str
+    method: PlanMethod
+
+
+# The executor's one thread holds all state. Workers load the model, inflate maps and
+# compute Q fields. A request that waits for a worker is a coroutine.
 class PlannerNode(ManagedNode):
-    """Plans from where the robot is to the active goal: ``goal_pose``, or ``goal_poses``."""
+    """Plans from the robot's pose to the active goal: ``goal_pose``, or ``goal_poses``."""
+
+    _checks_first_parameters = True  # in the constructor of `BaseNode`
 
     def __init__(self) -> None:
         super().__init__("planner", PLANNER_PARAMETERS)
+        self._checks_first_parameters = False
         self._settings = self.settings()
         self._looks = self.create_timer(LOOK_PERIOD, self._on_look, clock=STEADY)
         self._diagnostics = PlannerDiagnostics(self, self._look_soon)
-        self._worker, self._map_worker, self._display_worker = (
-            Worker(self) for _ in range(3)
-        )
+        self._worker = Worker(self)
+        self._map_worker = Worker(self)
+        self._display_worker = Worker(self)
         self._model = ModelSource(self, self._diagnostics, self._worker)
         self.deactivate()
         self.add_post_set_parameters_callback(self._apply_parameters)
@@ -74,8 +92,8 @@ class PlannerNode(ManagedNode):
     # Lifecycle
 
     def start(self) -> None:
-        """Configure the node; what is asked before the model is loaded waits for it."""
-        # While it loads, DDS discovers, and the node says what else is missing.
+        """Configure the node; requests wait until the model is loaded."""
+        # Meanwhile DDS discovers other nodes, and the node tells what else is missing.
         self._model.load()
         self.change("configure")
         self.activate()  # the state follows when there is a model
@@ -85,16 +103,20 @@ class PlannerNode(ManagedNode):
         super().configure()
         self._display = FieldDisplay(self, self._display_worker)
         self._plan_publisher = self.create_publisher(Path, "plan", LATCHED)
-        # In a group of its own: triggers that come while it plans make it plan once more after.
+        # A group of its own: a trigger that comes during a plan makes the node plan again.
         group = MutuallyExclusiveCallbackGroup()
         self._replan = self.create_guard_condition(self._plan_for_active_goal, group)
         self._map = MapSource(self, self._diagnostics, self._map_worker, self._on_map)
         self._places = Places(
             self, self._diagnostics, lambda: self._map.frame, self._on_start
         )
-        inputs = self._map, self._places, self._model
         self._requests = Requests(
-            self._settings, *inputs, self._worker, self._look_soon
+            self._settings,
+            self._map,
+            self._places,
+            self._model,
+            self._worker,
+            self._look_soon,
         )
         self.create_subscription(PoseStamped, "goal_pose", self._on_goals, 10)
         self.create_subscription(PoseArray, "goal_poses", self._on_goals, 10)
@@ -102,24 +124,24 @@ class PlannerNode(ManagedNode):
             self.create_subscription(
                 UInt8MultiArray, "trainer/model", self._on_model, LATCHED
             )
-        # Reentrant: a request that waits for its field does not keep out the others.
+        # Reentrant: while a request waits for its field, others are answered.
         reentrant = ReentrantCallbackGroup()
         self.create_service(
             GetPlan, "~/get_plan", self._on_get_plan, callback_group=reentrant
         )
         self.create_trigger("~/reload_model", self._model.on_reload)
-        planning = Nav2Planning(
+        navigation = NavigationServer(
             refusal=lambda: self._refusal,
             plan=self._plan_for_action,
             ask_other=self._ask_other_planner,
-            is_ours=lambda planner_id: planner_id in ("", self._settings.planner_id),
+            is_own=lambda planner_id: planner_id in ("", self._settings.planner_id),
             on_is_path_valid=self._on_is_path_valid,
         )
-        serve_nav2(self, planning, self._settings.other_planners)
+        serve_nav2(self, navigation, self._settings.other_planners)
 
     def activate(self) -> None:
         """Answer requests from now on."""
-        # What requests are answered, also those under way; None while the node is active.
+        # The answer to all requests, also to those that wait; None while active.
         self._refusal: Outcome | None = None
         self._diagnostics.change()
         self._replan.trigger()
@@ -129,10 +151,11 @@ class PlannerNode(ManagedNode):
         super().deactivate()
         self._refusal = NOT_ACTIVE
         self._active = ActiveGoal([], 0.0)
-        # Of actions whose path can be kept, and of those whose path can get better, the last ones.
+        # The last outcome of an action with a path, whose rest the next action may keep.
         self._followed: Outcome | None = None
+        # The last outcome with or without a path: an older path is not improved.
         self._newest: Outcome | None = None
-        self._logged: tuple[object, ...] = ()
+        self._logged: LoggedPlan | None = None
         self._diagnostics.change()
 
     def cleanup(self) -> None:
@@ -143,12 +166,14 @@ class PlannerNode(ManagedNode):
         self._diagnostics.note(NO_REQUEST)
         self.after_jump_back.clear()
         for name in ("_places", "_display", "_map", "_requests"):
-            vars(self).pop(name, None)  # not all are there, if `configure` failed
-        if not self.is_stopping:  # the process ends, and a collection may take a second
+            if hasattr(self, name):  # `configure` may have failed before it
+                delattr(self, name)
+        # At the end of the process nothing is freed: a collection may take a second.
+        if not self.is_stopping:
             self._model.forget()
 
     async def prepare(self, transition: str) -> bool:
-        """Load the model before ``configure``; answer what waits before the node stops."""
+        """Load the model before ``configure``; refuse waiting requests before a stop."""
         if transition == "configure":
             self._model.load()
             await unless(self._model.first(), lambda: self.is_stopping)
@@ -161,40 +186,36 @@ class PlannerNode(ManagedNode):
         return True
 
     def refuse_requests(self) -> None:
-        """Answer what waits, as before ``deactivate``."""
+        """Refuse the requests that wait, as the node is being stopped."""
         super().refuse_requests()
         self._refuse(STOPPING)
 
     def _refuse(self, refusal: Outcome) -> None:
         self._refusal = refusal
         if self.state in CONFIGURED:
-            self._requests.look_again()  # whoever waits sees the refusal
+            self._requests.look_again()  # waiting requests see the refusal
 
     # Parameters
 
     def check_parameters(self, new: dict[str, Any]) -> None:
-        """Check new values as `BaseNode` does, whether TF can be used, and load new files."""
+        """Check new values as `BaseNode` does, whether TF can be used, and load files."""
         super().check_parameters(new)
-        check_source(
-            "start_source", new.get("start_source", ""), "'initialpose' or 'odometry'"
-        )
+        source = new.get("start_source", "")
+        check_source("start_source", source, "'initialpose' or 'odometry'")
         check_prefix(self, new.get("other_planners", ""))
-        if "model" in new and hasattr(
-            self, "_settings"
-        ):  # a worker loads the first one
+        if self._checks_first_parameters:
+            return  # workers load the first files
+        if "model" in new:
             self._candidate = read_model(new["model"])
-        if "experience" in new and hasattr(
-            self, "_settings"
-        ):  # so does one with the first file
+        if "experience" in new:
             file = new["experience"]
             self._new_experience = Experience.load(file) if file else None
 
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
         self._settings = self.settings()
         changed = {parameter.name for parameter in parameters} & self._declared.keys()
-        if (
-            not changed or self.state not in CONFIGURED
-        ):  # subscriptions declare parameters, too
+        # Subscriptions declare parameters, too, which are none of these.
+        if not changed or self.state not in CONFIGURED:
             return
         if "model" in changed:
             self._model.use(*self._candidate)
@@ -208,13 +229,11 @@ class PlannerNode(ManagedNode):
     def _on_model(self, message: UInt8MultiArray) -> None:
         with self._diagnostics.receiving("trainer/model"):
             data = bytes_of("model", message)
-            if (
-                message.layout != self._model.layout
-            ):  # its digest says whether it is in use
-                self._model.use(
-                    Planner(*model_of(data)), "trainer/model", message.layout
-                )
-                self._plan_for(self._active.poses)
+            if message.layout == self._model.layout:  # with the digest of the model
+                return
+            planner = Planner(*model_of(data))
+            self._model.use(planner, "trainer/model", message.layout)
+            self._plan_for(self._active.poses)
 
     # Map, start and goal
 
@@ -226,9 +245,9 @@ class PlannerNode(ManagedNode):
         self._plan_for(self._active.poses, self._active.followed)
 
     def _plan_for(
-        self, goals: list[PoseStamped], followed: Outcome | None = None
+        self, goals: Sequence[PoseStamped], followed: Outcome | None = None
     ) -> None:
-        """Plan at once, whatever was planned: the goal before may have a plan under way."""
+        """Plan to goals at once, though a plan to the last ones may not be ready."""
         self._active = ActiveGoal(goals, self._settings.replan_period, followed)
         self._replan.trigger()
 
@@ -243,19 +262,18 @@ class PlannerNode(ManagedNode):
             self._diagnostics.log(self._refusal)
         else:
             self._diagnostics.ok("goal_poses")
-            self._plan_for(
-                [PoseStamped(header=message.header, pose=pose) for pose in poses]
-            )
+            header = message.header
+            self._plan_for([PoseStamped(header=header, pose=pose) for pose in poses])
 
     # Planning
 
-    async def _on_get_plan(self, request: Any, response: Any) -> Any:
+    async def _on_get_plan(
+        self, request: GetPlan.Request, response: GetPlan.Response
+    ) -> GetPlan.Response:
         start = request.start if request.start.header.frame_id else None
-        goals = [request.goal]
-        outcome = await self._answer(
-            goals, self._requests.plan(start, goals, request.tolerance)
-        )
-        (response.plan,) = _paths(outcome, path_message)
+        query = PathQuery(start, [request.goal], tolerance=request.tolerance)
+        outcome = await self._answer(query.goals, self._requests.plan(query))
+        response.plan = path_message(*path_poses(outcome))
         self._diagnostics.log(outcome)
         return response
 
@@ -263,7 +281,8 @@ class PlannerNode(ManagedNode):
         await self._model.first()
         if self._refusal is None and self.state == "inactive":
             self.change("activate")
-        active, goals = self._active, self._active.poses
+        active = self._active
+        goals = active.poses
         if not goals:
             return
         outcome = await self._answer(goals, self._requests.plan_for(active))
@@ -271,55 +290,48 @@ class PlannerNode(ManagedNode):
             return
         self._publish(outcome, active)
         self._improve_later(outcome)
-        # Not the reason: its places and lengths may differ.
-        logged = goals, outcome.goal, outcome.status, outcome.plan.method
+        logged = LoggedPlan(goals, outcome.goal, outcome.status, outcome.plan.method)
         if self._logged != logged:
             self._logged = logged
             self._diagnostics.log(outcome, paths=True)
 
     def _publish(self, outcome: Outcome, active: ActiveGoal) -> None:
-        if active.is_news(outcome):
-            self._plan_publisher.publish(*_paths(outcome, path_bytes))
+        is_news = active.note(outcome)
+        if is_news:
+            self._plan_publisher.publish(path_bytes(*path_poses(outcome)))
         self._display.show(outcome)
 
     async def _plan_for_action(
-        self, task: Task, given_up: GivenUp
+        self, query: PathQuery, given_up: GivenUp
     ) -> tuple[Path, Outcome]:
-        start, goals, planner_id, has_via_points = task
-        planning = self._requests.plan(
-            start,
-            goals,
-            planner_id=planner_id,
-            followed=self._followed,
-            has_via_points=has_via_points,
-        )
-        outcome = await self._answer(goals, planning, given_up)
-        to_publish, path = _paths(outcome, path_bytes, path_message)
+        planning = self._requests.plan(query, self._followed)
+        outcome = await self._answer(query.goals, planning, given_up)
+        poses = path_poses(outcome)
         if len(outcome.plan.path):
             self._followed = outcome
-            # It gets the better path with its next request.
+            # The action gets the better path with its next request.
             self._improve_later(outcome)
-            self._plan_publisher.publish(to_publish)
+            self._plan_publisher.publish(path_bytes(*poses))
         self._diagnostics.log(outcome)
-        return path, outcome
+        return path_message(*poses), outcome
 
     async def _ask_other_planner(
         self,
-        others: OtherPlanners,
+        server: OtherPlanners,
         handle: Any,
         given_up: GivenUp,
-        is_kept: Callable[[], bool],
+        is_preempted_there: Callable[[], bool],
     ) -> Any:
-        """Return another planner's answer to a goal, or the outcome if there is none."""
+        """Return another planner's answer to a goal, or an outcome without an answer."""
         goal = handle.request
         try:
             with self.answering():
-                answer = await others.ask(
+                answer = await server.ask(
                     goal.planner_id,
                     goal,
                     handle.goal_id,
                     given_up=lambda: self._refusal or given_up(),
-                    is_kept=is_kept,
+                    is_preempted_there=is_preempted_there,
                 )
         except Exception as error:  # the node must survive
             answer = Outcome(
@@ -331,10 +343,11 @@ class PlannerNode(ManagedNode):
         return answer
 
     def _improve_later(self, outcome: Outcome) -> None:
-        """Look for the least path of a body, unless it would not be worth a switch."""
-        plan, self._newest = outcome.plan, outcome
-        worth = (1 + self._settings.switch_threshold) * SAME_COST
-        if isinstance(plan, PosePlan) and plan.bound > worth:
+        """Look for a body's cheapest path, if it may be cheap enough for a switch."""
+        self._newest = outcome
+        plan = outcome.plan
+        switch_ratio = (1 + self._settings.switch_threshold) * SAME_COST
+        if isinstance(plan, PosePlan) and plan.bound > switch_ratio:
             executor: Any = self.executor
             executor.create_task(self._improve_path, outcome)
 
@@ -349,36 +362,37 @@ class PlannerNode(ManagedNode):
     async def _on_is_path_valid(self, request: Any, response: Any) -> Any:
         """Answer Nav2's IsPathValid: whether the robot can drive the rest of a path."""
         response.is_valid = False
-        has_success = hasattr(
-            response, "success"
-        )  # with it, Nav2 needs the robot's pose
+        # Releases whose response has this field need the robot's pose.
+        has_success = hasattr(response, "success")
+        checking = check_path(
+            self._requests, PathCheck.of_message(request), has_success
+        )
         try:
-            checking = self._requests.invalid_poses(request, needs_robot=has_success)
             with self.answering():
-                invalid = await unless(checking, lambda: self._refusal)
-            if isinstance(invalid, Outcome):
-                raise ValueError(invalid.reason)
-            response.is_valid = not invalid
-            if has_success:
-                response.success = True
-            if hasattr(response, "invalid_pose_indices"):
-                response.invalid_pose_indices = invalid
+                invalid_poses = await unless(checking, lambda: self._refusal)
+            if isinstance(invalid_poses, Outcome):
+                raise ValueError(invalid_poses.reason)
         except Exception as error:  # as when no memory is left: the node must survive
             self.get_logger().warning(f"no path to check: {str(error) or repr(error)}")
+            return response
+        response.is_valid = not invalid_poses
+        if has_success:
+            response.success = True
+        if hasattr(response, "invalid_pose_indices"):
+            response.invalid_pose_indices = invalid_poses
         return response
 
     async def _answer(
         self,
-        goals: list[PoseStamped],
+        goals: Sequence[PoseStamped],
         planning: Planning,
         given_up: GivenUp = lambda: None,
     ) -> Outcome:
         """Plan, unless the node stops or the request is given up."""
+        outcome: Outcome
         try:
             with self.answering():
-                outcome: Outcome = await unless(
-                    planning, lambda: self._refusal or given_up()
-                )
+                outcome = await unless(planning, lambda: self._refusal or given_up())
         except RequestError as error:
             outcome = Outcome(error.status, str(error))
         except Exception as error:  # as when no memory is left: the node must survive
@@ -386,59 +400,83 @@ class PlannerNode(ManagedNode):
             outcome = Outcome("FAILED", f"the planning failed ({error!r}); {remedy}")
         if outcome is not UNCHANGED:
             self._diagnostics.note(outcome)
-        frame = self._map.frame or (goals[0].header.frame_id if goals else "")
-        if outcome.goal is not None:  # the map may be another one by now
-            frame = outcome.goal.header.frame_id
-        return replace(outcome, header=self.header(frame))
+        return replace(outcome, header=self.header(self._frame_of(outcome, goals)))
+
+    def _frame_of(self, outcome: Outcome, goals: Sequence[PoseStamped]) -> str:
+        """Return the frame of a path: its map's, or without a map the goal's."""
+        if outcome.goal is not None:  # the node's map may be another one by now
+            return str(outcome.goal.header.frame_id)
+        if self._map.frame or not goals:
+            return self._map.frame
+        return str(goals[0].header.frame_id)
 
     # Diagnostics
 
-    def _look_soon(self, is_near: bool = True) -> None:
-        """Look at what changed, or may have come, in `LOOK_PERIOD`, or else in `IDLE_PERIOD`."""
-        nanoseconds = int(1e9 * (LOOK_PERIOD if is_near else IDLE_PERIOD))
-        if (
-            self._looks.timer_period_ns != nanoseconds
-        ):  # a timer that is reset wakes the node
+    def _look_soon(self) -> None:
+        """Look at changes, or whether a message has come, in `LOOK_PERIOD`."""
+        self._look_each(LOOK_PERIOD)
+
+    def _look_each(self, period: float) -> None:
+        nanoseconds = int(1e9 * period)
+        # A timer that is reset wakes the node.
+        if self._looks.timer_period_ns != nanoseconds:
             self._looks.timer_period_ns = nanoseconds
             self._looks.reset()
 
     def _on_look(self) -> None:
-        active, missing = self._active, [self._refusal.reason if self._refusal else ""]
-        is_frequent = bool(active.poses) and self._settings.replan_period < IDLE_PERIOD
         is_configured = self.state in CONFIGURED
         is_settling = is_configured and self._map.is_settling
-        self._look_soon(is_frequent or active.lacks_pose or is_settling)
+        active = self._active
+        replans_often = bool(active.poses) and active.period < IDLE_PERIOD
+        is_near = replans_often or active.lacks_pose or is_settling
+        self._look_each(LOOK_PERIOD if is_near else IDLE_PERIOD)
+        map_missing = ""
         if is_configured:
             self._requests.look_again()
             self._places.transform_start()
-            missing.append(self._map.missing)
-            has_come = active.lacks_pose and self._places.know(active.poses)
-            if has_come or active.is_look_due(bool(missing[-1])):
+            map_missing = self._map.missing
+            pose_has_come = active.lacks_pose and self._places.know(active.poses)
+            if pose_has_come or active.is_look_due(lacks_map=bool(map_missing)):
                 self._replan.trigger()
         if llvm_was_used.is_set() and not self._model.loading:
             llvm_was_used.clear()
             self._worker.call(give_back)
         if self._diagnostics.is_due():
-            missing += ["the model is being loaded"] if self._model.loading else []
-            fatal = self._model.planner is None and "model" in self._diagnostics.refused
-            values = {
-                "state": self.state,
-                **self._model.describe(self._settings.move_rule),
-            }
-            values |= self._map.describe() if is_configured else {}
-            self._diagnostics.publish(fatal, "; ".join(filter(None, missing)), values)
+            self._publish_diagnostics(map_missing)
+
+    def _publish_diagnostics(self, map_missing: str) -> None:
+        """Publish the diagnostics, with why there is no map; empty with a map."""
+        refusal = self._refusal.reason if self._refusal is not None else ""
+        model_missing = "the model is being loaded" if self._model.loading else ""
+        missing = [refusal, map_missing, model_missing]
+        values = {"state": self.state}
+        values |= self._model.describe(self._settings.move_rule)
+        if self.state in CONFIGURED:
+            values |= self._map.describe()
+        is_fatal = self._model.planner is None and "model" in self._diagnostics.refused
+        self._diagnostics.publish(is_fatal, "; ".join(filter(None, missing)), values)
 
 
-def _paths(outcome: Outcome, *makers: Callable[..., Any]) -> list[Any]:
-    """Return the path of an outcome, or an empty one, as functions of `conversions` make it."""
-    plan, header = outcome.plan, outcome.header
-    if outcome.request is None or outcome.goal is None:
-        return [Path(header=header) for _ in makers]
+class PathPoses(NamedTuple):
+    """The poses of a path in the plane; see `path_message`."""
+
+    points: Float64  # (N, 2): metres in the header's frame
+    yaws: Float64  # (N,), or (N - 1,) with a last orientation
+    header: Header
+    last_orientation: Quaternion | None = None
+
+
+def path_poses(outcome: Outcome) -> PathPoses:
+    """Return the poses of an outcome's path; none if it has no path."""
+    plan = outcome.plan
     if isinstance(plan, PosePlan):
-        return [make(plan.poses[:, :2], plan.poses[:, 2], header) for make in makers]
-    spacing = outcome.request.grid.resolution if outcome.is_dense else math.inf
-    along_path = along(outcome.path.points, spacing)
-    return [make(*along_path, header, outcome.goal.pose.orientation) for make in makers]
+        return PathPoses(plan.poses[:, :2], plan.poses[:, 2], outcome.header)
+    spacing = math.inf
+    if outcome.is_dense and outcome.request is not None:
+        spacing = outcome.request.grid.resolution
+    points, yaws = along(outcome.path.points, spacing)
+    orientation = None if outcome.goal is None else outcome.goal.pose.orientation
+    return PathPoses(points, yaws, outcome.header, orientation)
 
 
 def main() -> int:

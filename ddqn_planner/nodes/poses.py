@@ -3,7 +3,7 @@
 import importlib.util
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -321,7 +321,7 @@ class Places(Frames):
             with suppress(ValueError):
                 self._pose = self.to_map("the start", self._pose, frame)
 
-    def know(self, goals: list[PoseStamped]) -> bool:
+    def know(self, goals: Sequence[PoseStamped]) -> bool:
         """Return whether the start and some goals have a place on the map."""
         with suppress(ValueError):
             for pose in (self.start(), *goals):

@@ -1,8 +1,9 @@
-"""Which requests are retries of failed ones, for which a newer costmap may have a path."""
+"""Which requests repeat a failed one, for which a newer costmap may have a path."""
 
 import math
 import time
 from collections import deque
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from geometry_msgs.msg import PoseStamped
@@ -10,7 +11,7 @@ from geometry_msgs.msg import PoseStamped
 from ddqn_planner.nodes.outcome import Outcome
 from ddqn_planner.planning import PlanStatus
 
-# What another costmap of the same place may change.
+# Statuses that another costmap of the same place may change.
 FAILURES = {
     status.name
     for status in (
@@ -29,7 +30,7 @@ class Failure(NamedTuple):
 
     last_goal: PoseStamped  # as the request gave it
     costmap: int  # the number of the one that it failed on
-    seconds: float  # when, by the steady clock
+    seconds: float  # by the steady clock
 
 
 class Retries:
@@ -39,9 +40,9 @@ class Retries:
         self._failures: deque[Failure] = deque(maxlen=MOST_FAILURES)
 
     def is_retry(
-        self, goals: list[PoseStamped], costmap: int, resolution: float
+        self, goals: Sequence[PoseStamped], costmap: int, resolution: float
     ) -> bool:
-        """Return whether a request for the same last goal failed just now, or on this costmap."""
+        """Return whether a request for this last goal failed just now, or on this costmap."""
         for failure in self._failures:
             is_recent = time.monotonic() - failure.seconds < RETRY_WITHIN
             may_have_been_cleared = failure.costmap == costmap or is_recent
@@ -50,17 +51,19 @@ class Retries:
                 return True
         return False
 
-    def note(self, goals: list[PoseStamped], costmap: int, outcome: Outcome) -> None:
+    def note(
+        self, goals: Sequence[PoseStamped], costmap: int, outcome: Outcome
+    ) -> None:
         """Remember a request that failed, or forget its goal if it did not."""
         if outcome.request is None:
             return
         resolution = outcome.request.grid.resolution
-        others = [
-            it
-            for it in self._failures
-            if _distance(it.last_goal, goals[-1]) > resolution
+        failures = [
+            failure
+            for failure in self._failures
+            if _distance(failure.last_goal, goals[-1]) > resolution
         ]
-        self._failures = deque(others, MOST_FAILURES)
+        self._failures = deque(failures, MOST_FAILURES)
         if outcome.status in FAILURES:
             self._failures.append(Failure(goals[-1], costmap, time.monotonic()))
 
@@ -69,5 +72,6 @@ def _distance(goal: PoseStamped, other: PoseStamped) -> float:
     """Return the metres from one goal to another; infinite in different frames."""
     if goal.header.frame_id != other.header.frame_id:
         return math.inf
-    place, other_place = goal.pose.position, other.pose.position
-    return math.hypot(place.x - other_place.x, place.y - other_place.y)
+    position = goal.pose.position
+    other_position = other.pose.position
+    return math.hypot(position.x - other_position.x, position.y - other_position.y)

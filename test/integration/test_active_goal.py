@@ -1,6 +1,7 @@
 """When the planner plans for the active goal again, and which of several goals it leads to."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -8,12 +9,16 @@ import numpy as np
 import pytest
 from client import cell_of, cells_of, map_message, values_of
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseArray
+from geometry_msgs.msg import PoseArray, PoseStamped
 from integration.robot import NUMBERS, Robot, check_path, odometry, points_of
 from nav_msgs.msg import Odometry
 from std_msgs.msg import Header
 
-from ddqn_planner.grid import Cell
+from ddqn_planner.grid import Cell, GridMap
+from ddqn_planner.nodes.active_goal import ActiveGoal
+from ddqn_planner.nodes.outcome import Outcome
+from ddqn_planner.planning import Planner
+from ddqn_planner.planning.pose_planner import PoseRequest
 
 START, GOAL = (0, 5), (29, 5)
 NEVER, SOON = 3600.0, 0.05
@@ -263,3 +268,18 @@ def test_goals_and_a_single_goal_replace_each_other(docks: Robot) -> None:
         send()
         docks.wait_for_path(DOCKED, RIGHT, yaw=yaw)
         docks.wait_for_reason("^a path of [0-9.]+ cells, by greedy steps$")
+
+
+@pytest.mark.parametrize("start_yaw", [0.0, 1.0, -3.0])
+def test_a_body_that_turns_on_the_spot_is_a_reason_to_plan(start_yaw: float) -> None:
+    header = Header(frame_id="map")
+    goal = (2.0, 2.0, 0.0)
+    first = PoseRequest(
+        GridMap(np.zeros((30, 30), bool), 0.1), (1.0, 1.0, start_yaw), (goal,)
+    )
+    planner: Planner = None  # it is not asked: at each change the goal is planned for
+    active = ActiveGoal([PoseStamped()], period=0.0)
+    active.note(Outcome("NO_PATH", "", request=first, map_header=header))
+    for turn, is_reason in ((0.0, False), (0.01, False), (0.8, True), (-1.6, True)):
+        turned = replace(first, start=(1.0, 1.0, start_yaw + turn))
+        assert active.is_due(planner, turned, header, True) == is_reason

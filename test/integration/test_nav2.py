@@ -34,13 +34,19 @@ from std_msgs.msg import Header
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes import nav2
-from ddqn_planner.nodes.nav2 import PREEMPTED, PathAction, Task, error_code, poses_of
+from ddqn_planner.nodes.nav2 import (
+    PREEMPTED,
+    NavigationServer,
+    PathAction,
+    error_code,
+    poses_of,
+)
 from ddqn_planner.nodes.other_planners import GivenUp
-from ddqn_planner.nodes.outcome import NOT_ACTIVE, Outcome, RequestError
+from ddqn_planner.nodes.outcome import NOT_ACTIVE, Outcome, PathQuery, RequestError
 from ddqn_planner.nodes.pending_requests import unless
 from ddqn_planner.nodes.planner_node import PlannerNode
 from ddqn_planner.nodes.quality import SERVICE_QUALITY
-from ddqn_planner.nodes.requests import check_request
+from ddqn_planner.nodes.requests import check_query
 from ddqn_planner.planning import Plan, PlanStatus
 
 FOUND = Outcome("SUCCEEDED", "a path", plan=Plan(PlanStatus.SUCCEEDED, ((0, 0),)))
@@ -97,13 +103,18 @@ def test_codes_are_nav2s(name: str) -> None:
 
 def test_a_request_has_a_goal_and_names_the_planner_or_none() -> None:
     for name in ("", "GridBased"):
-        check_request([1], name, "GridBased")
+        check_query(PathQuery(None, [PoseStamped()], name), "GridBased")
     for goals, name, status, reason in (
-        ([1], "Smac", "INVALID_PLANNER", "no planner 'Smac'; give 'GridBased' or ''"),
+        (
+            [PoseStamped()],
+            "Smac",
+            "INVALID_PLANNER",
+            "no planner 'Smac'; give 'GridBased' or ''",
+        ),
         ([], "", "NO_GOALS", "no goal; give one or more"),
     ):
         with pytest.raises(RequestError, match=reason) as error:
-            check_request(goals, name, "GridBased")
+            check_query(PathQuery(None, goals, name), "GridBased")
         assert error.value.status == status
 
 
@@ -154,13 +165,24 @@ class ThroughPoses:
 class Server:
     """An action whose plans are there when the test says so."""
 
-    def __init__(self, kind: Any = ToPose, **options: Any) -> None:
+    def __init__(
+        self,
+        kind: Any = ToPose,
+        ask_other: Any = None,
+        is_own: Callable[[str], bool] = bool,
+    ) -> None:
         self.asked: list[tuple[Any, Any]] = []
-        self.tasks: list[Task] = []
+        self.tasks: list[PathQuery] = []
         self.planned, self.refusal = Future(), None
-        self.action = PathAction(kind, lambda: self.refusal, self.plan, **options)
+        server = NavigationServer(
+            lambda: self.refusal, self.plan, ask_other, is_own, on_is_path_valid=None
+        )
+        others = None if ask_other is None else SimpleNamespace()
+        self.action = PathAction(kind, server, others)
 
-    async def plan(self, task: Task, given_up: GivenUp) -> tuple[PathMessage, Outcome]:
+    async def plan(
+        self, task: PathQuery, given_up: GivenUp
+    ) -> tuple[PathMessage, Outcome]:
         self.asked.append((task.start, task.goals))
         self.tasks.append(task)
 
@@ -327,10 +349,12 @@ class Other:
     """Another planner, which answers when the test says so."""
 
     def __init__(self) -> None:
-        self.answer, self.is_kept = Future(), bool
+        self.answer, self.is_preempted = Future(), bool
 
-    async def ask(self, handle: Any, given_up: GivenUp, is_kept: Any) -> Any:
-        self.is_kept = is_kept
+    async def ask(
+        self, server: Any, handle: Any, given_up: GivenUp, is_preempted_there: Any
+    ) -> Any:
+        self.is_preempted = is_preempted_there
 
         async def answering() -> Any:
             return await self.answer
@@ -346,7 +370,7 @@ def test_the_answer_of_another_planner_is_returned_as_it_is(
     status: Any, state: str
 ) -> None:
     other, handle, ours = Other(), Handle(), Handle()
-    server = Server(ask_other=other.ask, is_ours=lambda name: name in ("", "ddqn"))
+    server = Server(ask_other=other.ask, is_own=lambda name: name in ("", "ddqn"))
     handle.request.planner_id, ours.request.planner_id = "GridBased", "ddqn"
     server.begin(ours).close()
     execution = server.begin(handle)
@@ -366,15 +390,15 @@ def test_the_answer_of_another_planner_is_returned_as_it_is(
 
 
 def test_a_newer_goal_preempts_that_of_another_planner_there_or_here() -> None:
-    for planner_id, is_kept in (("Smac", True), ("", False)):
+    for planner_id, is_there in (("Smac", True), ("", False)):
         other, first, second = Other(), Handle(), Handle()
-        server = Server(ask_other=other.ask, is_ours=lambda name: not name)
+        server = Server(ask_other=other.ask, is_own=lambda name: not name)
         first.request.planner_id, second.request.planner_id = "GridBased", planner_id
         execution = server.begin(first)
-        assert not other.is_kept()
-        kept = other.is_kept
+        is_preempted = other.is_preempted
+        assert not is_preempted()
         server.begin(second).close()
-        assert kept() == is_kept
+        assert is_preempted() == is_there
         assert end(execution).error_msg == PREEMPTED.reason
         assert first.state == "aborted"
 
@@ -407,7 +431,7 @@ def test_the_services_of_actions_have_queues_as_others(
     )
     node = SimpleNamespace(create_service=lambda *given, **named: None)
     planning: Any = SimpleNamespace(
-        refusal=bool, plan=None, is_ours=bool, on_is_path_valid=print
+        refusal=bool, plan=None, is_own=bool, on_is_path_valid=print
     )
     nav2.serve_nav2(cast("Any", node), planning)
     services = [
@@ -434,7 +458,7 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
         executor.add_node(node)
         values[3:8, 4:26] = 100
         grid = GridMap(values > 0)
-        task = Task(pose(grid, (0, 5)), [pose(grid, (29, 5))], "")
+        task = PathQuery(pose(grid, (0, 5)), [pose(grid, (29, 5))], "")
 
         def run(task: Any) -> Any:
             future = executor.create_task(task)
@@ -515,7 +539,7 @@ def test_a_path_leads_through_its_goals_in_order_or_as_far_as_it_can() -> None:
 
         def plan(*goals: PoseStamped, via: bool = False) -> tuple[PathMessage, Outcome]:
             node._map.take(map_message(values, grid, next(NUMBERS)))
-            task = Task(start, [*goals], "", via)
+            task = PathQuery(start, [*goals], "", via)
             future = executor.create_task(node._plan_for_action(task, lambda: None))
             executor.spin_until_future_complete(future, TIMEOUT)
             path, outcome = future.result()

@@ -23,8 +23,8 @@ from std_msgs.msg import Header
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.arrivals import Arrivals
-from ddqn_planner.nodes.nav2 import CANCELED, Task
-from ddqn_planner.nodes.outcome import NOT_ACTIVE, STOPPING, Outcome
+from ddqn_planner.nodes.nav2 import CANCELED
+from ddqn_planner.nodes.outcome import NOT_ACTIVE, STOPPING, Outcome, PathQuery
 from ddqn_planner.nodes.pending_requests import FAREWELL
 from ddqn_planner.nodes.planner_node import IDLE_PERIOD, PlannerNode
 from ddqn_planner.nodes.retries import Retries
@@ -91,7 +91,7 @@ class Asked:
         self, goal: tuple[int, int] = GOAL, given_up: Callable[[], Any] = lambda: None
     ) -> Any:
         """Return the future of an answer, asked for as an action asks."""
-        task = Task(pose(GRID, START), [pose(GRID, goal)], "")
+        task = PathQuery(pose(GRID, START), [pose(GRID, goal)], "")
         return self.executor.create_task(self.node._plan_for_action, task, given_up)
 
     def answer(self, task: Any) -> str:
@@ -179,17 +179,17 @@ def test_the_last_costmap_in_time_counts_though_it_is_planned_on_later(
     clock = SimpleNamespace(monotonic=lambda: time.monotonic() + late[0])
     monkeypatch.setattr("ddqn_planner.nodes.requests.time", clock)
     failed_before(asked)
-    plan_now, costmaps = asked.node._requests.plan_now, [RING, FREE]
+    plan_once, costmaps = asked.node._requests.plan_once, [RING, FREE]
 
     async def slow_plan(*arguments: Any, **options: Any) -> Outcome:
-        outcome = await plan_now(*arguments, **options)
+        outcome = await plan_once(*arguments, **options)
         if costmaps:  # comes while the plan is made
             asked.send(costmaps.pop(0))
             asked.set_period(1000.0)
             late[0] += 2500.0
         return outcome
 
-    monkeypatch.setattr(asked.node._requests, "plan_now", slow_plan)
+    monkeypatch.setattr(asked.node._requests, "plan_once", slow_plan)
     assert asked.answer(asked.ask()) == "SUCCEEDED"
 
 

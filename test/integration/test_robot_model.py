@@ -21,7 +21,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.nodes.conversions import grid_from_message
-from ddqn_planner.nodes.nav2 import Task
+from ddqn_planner.nodes.outcome import PathQuery
 from ddqn_planner.nodes.planner_node import PlannerNode
 from ddqn_planner.nodes.quality import LATCHED
 
@@ -243,7 +243,7 @@ def test_actions_lead_through_poses_and_paths_are_checked(
         executor.add_node(node)
         node._map.take(map_message(rooms, grid, next(NUMBERS)))
         path, outcome = run(
-            node._plan_for_action(Task(start, [middle, goal], ""), lambda: None)
+            node._plan_for_action(PathQuery(start, [middle, goal], ""), lambda: None)
         )
         poses = check(path, grid, BEYOND, 1.0)
         assert outcome.status == "SUCCEEDED"
@@ -252,9 +252,11 @@ def test_actions_lead_through_poses_and_paths_are_checked(
         )
         assert np.abs(np.diff(poses, axis=0)).max(axis=1).min() > 1e-6
         assert any(ends_at(Path(poses=[it]), grid, BESIDE, 2.0) for it in path.poses)
-        first, _ = run(node._plan_for_action(Task(start, [goal], ""), lambda: None))
+        first, _ = run(
+            node._plan_for_action(PathQuery(start, [goal], ""), lambda: None)
+        )
         again, outcome = run(
-            node._plan_for_action(Task(first.poses[9], [goal], ""), lambda: None)
+            node._plan_for_action(PathQuery(first.poses[9], [goal], ""), lambda: None)
         )
         assert outcome.plan.extra_cost is not None  # kept
         assert np.array_equal(array_of(again), array_of(first)[9:])
@@ -264,7 +266,9 @@ def test_actions_lead_through_poses_and_paths_are_checked(
         narrow[:, 28:33] = 100
         narrow[24:29, 28:33] = 0
         node._map.take(map_message(narrow, grid, next(NUMBERS)))
-        through, _ = run(node._plan_for_action(Task(start, [goal], ""), lambda: None))
+        through, _ = run(
+            node._plan_for_action(PathQuery(start, [goal], ""), lambda: None)
+        )
         poses_through = array_of(through)
         from_door = np.abs(poses_through[:, :2] - grid.cell_to_world((30, 26))).sum(
             axis=1
@@ -274,7 +278,7 @@ def test_actions_lead_through_poses_and_paths_are_checked(
         aside.pose.position.x -= 0.06 * math.sin(ORIGIN[2])
         aside.pose.position.y += 0.06 * math.cos(ORIGIN[2])
         rest, outcome = run(
-            node._plan_for_action(Task(aside, [goal], ""), lambda: None)
+            node._plan_for_action(PathQuery(aside, [goal], ""), lambda: None)
         )
         assert np.array_equal(array_of(rest), poses_through[number:])
         assert (
