@@ -1,4 +1,7 @@
-"""Conversions between ROS messages, checked as Nav2 does (nav2_util), and grid maps and paths."""
+"""Conversions between ROS messages and grid maps, paths, and bytes.
+
+Messages are checked as Nav2 does (nav2_util).
+"""
 
 import array
 import hashlib
@@ -24,20 +27,27 @@ from ddqn_planner.planning.exact_paths import dense
 Origin = tuple[float, float, float]
 Float64 = NDArray[np.float64]
 
-MAX_TILT = math.sin(
-    math.radians(1) / 2
-)  # of one degree: two decimals of a quaternion tilt less
-AS_SENT = 1e-6  # a norm so near to 1 is left as it is
-LABEL = (
-    "ddqn_planner {} 1 sha256:{}"  # of bytes: their kind, its version and their digest
-)
-BLANK_POSES = pickle.dumps(
-    [
-        PoseStamped(header=header, pose=Pose(orientation=rotation))
-        for header, rotation in [(Header(), Quaternion())]
-        for _ in range(64)
-    ]
-)
+# Of one degree, as `Rotation.tilt`: a quaternion of two decimals tilts less.
+MAX_TILT = math.sin(math.radians(1) / 2)
+NORM_TOLERANCE = 1e-6  # a norm that differs less from 1 is left as it is
+# Of bytes in a message: their kind, its version and their digest.
+LABEL = "ddqn_planner {} 1 sha256:{}"
+ENCODING_BYTES = 4  # at the start of a serialised message
+
+
+def _blank_poses() -> bytes:
+    """Return 64 pickled poses that share a header and an orientation."""
+    header = Header()
+    orientation = Quaternion()
+    return pickle.dumps(
+        [
+            PoseStamped(header=header, pose=Pose(orientation=orientation))
+            for _ in range(64)
+        ]
+    )
+
+
+BLANK_POSES = _blank_poses()
 
 
 class MapRules(NamedTuple):
@@ -127,15 +137,29 @@ def grid_from_values(
 def occupancy_message(
     values: NDArray[Any] | None, resolution: float, origin: Origin, header: Header
 ) -> OccupancyGrid:
-    """Make a message of a map's values or forbidden directions, see `GridMap`; empty of none."""
+    """Make a map message.
+
+    Parameters
+    ----------
+    values : (H, W) integers, or None
+        A map's values, or its forbidden directions (see `GridMap`); None for a message
+        without cells.
+    resolution
+        Metres per cell.
+    origin
+        The pose of the corner of the first cell: metres, and radians.
+    header
+        The header of the message.
+    """
     if values is None:
         return OccupancyGrid(header=header)
-    (height, width), (x, y, yaw) = values.shape, map(float, origin)
-    corner = Pose(position=Point(x=x, y=y), orientation=quaternion(yaw))
-    info = MapMetaData(
-        map_load_time=header.stamp, resolution=float(resolution), origin=corner
-    )
-    info.width, info.height = width, height
+    height, width = values.shape
+    x, y, yaw = origin
+    corner = Point(x=float(x), y=float(y))
+    info = MapMetaData(map_load_time=header.stamp, resolution=float(resolution))
+    info.origin = Pose(position=corner, orientation=quaternion(float(yaw)))
+    info.width = width
+    info.height = height
     data = array.array("b", values.astype(np.int8, copy=False).tobytes())
     return OccupancyGrid(header=header, info=info, data=data)
 
@@ -143,18 +167,23 @@ def occupancy_message(
 def path_message(
     points: Float64, yaws: Float64, header: Header, last: Quaternion | None = None
 ) -> Path:
-    """Make a path message of points and directions, see `path_bytes`."""
+    """Make a path message; for the parameters see `path_bytes`."""
     path = Path(header=header)
-    # Most of an answer's time is making messages. Poses in the same direction share a quaternion,
-    # and all are copies, which take a quarter of the time of the messages' constructors.
+    # Most of an answer's time is making messages. Poses in the same direction share a
+    # quaternion, and all are copies, which take a quarter of the time of the messages'
+    # constructors.
     poses: list[PoseStamped] = []
     while len(poses) < len(points):
         poses += pickle.loads(BLANK_POSES)
     del poses[len(points) :]
-    towards = {yaw: quaternion(yaw) for yaw in {*yaws.tolist()}}
-    orientations = [*map(towards.get, yaws.tolist()), last]
-    places = points.tolist()
-    for stamped, (x, y), orientation in zip(poses, places, orientations, strict=False):
+    yaw_of_poses: list[float] = yaws.tolist()
+    quaternions = {yaw: quaternion(yaw) for yaw in set(yaw_of_poses)}
+    orientations = [quaternions[yaw] for yaw in yaw_of_poses]
+    orientations.append(last)
+    positions: list[list[float]] = points.tolist()
+    for stamped, (x, y), orientation in zip(
+        poses, positions, orientations, strict=False
+    ):
         stamped.header = header
         stamped.pose.orientation = orientation
         stamped.pose.position.x = x
@@ -187,53 +216,86 @@ def frame_of(path: Path) -> str:
 
 
 def poses_of(path: Path, with_yaw: bool = True) -> Float64:
-    """Return the poses of a path, (N, 3), with the yaw 0 if it does not count; or a ValueError."""
-    if not path.poses:
+    """Return the poses of a path, (N, 3): metres and radians.
+
+    The yaw is 0 unless it is asked for. A ValueError says which pose is not finite, or
+    that there is none.
+    """
+    messages: list[Pose] = [stamped.pose for stamped in path.poses]
+    if not messages:
         raise ValueError("the path has no pose; give one or more")
-    poses = [stamped.pose for stamped in path.poses]
-    array = np.zeros((len(poses), 3))
-    array[:, :2] = [(pose.position.x, pose.position.y) for pose in poses]
+    poses = np.zeros((len(messages), 3))
+    poses[:, :2] = [(pose.position.x, pose.position.y) for pose in messages]
     if with_yaw:
-        array[:, 2] = [rotation(pose.orientation).yaw for pose in poses]
-    is_finite = np.isfinite(array).all(axis=1)
+        poses[:, 2] = [rotation(pose.orientation).yaw for pose in messages]
+    is_finite = np.isfinite(poses).all(axis=1)  # (N,)
     if not is_finite.all():
         number = int(is_finite.argmin())
-        raise ValueError(
-            f"pose {number} of the path is {array[number]}; give finite numbers"
-        )
-    return array
+        wrong = f"pose {number} of the path is {poses[number]}"
+        raise ValueError(f"{wrong}; give finite numbers")
+    return poses
 
 
 def moved(poses: Float64, origin: Origin) -> Float64:
-    """Return poses (N, 3) of a frame in the one where the frame's origin is given."""
+    """Return poses (N, 3) in the frame in which `origin` is the pose of their frame."""
     x, y, yaw = poses.T
-    cos, sin = math.cos(origin[2]), math.sin(origin[2])
-    points = origin[0] + cos * x - sin * y, origin[1] + sin * x + cos * y
-    return np.column_stack([*points, yaw + origin[2]])
+    origin_x, origin_y, origin_yaw = origin
+    cos = math.cos(origin_yaw)
+    sin = math.sin(origin_yaw)
+    moved_x = origin_x + cos * x - sin * y
+    moved_y = origin_y + sin * x + cos * y
+    return np.column_stack([moved_x, moved_y, yaw + origin_yaw])
 
 
 def path_bytes(
     positions: Float64, yaw: Float64, header: Header, last: Quaternion | None = None
 ) -> bytes:
-    """Return a path as it is sent: positions (N, 2), and directions (N), or (N - 1) and a last."""
-    # OMG DDS-XTypes, plain CDR, little-endian: numbers are aligned to their size, so that each pose
-    # has the same bytes before its seven numbers, except for the first one.
-    count, stamp = len(positions), serialize_message(header)[4:]
-    start = serialize_message(Path(header=header))[:-4] + count.to_bytes(4, "little")
-    if not count:
+    """Return a path as it is sent.
+
+    Parameters
+    ----------
+    positions : (N, 2) float64
+        Metres.
+    yaw : (N,) float64, or (N - 1,) with `last`
+        Radians.
+    header
+        The header of the path and of each pose.
+    last
+        The orientation of the last pose, if `yaw` has none.
+
+    Returns
+    -------
+    The message in OMG DDS-XTypes' plain CDR, little-endian.
+    """
+    count = len(positions)
+    # The header without the four bytes that name the encoding.
+    pose_header = serialize_message(header)[ENCODING_BYTES:]
+    # A path without poses ends with their number, 0.
+    empty_path = serialize_message(Path(header=header))
+    start = empty_path[:-4] + count.to_bytes(4, "little")
+    if count == 0:
         return start
-    first, others = (
-        stamp + bytes(-(at + len(stamp)) % 8) for at in (len(start) - 4, 0)
-    )
-    poses = np.zeros(
-        count, dtype=[("header", f"V{len(others)}"), ("numbers", "<f8", 7)]
-    )
-    poses["header"], numbers = np.void(others), poses["numbers"]
+    # Numbers are aligned to their size, 8 bytes. So each pose has the same bytes before
+    # its seven numbers, except for the first pose, which begins elsewhere.
+    first_pose_header = _padded(pose_header, offset=len(start) - ENCODING_BYTES)
+    next_pose_header = _padded(pose_header, offset=0)
+    header_type = f"V{len(next_pose_header)}"
+    poses = np.zeros(count, dtype=[("header", header_type), ("numbers", "<f8", 7)])
+    poses["header"] = np.void(next_pose_header)
+    numbers = poses["numbers"]  # (N, 7): x, y, z, and a quaternion x, y, z, w
     numbers[:, :2] = positions
-    numbers[: len(yaw), 5], numbers[: len(yaw), 6] = np.sin(yaw / 2), np.cos(yaw / 2)
+    numbers[: len(yaw), 5] = np.sin(yaw / 2)
+    numbers[: len(yaw), 6] = np.cos(yaw / 2)
     if last is not None:
-        numbers[-1, 3:] = last.x, last.y, last.z, last.w
-    return start + first + poses.tobytes()[len(others) :]
+        numbers[-1, 3:] = (last.x, last.y, last.z, last.w)
+    content = poses.tobytes()[len(next_pose_header) :]
+    return start + first_pose_header + content
+
+
+def _padded(content: bytes, offset: int) -> bytes:
+    """Return bytes that begin at an offset, with zeros up to a multiple of 8 bytes."""
+    end = offset + len(content)
+    return content + bytes(-end % 8)
 
 
 def bytes_message(kind: str, data: bytes) -> UInt8MultiArray:
@@ -246,44 +308,63 @@ def bytes_message(kind: str, data: bytes) -> UInt8MultiArray:
 
 
 def bytes_of(kind: str, message: UInt8MultiArray) -> bytes:
-    """Return the bytes of a kind that a message carries; a ValueError if it has others."""
+    """Return the bytes of a message; a ValueError if damaged or of another kind."""
     data = bytes(message.data)
-    label = message.layout.dim[0].label if message.layout.dim else ""
-    if label != (right := LABEL.format(kind, hashlib.sha256(data).hexdigest())):
-        wrong = f"{len(data)} bytes with the label {label!r}, not {right!r}"
-        is_cut = label.partition(":")[0] == right.partition(":")[0]
-        remedy = (
-            "save there again" if is_cut else "let trainer and planner have one version"
-        )
-        raise ValueError(f"the trainer sent {wrong}; {remedy}")
-    return data
+    label: str = message.layout.dim[0].label if message.layout.dim else ""
+    expected_label = LABEL.format(kind, hashlib.sha256(data).hexdigest())
+    if label == expected_label:
+        return data
+    wrong = f"{len(data)} bytes with the label {label!r}, not {expected_label!r}"
+    is_same_kind = label.partition(":")[0] == expected_label.partition(":")[0]
+    remedy = "let trainer and planner have one version"
+    if is_same_kind:  # the bytes were damaged
+        remedy = "save there again"
+    raise ValueError(f"the trainer sent {wrong}; {remedy}")
 
 
 def check_pose(
     name: str, stamped: PoseStamped, frame: str = "", other_remedy: str = ""
 ) -> None:
-    """Check a pose, which the ValueError calls by its name, and that it is in the map's frame."""
-    its = stamped.header.frame_id
-    if its and frame in ("", its):
+    """Check that a pose is a pose in a frame.
+
+    Parameters
+    ----------
+    name
+        The name of the pose in errors, such as "the goal".
+    stamped
+        The pose.
+    frame
+        The map's frame, in which the pose must be; empty for any frame with a name.
+    other_remedy
+        What else to do about another frame, in words.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite, the orientation is no rotation, or the frame is
+        wrong.
+    """
+    pose_frame: str = stamped.header.frame_id
+    if pose_frame and frame in ("", pose_frame):
         return _check_pose(name, stamped.pose)
-    known = f", the map's is {frame!r}" if frame else ""
     remedy = "name one in header.frame_id"
-    if its:
-        remedy = f"transform the pose to that frame (in RViz: set Fixed Frame to it){other_remedy}"
-    raise ValueError(f"{name}'s frame is {its!r}{known}; {remedy}")
+    if pose_frame:
+        transform = "transform the pose to that frame (in RViz: set Fixed Frame to it)"
+        remedy = f"{transform}{other_remedy}"
+    map_frame = f", the map's is {frame!r}" if frame else ""
+    raise ValueError(f"{name}'s frame is {pose_frame!r}{map_frame}; {remedy}")
 
 
 def cell_from_pose(name: str, stamped: PoseStamped, grid: GridMap, frame: str) -> Cell:
-    """Return the cell of a pose, which may lie outside the map; see `check_pose` for errors."""
+    """Return the cell of a pose, perhaps off the map; errors as of `check_pose`."""
     check_pose(name, stamped, frame)
     position = stamped.pose.position
     try:
         return grid.world_to_cell(position.x, position.y)
     except (OverflowError, ValueError):  # the floor of infinity, and of NaN
-        where = f"({_numbers(position)}) is too far from the map to have a cell"
-        raise ValueError(
-            f"{name}'s position {where}; give one on the map, in metres"
-        ) from None
+        wrong = f"{name}'s position ({_numbers(position)}) is too far from the map"
+        remedy = "give one on the map, in metres"
+        raise ValueError(f"{wrong} to have a cell; {remedy}") from None
 
 
 def pose_of(stamped: PoseStamped) -> Origin:
@@ -298,47 +379,47 @@ def rotation(message: Quaternion) -> Rotation:
 
 
 def with_unit_quaternion(stamped: PoseStamped) -> PoseStamped:
-    """Return a pose that `check_pose` accepts, or a copy of it whose quaternion has the norm 1.
+    """Return a pose whose quaternion has the norm 1: itself, or a copy.
 
-    Whoever reads a path may refuse others, as Nav2 does.
+    `check_pose` accepts rounded quaternions; Nav2 refuses them in a path.
     """
-    sent = stamped.pose.orientation
-    unit = unit_quaternion(sent)
-    if unit is sent:
+    pose: Pose = stamped.pose
+    orientation = unit_quaternion(pose.orientation)
+    if orientation is pose.orientation:
         return stamped
-    pose = Pose(position=stamped.pose.position, orientation=unit)
+    pose = Pose(position=pose.position, orientation=orientation)
     return PoseStamped(header=stamped.header, pose=pose)
 
 
 def unit_quaternion(message: Quaternion) -> Quaternion:
     """Return a quaternion with the norm 1: itself if it has that already."""
-    sent = rotation(message)
-    if abs(sent.norm - 1) <= AS_SENT:
+    rounded = rotation(message)
+    if abs(rounded.norm - 1) <= NORM_TOLERANCE:
         return message
-    x, y, z, w = sent.normalised()
+    x, y, z, w = rounded.normalised()
     return Quaternion(x=x, y=y, z=z, w=w)
 
 
 def quaternion(yaw: float) -> Quaternion:
     """Return the rotation by `yaw` radians about z, counter-clockwise."""
     turned = Quaternion()
-    turned.z, turned.w = math.sin(yaw / 2), math.cos(yaw / 2)
+    turned.z = math.sin(yaw / 2)
+    turned.w = math.cos(yaw / 2)
     return turned
 
 
 def _check_pose(name: str, pose: Pose) -> None:
-    position = pose.position
-    if not all(map(math.isfinite, (position.x, position.y, position.z))):
-        raise ValueError(
-            f"{name}'s position is ({_numbers(position)}); give finite numbers"
-        )
+    position: Point = pose.position
+    coordinates: tuple[float, float, float] = (position.x, position.y, position.z)
+    if not all(map(math.isfinite, coordinates)):
+        wrong = f"{name}'s position is ({_numbers(position)})"
+        raise ValueError(f"{wrong}; give finite numbers")
     turned = rotation(pose.orientation)
     if not turned.is_rounded:
-        numbers = _numbers(pose.orientation)
-        wrong = f"{name}'s orientation is ({numbers}), a quaternion of norm {turned.norm:.6g}"
-        raise ValueError(
-            f"{wrong}; give one of norm 1 (w = 1 and the rest 0 means no rotation)"
-        )
+        orientation = f"{name}'s orientation is ({_numbers(pose.orientation)})"
+        wrong = f"{orientation}, a quaternion of norm {turned.norm:.6g}"
+        remedy = "give one of norm 1 (w = 1 and the rest 0 means no rotation)"
+        raise ValueError(f"{wrong}; {remedy}")
 
 
 def _numbers(message: Point | Quaternion) -> str:
