@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from numbers import Integral
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -39,10 +39,11 @@ class Scenario:
 
     def __post_init__(self) -> None:
         check_grid(self.grid)
-        start, goal = as_cell(self.start, "the start"), as_cell(self.goal, "the goal")
-        vars(self).update(
-            start=start, goal=goal, move_rule=MoveRule(self.move_rule)
-        )  # it is frozen
+        start = as_cell(self.start, "the start")
+        goal = as_cell(self.goal, "the goal")
+        object.__setattr__(self, "start", start)  # as Python's dataclasses do
+        object.__setattr__(self, "goal", goal)
+        object.__setattr__(self, "move_rule", MoveRule(self.move_rule))
         for name, cell in (("start", start), ("goal", goal)):
             if not self.grid.is_free(cell):
                 raise ValueError(
@@ -53,11 +54,12 @@ class Scenario:
                 f"start and goal are both {start}; give two different cells"
             )
         if not self._leads_to_goal(self.move_rule):
-            others = [rule.value for rule in MoveRule if self._leads_to_goal(rule)]
-            remedy = f"give the move rule {others[0]}" if others else "open the map"
-            problem = f"no path leads from the start {start} to the goal {goal}"
-            rule = f"under the move rule {self.move_rule.value}"
-            raise ValueError(f"{problem} {rule}; give other cells, or {remedy}")
+            rules = [rule.value for rule in MoveRule if self._leads_to_goal(rule)]
+            remedy = f"give the move rule {rules[0]}" if rules else "open the map"
+            raise ValueError(
+                f"no path leads from the start {start} to the goal {goal} under the "
+                f"move rule {self.move_rule.value}; give other cells, or {remedy}"
+            )
 
     def _leads_to_goal(self, move_rule: MoveRule) -> bool:
         reached = self.grid.reachable([self.start], move_rule)
@@ -74,11 +76,55 @@ def paper_scenario() -> Scenario:
     return Scenario(map_file.grid(), map_file.start, map_file.goal)
 
 
-class GridVectorEnvironment:
-    """N robots on maps of one size, moved in one step; each episode draws one of S scenarios."""
+class Outcome(NamedTuple):
+    """What a move of N robots gave; (N,) each."""
 
-    # Cells are numbers y * W + x. The results of moves are looked up in tables (S, 8, H * W).
-    # `reset` begins the first episodes too; one that has ended waits for it, and makes no move.
+    reward: NDArray[np.float32]
+    terminated: NDArray[np.bool_]  # at the goal, or in a collision
+    truncated: NDArray[np.bool_]  # out of steps
+
+
+def _check_scenarios(scenarios: Any) -> None:
+    """Raise a ValueError for none, for other things, and for maps of several sizes."""
+    if not scenarios or not all(isinstance(item, Scenario) for item in scenarios):
+        raise ValueError(f"the scenarios are {scenarios!r}; give at least one Scenario")
+    shapes = {scenario.grid.occupancy.shape for scenario in scenarios}
+    if len(shapes) != 1:
+        raise ValueError(
+            f"the maps have the sizes {sorted(shapes)}; give maps of one size"
+        )
+
+
+class GridVectorEnvironment:
+    """N robots on maps of one size, moved in one step.
+
+    Each episode draws one of S scenarios. `reset` begins the first episodes, too. A
+    robot whose episode has ended makes no move until it is reset. Cells are numbers
+    y * W + x, C in all; the results of moves are looked up in tables.
+
+    Attributes
+    ----------
+    background : (S, C) float32
+        What a network sees of each map without a robot.
+    legal : (S, 8, C) bool
+        Whether a move is legal.
+    free_reward : (S, 8, C) float32
+        The reward of a legal move, see `move_reward`.
+    rewards : (S, 8, C) float32
+        The reward of any move.
+    next_cell : (8, C) int64
+        The neighbour in the direction of a move; C off the map.
+    start, goal : (S,) int64
+        The cells of the scenarios.
+    scenario, cell, steps : (N,) int64
+        Of each robot's episode: its scenario, its cell, and how many steps it has made.
+    visited : (N, max_episode_steps + 1) int64
+        The cells of each episode in their order.
+    total_reward : (N,) float64
+        The sum of the rewards of each episode.
+    terminated, truncated : (N,) bool
+        Whether an episode ended with its last move, or ran out of steps.
+    """
 
     def __init__(
         self,
@@ -86,77 +132,81 @@ class GridVectorEnvironment:
         parameters: HyperParameters,
         random: np.random.Generator | None = None,
     ) -> None:
-        if not scenarios or not all(isinstance(one, Scenario) for one in scenarios):
-            raise ValueError(
-                f"the scenarios are {scenarios!r}; give at least one Scenario"
-            )
+        _check_scenarios(scenarios)
         if not isinstance(parameters, HyperParameters):
             raise ValueError(f"the parameters are {parameters!r}; give HyperParameters")
-        shapes = {scenario.grid.occupancy.shape for scenario in scenarios}
-        if len(shapes) != 1:
-            raise ValueError(
-                f"the maps have the sizes {sorted(shapes)}; give maps of one size"
-            )
-        (self.shape,) = shapes
+        self.shape = scenarios[0].grid.occupancy.shape
         self.scenarios = tuple(scenarios)
         self.parameters = parameters
         self.random = random or np.random.default_rng()
 
-        maps = [observation_background(s.grid.occupancy, s.goal) for s in scenarios]
-        self.background, self.next_cell = np.stack(maps), neighbours(self.shape)
-        tables, to_number = (len(maps), len(MOVES), -1), np.array([1, self.shape[1]])
+        height, width = self.shape
+        tables = (len(scenarios), len(MOVES), height * width)
+        self.background = np.stack(
+            [observation_background(s.grid.occupancy, s.goal) for s in scenarios]
+        )
         legal = [s.grid.legal_moves(s.move_rule) for s in scenarios]
-        reward = [move_reward(s.grid, s.start, s.goal, parameters) for s in scenarios]
+        rewards = [move_reward(s.grid, s.start, s.goal, parameters) for s in scenarios]
         self.legal = np.stack(legal).reshape(tables)
-        self.free_reward = np.stack(reward).reshape(tables)
+        self.free_reward = np.stack(rewards).reshape(tables)
         collision = np.float32(parameters.obstacle_reward)
         self.rewards = np.where(self.legal, self.free_reward, collision)
-        self.start = np.array([s.start for s in scenarios]) @ to_number
-        self.goal = np.array([s.goal for s in scenarios]) @ to_number
+        self.next_cell = neighbours(self.shape)
+        number_of_x_y = np.array([1, width])
+        self.start = np.array([s.start for s in scenarios]) @ number_of_x_y
+        self.goal = np.array([s.goal for s in scenarios]) @ number_of_x_y
+        # The free cells of all maps in a row, and where those of each map begin.
+        is_free_SC = self.background == FREE  # goals are not
+        _, self._free_cells = np.nonzero(is_free_SC)
+        self._free_count = is_free_SC.sum(axis=1)
+        self._first_free = np.cumsum(self._free_count) - self._free_count
 
-        free_SC = self.background == FREE  # goals are not
-        _, self._free = np.nonzero(free_SC)
-        self._free_count = free_SC.sum(axis=1)
-        self._free_first = np.cumsum(self._free_count) - self._free_count
-
-        count, most = parameters.environments, parameters.max_episode_steps
-        self.scenario, self.cell, self.steps = np.zeros((3, count), np.int64)
-        # Of each robot's episode: the cells in their order, and the sum of the rewards.
-        self.visited, self.total_reward = (
-            np.zeros((count, most + 1), np.int64),
-            np.zeros(count),
-        )
-        self.terminated, self.truncated = np.zeros((2, count), np.bool_)
+        robots = parameters.environments
+        self.scenario = np.zeros(robots, np.int64)
+        self.cell = np.zeros(robots, np.int64)
+        self.steps = np.zeros(robots, np.int64)
+        self.visited = np.zeros((robots, parameters.max_episode_steps + 1), np.int64)
+        self.total_reward = np.zeros(robots)
+        self.terminated = np.zeros(robots, np.bool_)
+        self.truncated = np.zeros(robots, np.bool_)
 
     def reset(self, mask: Any = ...) -> None:
         """Start new episodes: all, or those where `mask` (N,) is True."""
         scenario = self.random.integers(len(self.start), size=len(self.cell[mask]))
+        cell = initial_cells(
+            self.start[scenario],
+            self._free_cells,
+            self._first_free[scenario],
+            self._free_count[scenario],
+            self.parameters.p_r,
+            self.random,
+        )
         self.scenario[mask] = scenario
-        free = self._free, self._free_first[scenario], self._free_count[scenario]
-        start, p_r = self.start[scenario], self.parameters.p_r
-        self.cell[mask] = initial_cells(start, *free, p_r, self.random)
-        self.visited[mask, 0] = self.cell[mask]
-        self.steps[mask], self.total_reward[mask] = 0, 0.0
-        self.terminated[mask] = self.truncated[mask] = False
+        self.cell[mask] = cell
+        self.visited[mask, 0] = cell
+        self.steps[mask] = 0
+        self.total_reward[mask] = 0.0
+        self.terminated[mask] = False
+        self.truncated[mask] = False
 
-    def move(self, actions: NDArray[np.int64]) -> tuple[NDArray[Any], ...]:
-        """Move each robot once, (N,) actions; return reward, terminated, truncated: (N,) each."""
+    def move(self, actions: NDArray[np.int64]) -> Outcome:
+        """Move each robot once, by the actions (N,)."""
         actions = numbers(
             "the actions", actions, self.cell.shape, "iu", (0, len(MOVES) - 1)
         )
         if (self.terminated | self.truncated).any():
             raise ResetNeeded("an episode has ended; call reset before the next step")
-        lookup = (self.scenario, actions, self.cell)
-        legal, reward = self.legal[lookup], self.rewards[lookup]
+        legal = self.legal[self.scenario, actions, self.cell]
+        reward = self.rewards[self.scenario, actions, self.cell]
         self.cell[:] = np.where(legal, self.next_cell[actions, self.cell], self.cell)
         self.steps += 1
         self.visited[np.arange(len(actions)), self.steps] = self.cell
         self.total_reward += reward
-        self.terminated[:] = ~legal | (self.cell == self.goal[self.scenario])
-        self.truncated[:] = ~self.terminated & (
-            self.steps >= self.parameters.max_episode_steps
-        )
-        return reward, self.terminated, self.truncated
+        is_at_goal = self.cell == self.goal[self.scenario]
+        is_out_of_steps = self.steps >= self.parameters.max_episode_steps
+        self.terminated[:] = ~legal | is_at_goal
+        self.truncated[:] = ~self.terminated & is_out_of_steps
+        return Outcome(reward, self.terminated, self.truncated)
 
     def observe(
         self, scenario: NDArray[np.int64], cell: NDArray[np.int64]
@@ -223,10 +273,14 @@ class GridEnvironment(gymnasium.Env[Observations, np.int64]):
             )
         if not self._is_begun:
             raise ResetNeeded("no episode has begun; call reset before the first step")
-        (reward,), (terminated,), (truncated,) = self.vector.move(
-            np.array([int(action)])
+        outcome = self.vector.move(np.array([int(action)]))
+        return (
+            self._observe(),
+            float(outcome.reward[0]),
+            bool(outcome.terminated[0]),
+            bool(outcome.truncated[0]),
+            {},
         )
-        return self._observe(), float(reward), bool(terminated), bool(truncated), {}
 
     def _observe(self) -> Observations:
         observation: Observations = self.vector.observe(

@@ -69,7 +69,12 @@ def record(episode: Episode) -> bytes:
 
 def read_cells(path: str | Path, every: int) -> Iterator[tuple[Cell, ...]]:
     """Yield the cells of each `every`-th complete row; an OSError without a file."""
-    for row in map(ROW.fullmatch, read_rows(as_path(path))):
-        if row and int(row[1]) % every == 0:
-            x_y = (cell.split(b":") for cell in row[2].split())
-            yield tuple((int(x), int(y)) for x, y in x_y)
+    for line in read_rows(as_path(path)):
+        row = ROW.fullmatch(line)
+        if row is None or int(row[1]) % every != 0:
+            continue
+        cells = []
+        for cell in row[2].split():
+            x, y = cell.split(b":")
+            cells.append((int(x), int(y)))
+        yield tuple(cells)

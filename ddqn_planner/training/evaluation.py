@@ -37,8 +37,8 @@ def length_ratios(
 def evaluate(field: QField, grid: GridMap, move_rule: MoveRule) -> Evaluation:
     """Summarise `length_ratios` of a field."""
     ratios = length_ratios(field, grid, move_rule)
+    starts = int((~np.isnan(ratios)).sum())
     solved = ratios[np.isfinite(ratios)]
-    mean, worst = (solved.mean(), solved.max()) if len(solved) else (np.nan, np.nan)
-    return Evaluation(
-        int((~np.isnan(ratios)).sum()), len(solved), float(mean), float(worst)
-    )
+    if not len(solved):
+        return Evaluation(starts, 0, np.nan, np.nan)
+    return Evaluation(starts, len(solved), float(solved.mean()), float(solved.max()))

@@ -12,10 +12,15 @@ def initial_cells(
     p_r: float,
     random: np.random.Generator,
 ) -> NDArray[np.int64]:
-    """Draw where N episodes start: in random cells with probability p_r, else in `start_N`."""
-    # `free_cells` are those of all maps, goals left out: an episode's map has `count_N` of them,
-    # from place `first_N` on.
-    at_random_N = random.random(len(start_N)) < p_r
-    return np.where(
-        at_random_N, free_cells[first_N + random.integers(count_N)], start_N
-    )
+    """Draw where N episodes start: in random cells with probability p_r, else in `start_N`.
+
+    Parameters
+    ----------
+    free_cells
+        The free cells of all maps without the goals, those of each map in a row.
+    first_N, count_N
+        Where in `free_cells` those of each episode's map begin, and how many they are.
+    """
+    is_random_N = random.random(len(start_N)) < p_r
+    random_cell_N = free_cells[first_N + random.integers(count_N)]
+    return np.where(is_random_N, random_cell_N, start_N)

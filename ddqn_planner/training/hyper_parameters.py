@@ -67,25 +67,35 @@ class HyperParameters:
 
     def __post_init__(self) -> None:
         for entry in fields(self):
-            value, choices = getattr(self, entry.name), entry.metadata.get("choices")
-            if choices is not None:
-                if not isinstance(value, str) or value not in choices:
-                    raise ValueError(
-                        f"{entry.name} is {value!r}; give one of {', '.join(choices)}"
-                    )
+            value = getattr(self, entry.name)
+            if "choices" in entry.metadata:
+                _check_choice(entry.name, value, entry.metadata["choices"])
                 continue
-            is_whole, number = entry.type in (int, "int"), real(value)
-            low, high = entry.metadata["range"]
-            if isinstance(value, bool) or not low <= number <= high:
-                raise ValueError(
-                    f"{entry.name} is {value!r}; it must lie in {low} to {high}"
-                )
-            if is_whole and not number.is_integer():
-                raise ValueError(f"{entry.name} is {value!r}; give a whole number")
-            # Of any type, and the dataclass is frozen.
-            vars(self)[entry.name] = int(value) if is_whole else number
-        count, most = self.environments, self.replay_capacity
-        if count > most:
-            raise ValueError(
-                f"environments is {count}; give at most replay_capacity, {most}"
+            is_whole = entry.type in (int, "int")
+            number = _checked_number(
+                entry.name, value, entry.metadata["range"], is_whole
             )
+            # Numbers of any type become Python's, as dataclasses set them.
+            object.__setattr__(self, entry.name, number)
+        if self.environments > self.replay_capacity:
+            raise ValueError(
+                f"environments is {self.environments}; give at most replay_capacity, "
+                f"{self.replay_capacity}"
+            )
+
+
+def _check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
+    if not isinstance(value, str) or value not in choices:
+        raise ValueError(f"{name} is {value!r}; give one of {', '.join(choices)}")
+
+
+def _checked_number(
+    name: str, value: object, limits: tuple[float, float], is_whole: bool
+) -> float:
+    number = real(value)
+    low, high = limits
+    if isinstance(value, bool) or not low <= number <= high:
+        raise ValueError(f"{name} is {value!r}; it must lie in {low} to {high}")
+    if is_whole and not number.is_integer():
+        raise ValueError(f"{name} is {value!r}; give a whole number")
+    return int(number) if is_whole else number

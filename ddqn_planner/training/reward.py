@@ -20,19 +20,24 @@ def move_reward(
     goal: Cell,
     parameters: HyperParameters,
 ) -> NDArray[np.float32]:
-    """Return the reward R_t of each legal move, action a in (x, y) at ``[a, y, x]``: (8, H, W)."""
+    """Return the reward R_t of each legal move: (8, H, W), action a in (x, y) at [a, y, x].
+
+    R_t = α (d_re(t-1) - d_re(t)) + β (d_rs(t) - d_rs(t-1) - d(t, t-1)): d_re is the
+    distance to the end (the goal), d_rs that to the start of the scenario, and
+    d(t, t-1) is the length of the move.
+    """
     if parameters.reward == "path_cost":
-        # The best return is the cheapest path. It depends on the cells around the robot alone.
+        # The best return is the cheapest path, and a reward depends only on the cells
+        # around the robot.
         return -move_costs(grid.cost_multiplier).astype(np.float32)
-    # R_t = α (d_re(t-1) - d_re(t)) + β (d_rs(t) - d_rs(t-1) - d(t, t-1)): d_re is the distance to
-    # the end (the goal), d_rs that to the given start, and d(t, t-1) is the length of the move.
     y, x = np.mgrid[0 : grid.height, 0 : grid.width]
     dx, dy = MOVES.T[:, :, None, None]
 
     def change_of_distance(cell: Cell) -> NDArray[np.float64]:
-        from_x, from_y = x - cell[0], y - cell[1]
-        after = np.hypot(from_x + dx, from_y + dy)
-        change: NDArray[np.float64] = after - np.hypot(from_x, from_y)
+        cell_x, cell_y = cell
+        distance = np.hypot(x - cell_x, y - cell_y)
+        next_distance = np.hypot(x - cell_x + dx, y - cell_y + dy)
+        change: NDArray[np.float64] = next_distance - distance
         return change
 
     progress = -change_of_distance(goal)

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,13 @@ from ddqn_planner.grid.arguments import as_seed, as_whole
 from ddqn_planner.model import ModelMetadata, RobotNetwork, package_version
 from ddqn_planner.robot.body_certificate import BodyCertificate
 from ddqn_planner.robot.footprint import read_footprint
-from ddqn_planner.robot.motions import HEADINGS, Motion, make_motions, read_lattice
+from ddqn_planner.robot.motions import (
+    HEADINGS,
+    Motion,
+    Motions,
+    make_motions,
+    read_lattice,
+)
 from ddqn_planner.training.double_dqn import (
     ReplayBuffer,
     Transitions,
@@ -24,11 +30,16 @@ from ddqn_planner.training.exploring_starts import initial_cells
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.propagation import value_iteration
 
-# Shapes: B = a batch, U units, K = primitives of each of N headings (those with few have some
-# twice), M maps, which repeat in all directions, C poses, numbers (y * W + x) * 16 + heading.
+Floats: TypeAlias = NDArray[np.float32]
+Integers: TypeAlias = NDArray[np.int64]
 
-# Every episode is one random primitive from any pose. The batch and the environments are per unit.
-# A collision costs much more than a primitive, so that all successes teach about as much.
+# Shapes: B = a batch, U units, K = primitives of each of N headings (headings with few
+# have some twice), M maps, which repeat in all directions, C poses, numbers
+# (y * W + x) * 16 + heading.
+
+# Every episode is one random primitive from any pose. The batch and the environments
+# are per unit. A collision costs much more than a primitive, so that all successes
+# teach about as much.
 ROBOT: Final = HyperParameters(
     learning_rate=4.5e-5,
     batch_size=24,
@@ -41,18 +52,18 @@ ROBOT: Final = HyperParameters(
     target_interval=2000,
     environments=12,
 )
-FIRST: Final = (
-    0.3,
-    1.0,
-)  # the weights and the thresholds of a network that knows nothing
 PER_UNIT: Final = ("batch_size", "learning_starts", "environments")
-SHRINKS: Final = (
-    3e-5  # what each weight loses per update: an obstacle is harmless unless seen
-)
-CAREFUL: Final = 0.1  # of a step is what a threshold moves
-CHECKED: Final = 100  # updates between two proofs
+LARGEST_COUNT: Final = 4096  # of these for all units
+# Of a network that knows nothing.
+FIRST_WEIGHT: Final = 0.3
+FIRST_THRESHOLD: Final = 1.0
+# What each weight loses per update: an obstacle is harmless unless it was hit.
+DECAY: Final = 3e-5
+THRESHOLD_RATE: Final = 0.1  # of a weight's learning rate
+UPDATES_PER_PROOF: Final = 100
 MOST_STEPS: Final = 10**12
 MARGIN: Final = 0.02  # of the proof, with which the training ends
+FREE_BORDER: Final = 5  # cells by which a map is larger than what the robot sees
 
 
 class RobotTrainer:
@@ -68,75 +79,82 @@ class RobotTrainer:
         seed: int,
         padding: float = 0.0,
     ) -> None:
-        if motion is not None and lattice is None:
-            motions = make_motions(motion, turning_radius, resolution)
-        elif lattice is not None and motion is None:
-            motions = read_lattice(lattice)
-        else:
-            count = (
-                "neither motion nor lattice is"
-                if motion is None
-                else "motion and lattice are"
-            )
-            remedy = f"give one of the two: motion {', '.join(Motion)}, or lattice FILE"
-            raise ValueError(f"{count} given; {remedy}")
+        motions = _read_motions(motion, turning_radius, resolution, lattice)
         self.network = RobotNetwork.untrained(
             read_footprint(footprint, padding), motions
         )
-        self.seed = seed = as_seed(seed)
-        tensors, units = self.network.tensors, self.network.sizes["units"]
-        counts = {name: min(4096, units * getattr(ROBOT, name)) for name in PER_UNIT}
+        self.seed = as_seed(seed)
+        units = self.network.sizes["units"]
+        counts = {
+            name: min(LARGEST_COUNT, units * getattr(ROBOT, name)) for name in PER_UNIT
+        }
         self.parameters = replace(ROBOT, **counts)
-        draws = np.random.SeedSequence(seed).spawn(4)
-        maps, *generators = map(np.random.default_rng, draws)
+        seeds = np.random.SeedSequence(self.seed).spawn(4)
+        map_generator, *generators = [np.random.default_rng(item) for item in seeds]
         self._initial, self._exploration, self._sampling = generators
-        swept = self.network.swept_by_unit
+        side = self.network.swept_by_unit.shape[1]
+        self.width = side + FREE_BORDER
+        self._draw_maps(map_generator)
+        self._tabulate_moves(motions)
+        self._tabulate_places(side)
+        self._replay = ReplayBuffer(self.parameters.replay_capacity)
+        self.steps = 0
+        self.updates = 0
+        tensors = self.network.tensors
+        tensors["weight"][:] = FIRST_WEIGHT
+        tensors["threshold"][:] = FIRST_THRESHOLD
+        # A unit's cells in a row, and a last one of 0 for what it does not see.
+        last_cell = ((0, 0), (0, 1))
+        self._weight = np.pad(tensors["weight"].reshape(units, -1), last_cell)
+        self._swept = np.pad(self.network.swept_by_unit.reshape(units, -1), last_cell)
+        self._threshold = tensors["threshold"]
 
-        # Maps with one obstacle, so it is known what was hit. Three cells are drawn, and two used:
-        # the draws belong to what one seed gives.
-        self.width = width = swept.shape[1] + 5  # more than what the robot sees
-        count = max(4, min(16, 60_000 // width**2))  # fewer, if they are large
-        drawn = np.array(
-            [maps.choice(width**2, 3, replace=False) for _ in range(count)]
-        )
-        self.goal_M = drawn[:, 1] * HEADINGS
-        self.obstacle_M2 = np.column_stack(np.divmod(drawn[:, 2], width))
+    def _draw_maps(self, random: np.random.Generator) -> None:
+        """Draw maps of one obstacle, so that it is known what was hit."""
+        cells = self.width**2
+        maps = max(4, min(16, 60_000 // cells))  # fewer, if they are large
+        # The first of three cells is not used, but drawn: the draws belong to what one
+        # seed gives.
+        drawn = [random.choice(cells, 3, replace=False) for _ in range(maps)]
+        _, goal, obstacle = np.transpose(drawn)
+        self.goal_M = goal * HEADINGS
+        self.obstacle_M2 = np.column_stack(np.divmod(obstacle, self.width))  # y, x
 
-        of_heading = [
+    def _tabulate_moves(self, motions: Motions) -> None:
+        """Tabulate where primitives lead, what they cost, and where episodes start."""
+        primitives = [
             np.flatnonzero(motions.start == heading) for heading in range(HEADINGS)
         ]
-        most = max(map(len, of_heading))
-        self.primitive_KN = np.array(
-            [np.resize(numbers, most) for numbers in of_heading]
-        ).T
-        y, x = np.mgrid[: self.width, : self.width].reshape(2, -1, 1)
-        dx, dy = motions.offset[self.primitive_KN].T[..., None, :].swapaxes(1, 3)
-        cell_KCN = (y + dy) % self.width * self.width + (x + dx) % self.width
-        next_KCN = cell_KCN * HEADINGS + motions.end[self.primitive_KN][:, None]
-        self.next_KC = next_KCN.reshape(most, -1)
-        self.reward_KC = np.tile(-motions.cost[self.primitive_KN], self.width**2)
-        is_first_MC = np.arange(self.next_KC.shape[1]) != self.goal_M[:, None]
-        _, self._first = np.nonzero(
-            is_first_MC
-        )  # where episodes start: on obstacles, too
-        self._replay = ReplayBuffer(self.parameters.replay_capacity)
-        self.steps = self.updates = 0
-
-        tensors["weight"][:], tensors["threshold"][:] = FIRST
-        # A unit's cells in a row, and one more of 0 for what it does not see.
-        one_more = (0, 0), (0, 1)
-        self._weight = np.pad(tensors["weight"].reshape(units, -1), one_more)
-        self._swept = np.pad(swept.reshape(units, -1), one_more)
-        self._threshold = tensors["threshold"]
-        # Where a robot that has turned by quarters sees an obstacle, so many rows and columns away.
-        side = swept.shape[1]
-        near, seen = (
-            np.arange(side) - side // 2,
-            np.arange(side * side).reshape(side, side),
+        count = max(map(len, primitives))
+        self.primitive_KN = np.transpose(
+            [np.resize(numbers, count) for numbers in primitives]
         )
+        cell = np.arange(self.width**2)[:, None]
+        y, x = np.divmod(cell, self.width)
+        dx_KN, dy_KN = np.moveaxis(motions.offset[self.primitive_KN], 2, 0)
+        # (K, cells, N)
+        next_y = (y + dy_KN[:, None]) % self.width
+        next_x = (x + dx_KN[:, None]) % self.width
+        next_heading = motions.end[self.primitive_KN][:, None]
+        next_pose = (next_y * self.width + next_x) * HEADINGS + next_heading
+        self.next_KC = next_pose.reshape(count, -1)
+        self.reward_KC = np.tile(-motions.cost[self.primitive_KN], self.width**2)
+        # Episodes start anywhere but at the goal, on obstacles, too.
+        is_start_MC = np.arange(self.next_KC.shape[1]) != self.goal_M[:, None]
+        _, self._starts = np.nonzero(is_start_MC)
+
+    def _tabulate_places(self, side: int) -> None:
+        """Tabulate which cell of its view an obstacle is in for a robot.
+
+        By the quarters that the robot has turned, and how many rows and columns away
+        the obstacle lies; side * side is a place that it does not see.
+        """
+        view = np.arange(side * side).reshape(side, side)
+        offsets = np.arange(side) - side // 2
         self._place = np.full((4, self.width, self.width), side * side)
         for quarter in range(4):
-            self._place[quarter][np.ix_(near, near)] = np.rot90(seen, -quarter)
+            turned = np.rot90(view, -quarter)
+            self._place[quarter][np.ix_(offsets, offsets)] = turned
 
     def run(self, until: int) -> Iterator[BodyCertificate]:
         """Train until all is proved, or so many steps are done; yield what is proved so far.
@@ -148,7 +166,7 @@ class RobotTrainer:
         certificate = self.network.certificate()
         yield certificate
         while certificate.margin < MARGIN and self.steps < until:
-            for _ in range(CHECKED):
+            for _ in range(UPDATES_PER_PROOF):
                 if self.steps >= until:
                     break
                 self._step(min(self.parameters.environments, until - self.steps))
@@ -162,102 +180,137 @@ class RobotTrainer:
     def metadata(self) -> ModelMetadata:
         """Return what the model file says of the network as it is now."""
         occupancy = np.zeros((self.width, self.width), dtype=np.bool_)
-        occupancy[tuple(self.obstacle_M2[0])] = True
-        p, sizes = self.parameters, self.network.sizes
-        of_training = (
-            GridMap(occupancy).fingerprint,
-            self.steps,
-            self.seed,
-            package_version(),
-        )
+        y, x = self.obstacle_M2[0]
+        occupancy[y, x] = True
         return ModelMetadata(
-            self.network.name, sizes, MoveRule.ROBOT_SAFE, p.gamma, *of_training
+            network=self.network.name,
+            sizes=self.network.sizes,
+            move_rule=MoveRule.ROBOT_SAFE,
+            gamma=self.parameters.gamma,
+            map_fingerprint=GridMap(occupancy).fingerprint,
+            steps=self.steps,
+            seed=self.seed,
+            package_version=package_version(),
         )
 
     def _step(self, robots: int) -> None:
         """Let so many robots try a random primitive, and remember what came of it."""
-        p, maps = self.parameters, len(self.goal_M)
+        p = self.parameters
+        maps = len(self.goal_M)
+        starts = len(self._starts) // maps  # of each map
         scenario = self._initial.integers(maps, size=robots)
-        count = np.full(robots, len(self._first) // maps)
-        places = self._first, scenario * count, count
-        cell = initial_cells(self.goal_M[scenario], *places, p.p_r, self._initial)
-        actions = self._exploration.integers(len(self.primitive_KN), size=robots)
-        unit_BK, place_B = self._observed(scenario, cell)
-        legal = ~self._swept[unit_BK[np.arange(len(cell)), actions], place_B]
-        next_cell = np.where(legal, self.next_KC[actions, cell], cell)
+        pose = initial_cells(
+            self.goal_M[scenario],
+            self._starts,
+            scenario * starts,
+            np.full(robots, starts),
+            p.p_r,
+            self._initial,
+        )
+        action = self._exploration.integers(len(self.primitive_KN), size=robots)
+        unit_BK, place_B = self._view(scenario, pose)
+        unit_B = unit_BK[np.arange(robots), action]
+        legal = ~self._swept[unit_B, place_B]
+        next_pose = np.where(legal, self.next_KC[action, pose], pose)
         collision = np.float32(p.obstacle_reward)
-        reward = np.where(legal, self.reward_KC[actions, cell], collision)
-        goes_on = legal & (next_cell != self.goal_M[scenario])
-        discount = np.where(goes_on, p.gamma, 0.0).astype(np.float32)
+        reward = np.where(legal, self.reward_KC[action, pose], collision)
+        continues = legal & (next_pose != self.goal_M[scenario])
+        discount = np.where(continues, p.gamma, 0.0).astype(np.float32)
         self._replay.add(
-            Transitions(scenario, cell, actions, reward, next_cell, discount)
+            Transitions(scenario, pose, action, reward, next_pose, discount)
         )
         self.steps += robots
 
     def _update(self) -> None:
         """Make one Double DQN update with a batch from the replay buffer."""
-        p, units = self.parameters, len(self._weight)
+        p = self.parameters
         batch = self._replay.sample(p.batch_size, self._sampling)
-        states = (
-            np.tile(batch.scenario, 2),
-            np.concatenate([batch.cell, batch.next_cell]),
-        )
-        unit_2BK, place_2B = self._observed(*states)
-        p_2BK = self._success(unit_2BK, place_2B)
+        # The states, and after them the next states.
+        scenario = np.tile(batch.scenario, 2)
+        pose = np.concatenate([batch.cell, batch.next_cell])
+        unit_2BK, place_2B = self._view(scenario, pose)
+        success_2BK = self._success(unit_2BK, place_2B)
+        # Q(s, a) = p (r + γ V(s')) + (1 - p) r_o
         collision = np.float32(p.obstacle_reward)
-        gain_2BK = self._return_SCK[states] - collision
-        q_BK, online_next_BK = np.split(collision + p_2BK * gain_2BK, 2)
+        gain_2BK = self._return_SCK[scenario, pose] - collision
+        q_BK, online_next_BK = np.split(collision + success_2BK * gain_2BK, 2)
         target_next_BK = self._q_SCK[batch.scenario, batch.next_cell]
-        q_gradient = double_dqn_gradient(
+        by_q_BK = double_dqn_gradient(
             batch, q_BK, next_q(p.target, online_next_BK, target_next_BK)
         )
-        taken = np.arange(p.batch_size), batch.action
-        by_logit_B = (q_gradient * gain_2BK[: p.batch_size])[taken]
-        by_logit_B *= p_2BK[taken] * (1 - p_2BK[taken])
+        # The gradient by the logit of the success of each action that was taken.
+        rows = np.arange(p.batch_size)
+        success_B = success_2BK[rows, batch.action]
+        by_success_B = (by_q_BK * gain_2BK[: p.batch_size])[rows, batch.action]
+        by_logit_B = by_success_B * (success_B * (1 - success_B))
+        units = len(self._weight)
         step_B = p.learning_rate * units * by_logit_B
-        unit_B, place_B = unit_2BK[taken], place_2B[: p.batch_size]
-        # All transitions of a unit move its threshold, and few move a weight: it must not jump.
-        np.subtract.at(self._threshold, unit_B, CAREFUL * step_B)
+        unit_B = unit_2BK[rows, batch.action]
+        place_B = place_2B[: p.batch_size]
+        # All transitions of a unit move its threshold, and few move a weight: the
+        # threshold must not jump.
+        np.subtract.at(self._threshold, unit_B, THRESHOLD_RATE * step_B)
         np.add.at(self._weight, (unit_B, place_B), step_B)
-        self._weight -= np.float32(SHRINKS)
+        self._weight -= np.float32(DECAY)
         np.maximum(self._weight, 0, out=self._weight)
         self._weight[:, -1] = 0
         self.updates += 1
         if self.updates % p.target_interval == 0:
             self._settle()
 
-    def _observed(
-        self, scenario: NDArray[np.int64], cell: NDArray[np.int64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def _view(self, scenario: Integers, pose: Integers) -> tuple[Integers, Integers]:
         """Return the unit of each action, (B, K), and the place of the obstacle, (B,)."""
-        heading, cell, width = cell % HEADINGS, cell // HEADINGS, self.width
-        y, x = self.obstacle_M2[scenario].T
-        seen = (
-            heading // (HEADINGS // 4),
-            (y - cell // width) % width,
-            (x - cell % width) % width,
-        )
-        return self.network.unit[self.primitive_KN[:, heading]].T, self._place[seen]
+        cell, heading = np.divmod(pose, HEADINGS)
+        y, x = np.divmod(cell, self.width)
+        obstacle_y, obstacle_x = self.obstacle_M2[scenario].T
+        quarter = heading // (HEADINGS // 4)
+        rows = (obstacle_y - y) % self.width
+        columns = (obstacle_x - x) % self.width
+        unit_BK = self.network.unit[self.primitive_KN[:, heading]].T
+        return unit_BK, self._place[quarter, rows, columns]
 
-    def _success(
-        self, unit_BK: NDArray[np.int64], place_B: NDArray[np.int64]
-    ) -> NDArray[np.float32]:
-        """Return p(s, a) of what `_observed` returns: (B, K)."""
+    def _success(self, unit_BK: Integers, place_B: Integers) -> Floats:
+        """Return p(s, a) of what `_view` returns: (B, K)."""
         logit_BK = self._threshold[unit_BK] - self._weight[unit_BK, place_B[:, None]]
-        p_BK: NDArray[np.float32] = 0.5 + 0.5 * np.tanh(0.5 * logit_BK)
-        return p_BK
+        success_BK: Floats = 0.5 + 0.5 * np.tanh(0.5 * logit_BK)
+        return success_BK
 
     def _settle(self) -> None:
         """As the target network, settle V on every map."""
-        p, cells = self.parameters, np.arange(self.next_KC.shape[1])
-        self._return_SCK = np.empty(
-            (len(self.goal_M), *self.next_KC.T.shape), np.float32
-        )
-        self._q_SCK = np.empty_like(self._return_SCK)
-        for number in range(len(self.goal_M)):
-            p_1CK = self._success(*self._observed(np.full_like(cells, number), cells))[
-                None
-            ]
-            given = self.reward_KC.T[None], self.goal_M[[number]], self.next_KC, p.gamma
-            (returns,), (q,) = value_iteration(p_1CK, *given, p.obstacle_reward)
-            self._return_SCK[number], self._q_SCK[number] = returns, q
+        p = self.parameters
+        actions, poses = self.next_KC.shape
+        maps = len(self.goal_M)
+        self._return_SCK = np.empty((maps, poses, actions), np.float32)
+        self._q_SCK = np.empty((maps, poses, actions), np.float32)
+        for number in range(maps):  # one after another, as all need much memory
+            scenario = np.full(poses, number)
+            success_CK = self._success(*self._view(scenario, np.arange(poses)))
+            return_1CK, q_1CK = value_iteration(
+                success_CK[None],
+                self.reward_KC.T[None],
+                self.goal_M[[number]],
+                self.next_KC,
+                p.gamma,
+                p.obstacle_reward,
+            )
+            self._return_SCK[number] = return_1CK[0]
+            self._q_SCK[number] = q_1CK[0]
+
+
+def _read_motions(
+    motion: str | None,
+    turning_radius: float,
+    resolution: float,
+    lattice: str | Path | None,
+) -> Motions:
+    """Return the primitives of a kind of motion, or of a lattice file."""
+    if motion is not None and lattice is None:
+        return make_motions(motion, turning_radius, resolution)
+    if lattice is not None and motion is None:
+        return read_lattice(lattice)
+    is_neither = motion is None
+    problem = (
+        "neither motion nor lattice is" if is_neither else "motion and lattice are"
+    )
+    remedy = f"give one of the two: motion {', '.join(Motion)}, or lattice FILE"
+    raise ValueError(f"{problem} given; {remedy}")

@@ -162,11 +162,16 @@ class Trainer:
         if is_greedy.any():
             best_action = learner.q_values(scenario, cell).argmax(axis=1)
             action = np.where(is_greedy, best_action, action)
-        reward, terminated, _ = environment.move(action)
-        discount = np.where(terminated, 0.0, p.gamma).astype(np.float32)
-        self._replay.add(
-            Transitions(scenario, cell, action, reward, environment.cell, discount)
+        outcome = environment.move(action)
+        transitions = Transitions(
+            scenario=scenario,
+            cell=cell,
+            action=action,
+            reward=outcome.reward,
+            next_cell=environment.cell,
+            discount=np.where(outcome.terminated, 0.0, p.gamma).astype(np.float32),
         )
+        self._replay.add(transitions)
         intervals = self.steps // p.update_interval
         self.steps += p.environments
         updates_due = self.steps // p.update_interval - intervals
