@@ -14,7 +14,6 @@ from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.grid.map_changes import shift_between
 from ddqn_planner.nodes.outcome import Outcome, Request
 from ddqn_planner.planning import Planner, PlanRequest, PlanStatus
-from ddqn_planner.planning.paths import rest_of_path
 from ddqn_planner.planning.plan import PosePlan
 from ddqn_planner.planning.pose_planner import PoseRequest
 from ddqn_planner.robot.motions import HEADINGS
@@ -93,7 +92,7 @@ class ActiveGoal:
         has_path = last.status == PlanStatus.SUCCEEDED.name
         if not has_path or last.header.frame_id != header.frame_id:
             return True
-        return not has_rest(planner, request)
+        return len(planner.rest_of_path(request)) == 0
 
     def note(self, outcome: Outcome) -> bool:
         """Keep an outcome; return whether to publish its path, which may be empty."""
@@ -154,15 +153,3 @@ def with_current_path(request: Request, last: Outcome, frame: str) -> Request:
     if not request.grid.contains((x, y)):
         return request
     return replace(request, under_way=cells)
-
-
-def has_rest(planner: Planner, request: Request) -> bool:
-    """Return whether the rest of the current path is free, and the robot near it."""
-    if isinstance(request, PlanRequest):
-        rest = rest_of_path(
-            request.under_way, request.start, request.grid, request.move_rule
-        )
-        return len(rest) > 0
-    assert planner.pose_planner is not None
-    poses = planner.pose_planner.rest_of(request.under_way, request.start, request.grid)
-    return len(poses) > 0

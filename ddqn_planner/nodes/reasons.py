@@ -1,6 +1,7 @@
 """The reason of an outcome in words: how a path was found, or why there is none."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
@@ -16,21 +17,30 @@ from ddqn_planner.planning import (
     unknown_space,
 )
 from ddqn_planner.planning.exact_paths import NO_PATH, ExactPath
-from ddqn_planner.planning.plan import PosePlan
+from ddqn_planner.planning.plan import PosePlan, PoseRequest
 
-TOLERANCE = (
-    ", or a greater tolerance"  # does not help with several goals: none of them moves
-)
-
-
+MOST_CELLS = 5  # of goals that a reason lists
+# No help with several goals, of which none moves.
+TOLERANCE = ", or a greater tolerance"
 REMEDIES = {
     PlanStatus.START_OUTSIDE_MAP: "set the start on the map",
     PlanStatus.GOAL_OUTSIDE_MAP: "set the goal on the map",
-    PlanStatus.START_OCCUPIED: "set the start on a free cell, or a greater start_clearing_radius",
+    PlanStatus.START_OCCUPIED: (
+        "set the start on a free cell, or a greater start_clearing_radius"
+    ),
     PlanStatus.GOAL_OCCUPIED: f"set the goal on a free cell{TOLERANCE}",
-    PlanStatus.MAP_SIZE_UNSUPPORTED: "set the parameter 'model' to one trained for this size",
+    PlanStatus.MAP_SIZE_UNSUPPORTED: (
+        "set the parameter 'model' to one trained for this size"
+    ),
     PlanStatus.NO_PATH: f"set the goal where free cells lead to{TOLERANCE}",
-    PlanStatus.ROLLOUT_TRAPPED: "train the model longer, or set mode to 'astar_fallback'",
+    PlanStatus.ROLLOUT_TRAPPED: (
+        "train the model longer, or set mode to 'astar_fallback'"
+    ),
+}
+REMEDIES_OF_BODY = {
+    **REMEDIES,
+    PlanStatus.START_OCCUPIED: "set the start where the robot's body has room",
+    PlanStatus.GOAL_OCCUPIED: f"set the goal where the robot's body has room{TOLERANCE}",
 }
 
 
@@ -42,70 +52,129 @@ def reason_of(
     robot_radius: float,
     path: ExactPath = NO_PATH,
 ) -> str:
-    """Say how a path between two poses was found, or why there is none and what to do."""
-    grid, has_body = request.grid, isinstance(plan, PosePlan)
-    begin, goals = request.cells[0], request.cells[1:]
-    clearing: float = getattr(request, "start_clearing_radius", 0.0)
-    cleared = f"{clearing * grid.resolution:.3g} m"
-    if plan.status is not PlanStatus.SUCCEEDED:
-        status, remedy = plan.status.value, REMEDIES[plan.status]
-        is_unknown = plan.reason.endswith(unknown_space.REMEDY)
-        if is_unknown:
-            status, _, remedy = plan.reason.partition("; ")
-        elif has_body:
-            remedy = remedy.removesuffix(", or a greater start_clearing_radius")
-            remedy = remedy.replace("on a free cell", "where the robot's body has room")
-        to = f"goal: {_place(goal, goals[0])}"
-        if len(goals) > 1:
-            why_not = status if is_unknown else plan.reason
-            status = f"no path to any of {len(goals)} goals: {why_not}"
-            remedy = remedy.removesuffix(TOLERANCE)
-            to = f"goals: cells {', '.join(map(str, goals[:5]))}{', ...' * (len(goals) > 5)}"
-        of_map = f"map: {grid.width} x {grid.height} cells"
-        reason = f"{status} (start: {_place(start, begin)}; {to}; {of_map})"
-        on_map = filter(grid.contains, goals)
-        is_goal = plan.status is PlanStatus.GOAL_OCCUPIED and not is_unknown
-        if is_goal and not all(map(grid.is_obstacle, on_map)):
-            near = (
-                f"robot_radius, {robot_radius:g} m"
-                if robot_radius
-                else "the costmap allows"
-            )
-            near = "the robot's body allows" if has_body else near
-            reason += f", nearer to an obstacle than {near}"
-        if plan.status is PlanStatus.START_OCCUPIED and clearing:
-            reason += f", deeper than the start_clearing_radius, {cleared}"
-        return f"{reason}; {remedy}"
-    several = len(goals) > 1
-    number = f" to goal {reached(request, plan) + 1} of {len(goals)}" if several else ""
-    how, length = "by greedy steps", path.length
-    if isinstance(plan, PosePlan):
-        length = plan.length
-        how = f"by greedy steps, of at most {plan.bound:.3g} times the least cost"
-        if math.isinf(plan.bound):
-            how = (
-                "kept, as there is none from the cell and heading nearest to the start"
-            )
-    elif plan.method is not PlanMethod.GREEDY:
-        how = "searched for in the order of the Q field: the greedy steps were trapped"
-    reason = f"a path of {length:.2f} cells{number}, {how}"
+    """Say how a path was found, or why there is no path and what to do.
+
+    Parameters
+    ----------
+    request : Request
+    plan : Plan
+        Of the request.
+    start, goal : PoseStamped
+        In the map's frame.
+    robot_radius : float
+        The parameter, in metres.
+    path : ExactPath
+        A disc's path between the exact poses; a body has none.
+    """
+    if plan.status is PlanStatus.SUCCEEDED:
+        return reason_of_path(request, plan, path)
+    return reason_of_failure(request, plan, start, goal, robot_radius)
+
+
+def reason_of_failure(
+    request: Request,
+    plan: Plan,
+    start: PoseStamped,
+    goal: PoseStamped,
+    robot_radius: float,
+) -> str:
+    """Say why there is no path, between which places, and what to do."""
+    grid = request.grid
+    start_cell, *goal_cells = request.cells
+    is_unknown = plan.reason.endswith(unknown_space.REMEDY)
+    if is_unknown:
+        problem, _, remedy = plan.reason.partition("; ")
+    else:
+        problem = plan.status.value
+        remedy = remedy_of(plan)
+    goals_in_words = f"goal: {_place(goal, goal_cells[0])}"
+    if len(goal_cells) > 1:
+        if not is_unknown:
+            problem = plan.reason
+        problem = f"no path to any of {len(goal_cells)} goals: {problem}"
+        remedy = remedy.removesuffix(TOLERANCE)
+        goals_in_words = _cells_in_words(goal_cells)
+    size = f"map: {grid.width} x {grid.height} cells"
+    place = f"start: {_place(start, start_cell)}; {goals_in_words}; {size}"
+    reason = f"{problem} ({place})"
+    if plan.status is PlanStatus.GOAL_OCCUPIED and not is_unknown:
+        goals_on_map = filter(grid.contains, goal_cells)
+        if not all(map(grid.is_obstacle, goals_on_map)):
+            limit = _clearance_in_words(plan, robot_radius)
+            reason += f", nearer to an obstacle than {limit}"
+    if plan.status is PlanStatus.START_OCCUPIED and _clearing_radius(request):
+        radius = f"{_clearing_radius(request):.3g} m"
+        reason += f", deeper than the start_clearing_radius, {radius}"
+    return f"{reason}; {remedy}"
+
+
+def remedy_of(plan: Plan) -> str:
+    """Return what to do about a plan without a path."""
+    remedies = REMEDIES_OF_BODY if isinstance(plan, PosePlan) else REMEDIES
+    return remedies[plan.status]
+
+
+def reason_of_path(request: Request, plan: Plan, path: ExactPath) -> str:
+    """Say how long a path is, how it was found, and what moved or was ignored."""
+    grid = request.grid
+    _, *goal_cells = request.cells
+    length = plan.length if isinstance(plan, PosePlan) else path.length
+    reason = f"a path of {length:.2f} cells"
+    if len(goal_cells) > 1:
+        reason += f" to goal {reached(request, plan) + 1} of {len(goal_cells)}"
+    reason += f", {_method_in_words(plan)}"
     if plan.extra_cost:
         reason += f", kept: its cost is {plan.extra_cost:+.1%} beside that of a new one"
-    if plan.goal is not None and plan.goal not in goals and not several:
-        metres = (
-            math.dist(plan.goal, goals[0]) * grid.resolution
-        )  # as the tolerance counts
-        why = unknown_space.goal_in_words(grid, goals[0]) or "is cut off"
-        reason += f"; the goal {why} and moved {metres:.3g} m"
+    has_moved = len(goal_cells) == 1 and plan.goal != goal_cells[0]
+    if plan.goal is not None and has_moved:
+        problem = unknown_space.goal_in_words(grid, goal_cells[0]) or "is cut off"
+        # In metres between centres of cells, as the tolerance counts.
+        metres = math.dist(plan.goal, goal_cells[0]) * grid.resolution
+        reason += f"; the goal {problem} and moved {metres:.3g} m"
     if grid.is_obstacle(plan.path[0]):
+        radius = f"{_clearing_radius(request):.3g} m"
         reason += (
-            f"; the start is occupied: obstacles within {cleared} of it were ignored"
+            f"; the start is occupied: obstacles within {radius} of it were ignored"
         )
     return reason
 
 
+def _method_in_words(plan: Plan) -> str:
+    if isinstance(plan, PosePlan):
+        if math.isinf(plan.bound):
+            return (
+                "kept, as there is none from the cell and heading nearest to the start"
+            )
+        return f"by greedy steps, of at most {plan.bound:.3g} times the least cost"
+    if plan.method is PlanMethod.GREEDY:
+        return "by greedy steps"
+    return "searched for in the order of the Q field: the greedy steps were trapped"
+
+
+def _clearing_radius(request: Request) -> float:
+    """Return the start_clearing_radius of a request in metres; 0 for a body."""
+    if isinstance(request, PoseRequest):
+        return 0.0
+    return request.start_clearing_radius * request.grid.resolution
+
+
+def _clearance_in_words(plan: Plan, robot_radius: float) -> str:
+    if isinstance(plan, PosePlan):
+        return "the robot's body allows"
+    if robot_radius:
+        return f"robot_radius, {robot_radius:g} m"
+    return "the costmap allows"
+
+
+def _cells_in_words(goal_cells: Sequence[Cell]) -> str:
+    cells = ", ".join(map(str, goal_cells[:MOST_CELLS]))
+    if len(goal_cells) > MOST_CELLS:
+        cells += ", ..."
+    return f"goals: cells {cells}"
+
+
 def reached(request: Request, plan: Plan) -> int:
-    """Return which of several goals a plan leads to, from 0: a path that is kept ends beside it."""
+    """Return the index of the goal that a plan leads to; a kept path ends beside it."""
     if plan.goal is None:
         return 0
     return int(np.argmin([math.dist(cell, plan.goal) for cell in request.cells[1:]]))

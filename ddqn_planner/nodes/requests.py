@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import SimpleNamespace
@@ -208,7 +208,7 @@ class Requests:
 
     async def _plan(self, planner: Planner, request: Request) -> Plan:
         """Plan in slow steps by the worker: between two of them others have a turn."""
-        steps = steps_of(planner, request)
+        steps = planner.steps(request)
         try:
             plan = next(steps)
         except ValueError as error:
@@ -359,13 +359,6 @@ def next_request(request: Request, leg: Plan, goal: MapPose) -> Request:
         assert isinstance(leg, PosePlan)
         return request.after(leg, pose_of(goal.message))
     return request.after(leg, goal.cell)
-
-
-def steps_of(planner: Planner, request: Request) -> Iterator[Plan | None]:
-    """Return an iterator that yields None before each slow step, and last the plan."""
-    if isinstance(request, PoseRequest):
-        return planner.pose_steps(request)
-    return planner.steps(request)
 
 
 def clearing_radius(settings: SimpleNamespace, grid: GridMap) -> float:
