@@ -167,7 +167,25 @@ def numbers(
     whole: bool = True,
     remedy: str = "",
 ) -> NDArray[Any]:
-    """Return an array of a shape, of some kinds of numbers, within a range."""
+    """Return an array of a shape, of some kinds of numbers, within a range.
+
+    Parameters
+    ----------
+    name : str
+        What errors call the array.
+    values : array
+    shape : tuple of int, optional
+        By default any.
+    kinds : str
+        NumPy's letters of the kinds of numbers: "iuf", and "b" if True and False may be
+        among them.
+    between : (float, float), optional
+        The lowest and the highest number, by default any.
+    whole : bool
+        Whether numbers within a range must be whole, of whatever kind.
+    remedy : str
+        What to give instead of numbers out of the range; by default the range.
+    """
     try:
         array = np.asarray(values)
     except ValueError as error:  # rows of different lengths
@@ -182,12 +200,23 @@ def numbers(
         raise ValueError(
             f"{name}: the elements are of type {array.dtype}; give numbers"
         )
-    if between is None or array.dtype.kind == "b" or array.size == 0:
-        return array
-    lowest, highest = between
+    if between is not None and array.dtype.kind != "b" and array.size > 0:
+        _check_range(name, array, between, whole, remedy)
+    return array
+
+
+def _check_range(
+    name: str,
+    array: NDArray[Any],
+    limits: tuple[float, float],
+    whole: bool,
+    remedy: str,
+) -> None:
+    """Raise a ValueError for numbers out of a range, or for NaN; or for fractions."""
+    lowest, highest = limits
     are_whole = not whole or array.dtype.kind != "f" or _all_whole(array)
-    if are_whole and lowest <= array.min() <= array.max() <= highest:  # not NaN
-        return array
+    if are_whole and lowest <= array.min() <= array.max() <= highest:
+        return
     right = (array >= lowest) & (array <= highest)
     if whole:
         right &= array == np.floor(array)

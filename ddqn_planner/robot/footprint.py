@@ -212,10 +212,10 @@ def _side_of(points: Points, starts: Points, ends: Points) -> NDArray[np.float64
 
     It is 1 to the left, -1 to the right, and 0 on the line.
     """
-    along = ends - starts  # (K, 2)
-    to_point = points[:, None] - starts  # (N, K, 2)
-    area = _cross(along, to_point)
-    tolerance = 1e-9 * np.hypot(along[:, 0], along[:, 1])
+    lines = ends - starts  # (K, 2)
+    to_points = points[:, None] - starts  # (N, K, 2)
+    area = _cross(lines, to_points)
+    tolerance = 1e-9 * np.hypot(lines[:, 0], lines[:, 1])
     return np.where(np.abs(area) <= tolerance, 0, np.sign(area))
 
 
@@ -262,10 +262,10 @@ def _corner_offsets(
         return [outward / (2 * max(cosine, SMALLEST_COSINE) ** 2)]
     # The cut is as far beyond the corner as the sides move.
     difference = direction_in - direction_out
-    beyond = difference / math.hypot(difference[0], difference[1])
-    aside = -_turned_outward(beyond, orientation)
-    aside = aside * (1 - cosine) / math.sqrt(1 - cosine**2)
-    return [beyond - aside, beyond + aside]
+    middle_of_cut = difference / math.hypot(difference[0], difference[1])
+    half_cut = -_turned_outward(middle_of_cut, orientation)
+    half_cut = half_cut * (1 - cosine) / math.sqrt(1 - cosine**2)
+    return [middle_of_cut - half_cut, middle_of_cut + half_cut]
 
 
 def _turned_outward(
@@ -378,12 +378,11 @@ def _mark_touched(mask: NDArray[np.bool_], edge: Points, poses: Poses) -> None:
     square = MARGIN * np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)])
     reach = len(mask) // 2
     for x, y, yaw in poses:
-        cos = math.cos(yaw)
-        sin = math.sin(yaw)
-        turned = edge @ np.array([[cos, sin], [-sin, cos]])  # by yaw
-        points = (turned + np.array([x, y]))[:, None] + square  # (M, 4, 2)
-        cells = np.rint(points).astype(np.int64).reshape(-1, 2) + reach
-        mask[cells[:, 1], cells[:, 0]] = True
+        turned = edge @ _rotation(yaw).T
+        points = turned + np.array([x, y])  # (M, 2)
+        corners = points[:, None] + square  # (M, 4, 2)
+        cells = np.rint(corners).astype(np.int64) + reach
+        mask[cells[..., 1], cells[..., 0]] = True
 
 
 def _mark_covered(mask: NDArray[np.bool_], body: Points, poses: Poses) -> None:
@@ -392,9 +391,13 @@ def _mark_covered(mask: NDArray[np.bool_], body: Points, poses: Poses) -> None:
     coordinates = np.arange(-reach, reach + 1.0)
     centres = np.stack(np.meshgrid(coordinates, coordinates), axis=-1).reshape(-1, 2)
     for x, y, yaw in poses:
-        cos = math.cos(yaw)
-        sin = math.sin(yaw)
-        turned = (centres - np.array([x, y])) @ np.array(
-            [[cos, -sin], [sin, cos]]
-        )  # by -yaw
-        mask |= inside(turned, body).reshape(mask.shape)
+        from_robot = centres - np.array([x, y])
+        turned_back = from_robot @ _rotation(yaw)
+        mask |= inside(turned_back, body).reshape(mask.shape)
+
+
+def _rotation(yaw: float) -> NDArray[np.float64]:
+    """Return the matrix (2, 2) that turns a column vector by a yaw."""
+    cos = math.cos(yaw)
+    sin = math.sin(yaw)
+    return np.array([[cos, -sin], [sin, cos]])

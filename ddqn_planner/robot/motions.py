@@ -227,26 +227,27 @@ def _bend(start: int, end: int, angles: Float64, radius: float) -> Poses:
     yaws = angles[[start, end]]
     directions = np.array([np.cos(yaws), np.sin(yaws)])  # (2, 2), in columns
     min_tangent = max(radius, 1.0) * tan_of_half
-    tangents, end_cell = _nearest_end(directions, min_tangent)
-    first_tangent, last_tangent = tangents
+    (first_tangent, last_tangent), end_cell = _nearest_end(directions, min_tangent)
 
     arc_tangent = min(first_tangent, last_tangent)
-    arc_radius = arc_tangent / tan_of_half
-    count_by_angle = math.ceil(abs(turn) / ANGLE)
-    count_by_length = math.ceil(abs(turn) * arc_radius / SPACING)
-    count = max(count_by_angle, count_by_length) + 1
-    yaw = angles[start] + turn * np.linspace(0, 1, count)  # (N,)
-
-    side = math.copysign(1, turn)  # 1: the centre of the arc lies to the left
-    to_centre = np.array([-math.sin(angles[start]), math.cos(angles[start])]) * side
     arc_start = (first_tangent - arc_tangent) * directions[:, 0]
-    centre = arc_start + arc_radius * to_centre
-    outward = np.column_stack([np.sin(yaw), -np.cos(yaw)]) * side  # (N, 2)
-    arc = np.column_stack([centre + arc_radius * outward, yaw])
-
-    first_line = _line(np.zeros(2), arc[0, :2], yaw[0])
-    last_line = _line(arc[-1, :2], end_cell, yaw[-1])
+    arc = _arc(arc_start, float(angles[start]), turn, arc_tangent / tan_of_half)
+    first_line = _line(np.zeros(2), arc[0, :2], arc[0, 2])
+    last_line = _line(arc[-1, :2], end_cell, arc[-1, 2])
     return np.concatenate([first_line[:-1], arc, last_line[1:]])
+
+
+def _arc(start: Float64, start_yaw: float, turn: float, radius: float) -> Poses:
+    """Return poses on an arc from a point (2,) that turns by an angle."""
+    count_by_angle = math.ceil(abs(turn) / ANGLE)
+    count_by_length = math.ceil(abs(turn) * radius / SPACING)
+    count = max(count_by_angle, count_by_length) + 1
+    yaw = start_yaw + turn * np.linspace(0, 1, count)  # (N,)
+    side = math.copysign(1, turn)  # 1: the centre lies to the left
+    to_centre = np.array([-math.sin(start_yaw), math.cos(start_yaw)]) * side
+    centre = start + radius * to_centre
+    from_centre = np.column_stack([np.sin(yaw), -np.cos(yaw)]) * side  # (N, 2)
+    return np.column_stack([centre + radius * from_centre, yaw])
 
 
 def _nearest_end(
