@@ -1,4 +1,4 @@
-"""A node that a lifecycle manager, or the node itself, configures, activates, and stops."""
+"""A node with a lifecycle, which a manager or the node itself moves through."""
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -20,10 +20,8 @@ from ddqn_planner.nodes.clocks import STEADY
 from ddqn_planner.nodes.declared import Parameters
 from ddqn_planner.nodes.ros_packages import apt_install
 
-BEAT_PERIOD, BEAT_TIMEOUT = (
-    0.5,
-    4.0,
-)  # seconds; the timeout as Nav2's lifecycle manager has it
+BEAT_PERIOD = 0.5  # seconds
+BEAT_TIMEOUT = 4.0  # seconds, as Nav2's lifecycle manager has it
 
 ENTITIES = {
     "publisher": "publishers",
@@ -33,7 +31,7 @@ ENTITIES = {
     "client": "clients",
     "service": "services",
 }
-"""What a node can create, and where it has them; beside waitables."""
+"""Attributes of a node with its entities, by kind; waitables come on top."""
 
 STATES = {
     "unknown": 0,
@@ -52,14 +50,14 @@ STATES = {
 
 
 class Change(NamedTuple):
-    """A transition that can be asked for, with ROS's numbers."""
+    """A transition that can be requested, with ROS's numbers."""
 
     number: int
     label: str
     start: str
-    during: str  # the state while the node works
+    transition_state: str  # while the node works
     goal: str
-    ends: int  # the number of its success; failure and error have the next two
+    success_number: int  # of its success; failure and error have the next two
 
 
 CHANGES = (
@@ -85,36 +83,55 @@ def _description(
     return TransitionDescription(transition=transition, **ends)
 
 
+def _describe(change: Change) -> TransitionDescription:
+    return _description(
+        change.number, change.label, change.start, change.transition_state
+    )
+
+
+class Ends(NamedTuple):
+    """The states in which the work of a transition state can end."""
+
+    success: str
+    failure: str
+    error: str
+
+
 def _transition_graph() -> Iterator[TransitionDescription]:
     """Yield ROS's transitions, also those of a node that fails, as tools draw them."""
-    ends = {}
+    numbers: dict[str, int] = {}  # of the success, by transition state
+    ends: dict[str, Ends] = {}
     for change in CHANGES:
-        yield _description(change.number, change.label, change.start, change.during)
-        failed = change.goal if change.label == "shutdown" else change.start
-        ends[change.ends] = change.during, change.goal, failed, "errorprocessing"
-    ends[60] = "errorprocessing", "unconfigured", "finalized", "finalized"
-    for first, (during, *goals) in ends.items():
-        labels = "transition_success", "transition_failure", "transition_error"
-        for offset, (label, goal) in enumerate(zip(labels, goals, strict=True)):
-            yield _description(first + offset, label, during, goal)
+        state = change.transition_state
+        yield _describe(change)
+        failure = change.goal if change.label == "shutdown" else change.start
+        numbers[state] = change.success_number
+        ends[state] = Ends(change.goal, failure, "errorprocessing")
+    numbers["errorprocessing"] = 60
+    ends["errorprocessing"] = Ends("unconfigured", "finalized", "finalized")
+    for state, number in numbers.items():
+        for offset, end in enumerate(Ends._fields):
+            goal: str = getattr(ends[state], end)
+            yield _description(number + offset, f"transition_{end}", state, goal)
 
 
-# Not on rclpy's LifecycleNode: its answer to a transition that the state does not have ends the
-# process, what its transitions call cannot say why it fails, and its services outlive the node.
+# Not on rclpy's LifecycleNode: its answer to a transition that the state does not have
+# ends the process, its callbacks cannot say why they fail, and its services outlive the
+# node.
 class ManagedNode(BaseNode):
     """Node that destroys what `configure` created if that fails, and at ``cleanup``."""
 
     def __init__(self, name: str, parameters: Parameters) -> None:
         # First, as a node that cannot start is destroyed, too.
         self.state = "unconfigured"  # or inactive, active or finalized
-        self._is_changing = self._is_destroyed = False
+        self._is_changing = False
+        self._is_destroyed = False
         self._beats: Timer | None = None
         super().__init__(name, parameters)
         self._events = self.create_publisher(TransitionEvent, "~/transition_event", 10)
-        group = (
-            ReentrantCallbackGroup()
-        )  # the state can be asked for while a transition waits
-        for kind, service, callback in (
+        # The state can be asked for while a transition waits.
+        group = ReentrantCallbackGroup()
+        for service_type, name, callback in (
             (ChangeState, "change_state", self._on_change_state),
             (GetState, "get_state", self._on_get_state),
             (GetAvailableStates, "get_available_states", self._on_get_states),
@@ -125,56 +142,61 @@ class ManagedNode(BaseNode):
             ),
             (GetAvailableTransitions, "get_transition_graph", self._on_get_graph),
         ):
-            self.create_service(kind, f"~/{service}", callback, callback_group=group)
+            self.create_service(
+                service_type, f"~/{name}", callback, callback_group=group
+            )
 
     def change(self, label: str) -> None:
         """Do a transition; if that raises an error, the state stays."""
-        (change,) = [it for it in self._changes() if it.label == label]
+        change = {change.label: change for change in self._changes()}[label]
+        do_change = getattr(self, label)
         try:
-            getattr(self, label)()
+            do_change()
         except Exception:
             if label == "configure":
                 self.cleanup()
             raise
         self.state = change.goal
-        for start, goal in (
-            (change.start, change.during),
-            (change.during, change.goal),
-        ):
-            event = TransitionEvent(start_state=_state(start), goal_state=_state(goal))
-            self._events.publish(event)
+        self._publish_event(change.start, change.transition_state)
+        self._publish_event(change.transition_state, change.goal)
         if label == "configure":
             super().tell_unread_qualities()
+
+    def _publish_event(self, start: str, goal: str) -> None:
+        event = TransitionEvent(start_state=_state(start), goal_state=_state(goal))
+        self._events.publish(event)
 
     def _changes(self) -> list[Change]:
         """Return the transitions that the state has."""
         return [change for change in CHANGES if change.start == self.state]
 
     def destroy_node(self) -> None:
-        """Free all that the node has, and destroy it, so that it leaves the graph at once."""
-        if (
-            self._is_destroyed
-        ):  # newer releases destroy a context's nodes when it is shut down
+        """Free everything of the node, and destroy it, so that it leaves the graph."""
+        # Newer releases destroy a context's nodes when it is shut down.
+        if self._is_destroyed:
             return
         self._is_destroyed = True
-        # First, as a lifecycle manager calls them when the bond breaks, and waits without end.
-        for service in [*self.services]:
+        # First, as a lifecycle manager calls them when the bond breaks, and waits
+        # without end.
+        for service in list(self.services):
             self.destroy_service(service)
         if self.context.ok():
             self.shutdown()
         super().destroy_node()
 
     def tell_unread_qualities(self) -> None:
-        """Log them as soon as the node is configured: before, it has no subscriptions."""
+        """Do nothing: a node without subscriptions logs them once it is configured."""
 
     async def prepare(self, transition: str) -> bool:
-        """Do what takes long before a transition that was asked for; False to refuse it."""
+        """Do what takes long before a requested transition; return False to refuse."""
         return True
 
     def configure(self) -> None:
         """Create what the node needs, after this."""
-        self._kept = {it for name in ENTITIES.values() for it in getattr(self, name)}
-        self._kept |= {*self.waitables}
+        self._entities_before = {
+            entity for name in ENTITIES.values() for entity in getattr(self, name)
+        }
+        self._waitables_before = {*self.waitables}
 
     def activate(self) -> None:
         """Begin to answer requests."""
@@ -183,19 +205,22 @@ class ManagedNode(BaseNode):
         """Stop, and end the bond."""
         if self._beats is not None:
             self.destroy_timer(self._beats)
-            self._beats, self._bond.active = None, False
+            self._beats = None
+            self._bond.active = False
             self._beat()
-            # Else a publisher that ends at once takes its last message with it.
+            # A publisher that ends at once would take its last message with it.
             self._heart.wait_for_all_acked(Duration(seconds=0.2))
             self.destroy_publisher(self._heart)
 
     def cleanup(self) -> None:
         """Destroy what was created since `configure`, also if that failed."""
         for kind, name in ENTITIES.items():
-            for entity in {*getattr(self, name)} - self._kept:
-                getattr(self, f"destroy_{kind}")(entity)
-        # Handlers of events have ended with their publisher or subscription: action servers stay.
-        servers: set[Any] = {*self.waitables} - self._kept
+            destroy = getattr(self, f"destroy_{kind}")
+            for entity in {*getattr(self, name)} - self._entities_before:
+                destroy(entity)
+        # Handlers of events have ended with their publisher or subscription. Only
+        # action servers are left.
+        servers: set[Any] = {*self.waitables} - self._waitables_before
         for server in servers:
             server.destroy()
 
@@ -217,8 +242,7 @@ class ManagedNode(BaseNode):
 
     def _on_get_transitions(self, _: Any, response: Any) -> Any:
         response.available_transitions = [
-            _description(change.number, change.label, change.start, change.during)
-            for change in self._changes()
+            _describe(change) for change in self._changes()
         ]
         return response
 
@@ -227,19 +251,19 @@ class ManagedNode(BaseNode):
         return response
 
     async def _on_change_state(self, request: Any, response: Any) -> Any:
-        asked = request.transition
-        known = {change.number: change.label for change in self._changes()}
-        label = asked.label or known.get(asked.id, "")
-        if self._is_changing or self.is_stopping or label not in known.values():
-            what = repr(asked.label) if asked.label else f"transition {asked.id}"
-            choices = ", ".join(known.values()) or "none"
-            when = (
-                "while it changes its state"
-                if self._is_changing
-                else f"when {self.state}"
+        labels = {change.number: change.label for change in self._changes()}
+        number: int = request.transition.id
+        requested_label: str = request.transition.label
+        label = requested_label or labels.get(number, "")
+        is_refused = self._is_changing or self.is_stopping
+        if is_refused or label not in labels.values():
+            transition = f"transition {number}"
+            if requested_label:
+                transition = repr(requested_label)
+            choices = ", ".join(labels.values()) or "none"
+            self.get_logger().error(
+                f"{transition} refused: the node has {choices} {self._circumstance()}"
             )
-            when = "as it is being stopped" if self.is_stopping else when
-            self.get_logger().error(f"{what} refused: the node has {choices} {when}")
             return response
         self._is_changing = True
         try:
@@ -254,6 +278,14 @@ class ManagedNode(BaseNode):
             self._is_changing = False
         return response
 
+    def _circumstance(self) -> str:
+        """Return in words when a transition was refused."""
+        if self.is_stopping:
+            return "as it is being stopped"
+        if self._is_changing:
+            return "while it changes its state"
+        return f"when {self.state}"
+
     def _form_bond(self) -> None:
         """Let a lifecycle manager see that the process lives."""
         try:
@@ -262,12 +294,11 @@ class ManagedNode(BaseNode):
             remedy = f"{apt_install('bond')}, or set bond_timeout to 0.0 in its manager"
             self.get_logger().info(f"no bond: bond is not installed; {remedy}")
             return
-        # As bondpy does, but deaf: the topic has the bonds of all nodes, each ten times a second.
+        # As bondpy does, without a subscription: the topic has the bonds of all nodes,
+        # each ten times per second.
         self._bond = Status(id=self.get_name(), instance_id=str(uuid4()), active=True)
-        self._bond.heartbeat_period, self._bond.heartbeat_timeout = (
-            BEAT_PERIOD,
-            BEAT_TIMEOUT,
-        )
+        self._bond.heartbeat_period = BEAT_PERIOD
+        self._bond.heartbeat_timeout = BEAT_TIMEOUT
         self._heart = self.create_publisher(Status, "bond", 1)
         self._beat()
         self._beats = self.create_timer(BEAT_PERIOD, self._beat, clock=STEADY)

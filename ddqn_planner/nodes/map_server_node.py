@@ -29,7 +29,7 @@ RESULTS: dict[type[Exception], int] = {
     MapMetadataError: LoadMap.Response.RESULT_INVALID_MAP_METADATA,
 }
 
-# How long to wait for subscribers that do not answer, as a planner that is stopped by a debugger.
+# How long to wait for subscribers that do not answer, as a planner in a debugger.
 DIRECTIONS_TIMEOUT = Duration(seconds=1)
 NO_MAP = "no map is loaded; call load_map first"
 PARAMETERS: Final = {
@@ -45,7 +45,7 @@ PARAMETERS: Final = {
 
 
 class MapServerNode(BaseNode):
-    """Serves one map, latched on a topic and as a service, and its directions on another topic."""
+    """Serves one map, on a latched topic and as a service, and its directions."""
 
     def __init__(self) -> None:
         super().__init__("map_server", PARAMETERS)
@@ -76,28 +76,26 @@ class MapServerNode(BaseNode):
     def check_parameters(self, new: dict[str, Any]) -> None:
         """Check new values as `BaseNode` does, and whether the topic can be one."""
         super().check_parameters(new)
-        topic = new.get("topic_name", "map")
+        topic: str = new.get("topic_name", "map")
         try:
             self.resolve_topic_name(topic)
         except (NameValidationException, RuntimeError, ValueError) as error:
-            wrong = (
-                f"topic_name is {topic!r} ({str(error).splitlines()[0].rstrip(':')})"
-            )
-            raise ValueError(
-                f"{wrong}; give letters, digits, _ and /, such as map"
-            ) from None
+            reason = str(error).splitlines()[0].rstrip(":")
+            remedy = "give letters, digits, _ and /, such as map"
+            raise ValueError(f"topic_name is {topic!r} ({reason}); {remedy}") from None
 
     def _load(self, url: str, only_below: bool = False) -> int:
-        """Load a map and serve it, or log why not; return the result code of LoadMap."""
+        """Load a map and serve it, or log why not; return LoadMap's result code."""
         try:
             path = find_map(url)
             loaded = read_map_file(path, only_below)
         except Exception as error:  # anything, of a library that reads a broken file
-            kept = "the map before it stays" if self._loaded else "no map is served"
-            self.get_logger().error(f"cannot load {url!r}, {kept}: {error}")
-            return int(
-                RESULTS.get(type(error), LoadMap.Response.RESULT_UNDEFINED_FAILURE)
-            )
+            consequence = "no map is served"
+            if self._loaded is not None:
+                consequence = "the map before it stays"
+            self.get_logger().error(f"cannot load {url!r}, {consequence}: {error}")
+            undefined: int = LoadMap.Response.RESULT_UNDEFINED_FAILURE
+            return RESULTS.get(type(error), undefined)
         self._loaded = loaded
         self._serve(loaded.values)
         height, width = loaded.values.shape
@@ -105,14 +103,17 @@ class MapServerNode(BaseNode):
         return int(LoadMap.Response.RESULT_SUCCESS)
 
     def _serve(self, values: NDArray[np.int8]) -> None:
-        assert self._loaded is not None
-        place = (
-            self._loaded.resolution,
-            self._loaded.origin,
-            self.header(self.value("frame_id")),
+        loaded = self._loaded
+        assert loaded is not None
+        header = self.header(self.value("frame_id"))
+        self._served = occupancy_message(
+            values, loaded.resolution, loaded.origin, header
         )
-        self._served = occupancy_message(values, *place)
-        self._directions.publish(occupancy_message(self._loaded.forbidden, *place))
+        self._directions.publish(
+            occupancy_message(
+                loaded.forbidden, loaded.resolution, loaded.origin, header
+            )
+        )
         # No planner has the new map while it has the directions of the map before.
         with suppress(RuntimeError):  # a middleware that cannot tell
             self._directions.wait_for_all_acked(DIRECTIONS_TIMEOUT)
@@ -135,19 +136,22 @@ class MapServerNode(BaseNode):
         return response
 
     def _on_scatter_obstacles(self) -> tuple[bool, str]:
-        """Add to the loaded map, not to what was added before: each call is an independent draw."""
+        """Serve the loaded map with new obstacles, none of an earlier call."""
+        loaded = self._loaded
         try:
-            if self._loaded is None:
+            if loaded is None:
                 raise ValueError(NO_MAP)
-            grid = self._loaded.grid()
-            move_rule, path = known_path(grid, self._loaded)
-            noisy, rejected = scatter_obstacles(grid, path, move_rule, self._random)
+            grid = loaded.grid()
+            move_rule, path = known_path(grid, loaded)
+            noisy_grid, rejected = scatter_obstacles(
+                grid, path, move_rule, self._random
+            )
         except ValueError as error:
             self.get_logger().error(f"no obstacles were scattered: {error}")
             return False, str(error)
-        new = noisy.occupancy & ~grid.occupancy
-        self._serve(np.where(new, np.int8(OCCUPIED), self._loaded.values))
-        places = grid.centres(np.argwhere(new)[:, ::-1]).tolist()
+        is_new = noisy_grid.occupancy & ~grid.occupancy  # (H, W)
+        self._serve(np.where(is_new, np.int8(OCCUPIED), loaded.values))
+        places = grid.centres(np.argwhere(is_new)[:, ::-1]).tolist()
         cells = ", ".join(f"({x:.3f}, {y:.3f})" for x, y in places)
         message = (
             f"{len(places)} new obstacles at {cells} m; {rejected} draws thrown away"
@@ -163,7 +167,10 @@ class MapServerNode(BaseNode):
 
 
 def known_path(grid: GridMap, map_file: MapFile) -> tuple[MoveRule, list[Cell]]:
-    """Return the shortest path, and the safest rule under which there is one, or a ValueError."""
+    """Return the shortest path, and the safest move rule that allows a path.
+
+    A ValueError says why there is none.
+    """
     start, goal = map_file.start, map_file.goal
     if start is None or goal is None:
         remedy = (
@@ -171,7 +178,8 @@ def known_path(grid: GridMap, map_file: MapFile) -> tuple[MoveRule, list[Cell]]:
         )
         raise ValueError(f"the map file names no start and goal; {remedy}")
     for move_rule in (MoveRule.ROBOT_SAFE, MoveRule.CORNER_CUTTING):
-        if path := shortest_path(grid, start, goal, move_rule):
+        path = shortest_path(grid, start, goal, move_rule)
+        if path:
             return move_rule, path
     raise ValueError(
         f"no path leads from the start {start} to the goal {goal} of the map file"
