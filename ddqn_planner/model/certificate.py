@@ -1,4 +1,4 @@
-"""Proves which moves a propagation network takes for possible, for all costs of cells."""
+"""Proves which moves a propagation network takes for possible, for all cell costs."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ Float32: TypeAlias = NDArray[np.float32]
 Float64: TypeAlias = NDArray[np.float64]
 
 # Shapes: P = patterns of occupied cells around a free one, 256 for each rule, A = 8
-# actions, F = filters, I = inputs, C = 18 inputs for costs and unknown cells, U = outputs
-# of a layer, B = a batch, V = 101 values of a free cell: the costs 0 to 99, and last
-# unknown.
+# actions, F = filters, I = inputs, C = 18 inputs for costs and unknown cells, U =
+# outputs of a layer, B = a batch, V = 101 values of a free cell: the costs 0 to 99, and
+# last unknown.
 
 MOVE_RULES: Final = (MoveRule.ROBOT_SAFE, MoveRule.CORNER_CUTTING)
 COSTS = slice(9, 27)  # the inputs for costs and unknown cells
@@ -90,8 +90,8 @@ class Certificate:
 
     def __str__(self) -> str:
         if not self.proved:
-            text = f"not proved: {self.undecided:,} of {self.decisions:,} decisions are open, "
-            return f"{text}{self.wrong:,} are wrong"
+            decisions = f"{self.undecided:,} of {self.decisions:,} decisions are open"
+            return f"not proved: {decisions}, {self.wrong:,} are wrong"
         text = f"proved: all {self.decisions:,} decisions, margin {self.margin:.1f}"
         if math.isinf(self.path_error):
             return text
@@ -107,7 +107,7 @@ def _percent(error: float) -> str:
 def certify(
     network: PatchNetwork, move_rules: Sequence[MoveRule] = MOVE_RULES
 ) -> Certificate:
-    """Prove the moves that a network takes for possible, and bound its costs' errors."""
+    """Prove which moves a network takes for possible; bound its costs' errors."""
     every_P9 = every_patch()
     features = [network.features(every_P9, rule) for rule in move_rules]
     legal_PA = np.concatenate([legal_in_patches(every_P9, rule) for rule in move_rules])
@@ -116,7 +116,7 @@ def certify(
     if network.sizes["filters"] > MAX_FILTERS:
         return Certificate(decisions, decisions, 0, 0.0, math.inf)
     with np.errstate(over="ignore", invalid="ignore"):  # a broken model may overflow
-        # Of all patches of a rule at once, as the planner computes them: the same floats.
+        # Of all patches of a rule at once, as in the planner: so the floats are equal.
         tries_PA = np.concatenate([network.tries(inputs) for inputs in features])
         tries = float(tries_PA[legal_PA].max())
         feature_PI = np.concatenate(features)[is_free_P]
@@ -154,7 +154,8 @@ def _count_wrong(
 ) -> int:
     """Return how many open decisions are wrong for the costs of the least margin."""
     pattern_B, action_B = np.nonzero(open_PA)
-    # Of each free cell, the cost 0, the greatest cost or unknown makes the margin least.
+    # The margin is least where each free cell has the cost 0, the greatest cost, or is
+    # unknown.
     gain_29B = margins.gain.reshape(-1, 9, *legal_PA.shape)[:, :, pattern_B, action_B]
     gain_39B = np.pad(gain_29B, ((1, 0), (0, 0), (0, 0)))  # a cost of 0 adds nothing
     value_3 = np.array([0, OCCUPIED - 1, UNKNOWN], np.int8)
@@ -172,9 +173,9 @@ def logit_margins(
     network: PatchNetwork, feature_PI: Float32, legal_PA: NDArray[np.bool_]
 ) -> Margins:
     """Bound how far each logit is on its right side of 0."""
-    # Two lines enclose a ReLU, so two linear functions a logit (CROWN, Zhang et al. 2018).
-    # With one slope for both lines, one product gives the bounds of a hidden layer
-    # (Fast-Lin, Weng et al. 2018).
+    # Two lines enclose a ReLU, so two linear functions enclose a logit (CROWN, Zhang et
+    # al. 2018). With one slope for both lines, one product gives the bounds of a hidden
+    # layer (Fast-Lin, Weng et al. 2018).
     tensors = {
         name: tensor.astype(np.float64) for name, tensor in network.tensors.items()
     }
@@ -217,14 +218,17 @@ def logit_margins(
 
 
 class _Lines:
-    """Lines around ReLUs of bounded inputs: slope * x + distance above, slope * x below."""
+    """Lines around ReLUs of bounded inputs.
+
+    Above a ReLU lies slope * x + distance, and below it slope * x.
+    """
 
     def __init__(self, low_PF: Float64, high_PF: Float64) -> None:
         above = np.maximum(high_PF, 0)
         below = np.minimum(low_PF, 0)
         self.slope = above / np.maximum(above - below, np.finfo(np.float64).tiny)
         self.distance = -below * self.slope
-        # Below the ReLU lies this line, too: of slope 0 or 1, whichever is nearer to it.
+        # Below the ReLU lies this line, too: its slope is 0 or 1, as fits better.
         self.lower_slope = (high_PF > -low_PF).astype(np.float64)
         self.greatest = above.max(axis=0).astype(np.float32)
 
@@ -232,7 +236,7 @@ class _Lines:
 def _extremes(
     weight_CPU: Float64, feature_PI: NDArray[np.float32]
 ) -> tuple[Float64, Float64]:
-    """Return the least and greatest sums, (P, U), of costs and unknown cells with weights."""
+    """Return the least and greatest weighted sums of costs and unknowns: (P, U)."""
     # A free cell has a cost of 0 to 1, or it is unknown.
     cells = len(weight_CPU) // 2
     choice_29PU = weight_CPU.reshape(2, cells, *weight_CPU.shape[1:])
@@ -253,8 +257,8 @@ def _multiplier_error(
         return 1 - 1 / MAX_COST_MULTIPLIER
     weight_IA = network.tensors["prices.weight"].T.astype(np.float64, order="C")
     bias_A = network.tensors["prices.bias"].astype(np.float64)
-    # Every pair of costs of a move's two cells is tried. The layer should add nothing for
-    # the other inputs: their least and greatest sums are enough.
+    # Every pair of costs of a move's two cells is tried. The layer should add nothing
+    # for the other inputs: their least and greatest sums are enough.
     action_A = np.arange(len(MOVES))
     cell_2A = CENTRE + np.outer([0, 1], MOVES @ [1, 3])  # of the patch
     cost_2A = COSTS.start + cell_2A

@@ -63,7 +63,7 @@ TYPES: Final[dict[str, tuple[type, ...]]] = {
 
 
 def package_version() -> str:
-    """Return the version of the installed package, or "unknown" in a bare source tree."""
+    """Return the version of the installed package; "unknown" in a bare source tree."""
     from importlib import metadata  # slow to import, and planning does not need it
 
     try:
@@ -184,7 +184,7 @@ def _check_tensors(
 
 
 def _description_of(values: object) -> ModelMetadata:
-    """Return the description of a network, from JSON; a ValueError says what is wrong."""
+    """Return a network's description from JSON; a ValueError says what is wrong."""
     if not isinstance(values, dict):
         raise ValueError(f"it is {reprlib.repr(values)}; it must be a JSON object")
     wrong_keys = sorted(values.keys() ^ TYPES.keys())

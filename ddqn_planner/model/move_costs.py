@@ -1,4 +1,4 @@
-"""The costs that a network gives the moves on a map, as fields are computed from them."""
+"""The costs that a network gives the moves on a map, from which fields are computed."""
 
 from __future__ import annotations
 
@@ -333,7 +333,10 @@ def _read_padded(padded: NDArray[np.bool_], cost: NDArray[np.int8] | None) -> Ce
 
 
 def _least_cost(occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None) -> int:
-    """Return the least cost of a large map's cells, see `CellsRead`; of most maps soon."""
+    """Return the least cost of a map's cells, see `CellsRead`.
+
+    On most maps a few rows tell it, so it is quick on large maps.
+    """
     if cost is None:
         return OCCUPIED
     least_cost = OCCUPIED
@@ -356,7 +359,7 @@ def _read_cells(
     value: NDArray[np.uint8],
     has_costs: bool,
 ) -> Any:
-    """Write patches and values of the cells inside the border; return the least cost."""
+    """Write patches and values of cells inside the border; return the least cost."""
     # All numbers are unsigned, of 8 bits: so the loop handles many cells at once.
     least_cost = np.uint8(OCCUPIED)
     for y in range(1, patch.shape[0] - 1):
@@ -409,7 +412,7 @@ def unique_patches(
 
 
 def every_patch() -> NDArray[np.int8]:
-    """Return all 512 patches without costs, in the order of their numbers: (512, 9) int8."""
+    """Return all patches without costs, by their numbers: (512, 9) int8."""
     is_occupied_P9 = np.arange(2**9)[:, None] >> np.arange(9) & 1
     return (is_occupied_P9 * OCCUPIED).astype(np.int8)
 

@@ -23,10 +23,10 @@ from ddqn_planner.robot.body_certificate import BodyCertificate
 
 Array: TypeAlias = NDArray[np.float32]
 
-# Shapes: A = 8 actions, B = a batch, I and O = inputs and outputs of a layer, P = patches,
-# F = filters. In the paper's network, L = windows of the convolution, U = outputs of the
-# layer after it, C = cells, with one more that stands for all outside the map. In cost
-# multipliers, L = the values of a cell, see `move_costs`.
+# Shapes: A = 8 actions, B = a batch, I and O = inputs and outputs of a layer, P =
+# patches, F = filters. In the paper's network, L = windows of the convolution, U =
+# outputs of the layer after it, C = cells, with one more that stands for all outside
+# the map. In cost multipliers, L = the values of a cell, see `move_costs`.
 
 # A move of at least this probability counts as one that always succeeds: the sigmoid
 # function never reaches 1, and the difference must not decide between paths.
@@ -81,11 +81,17 @@ class QNetwork:
         return None
 
     def move_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts | None:
-        """Return the costs of a map's moves if proved: the possible ones are the legal ones."""
+        """Return the costs of a map's moves; None unless proved that they are right.
+
+        Then exactly the legal moves are possible.
+        """
         return None
 
     def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Array:
-        """Return Q(s, a) of every cell toward one goal, if it does not follow from costs."""
+        """Return Q(s, a) of every cell toward one goal: (8, H, W).
+
+        Networks whose Q follows from costs of moves do not have it.
+        """
         raise NotImplementedError
 
     def _layer(self, name: str, input_BI: Array) -> Array:
@@ -101,7 +107,7 @@ class QNetwork:
 def observation_background(
     occupancy: NDArray[np.bool_], goal: Cell
 ) -> NDArray[np.float32]:
-    """Return the part of the observation that stays the same while the robot moves: (C,)."""
+    """Return the part of the observation without the robot: (H * W,)."""
     background = np.where(occupancy, OBSTACLE, FREE).astype(np.float32)
     background[goal[1], goal[0]] = GOAL
     return background.ravel()
@@ -113,8 +119,8 @@ class PaperQNetwork(QNetwork):
     It has a 3x3 convolution and fully connected layers.
     """
 
-    # The paper gives no padding. Without our padding of 1, no filter covers the last row
-    # and column of a map of even size. The paper's text can mean a hidden layer of
+    # The paper gives no padding. Without our padding of 1, no filter covers the last
+    # row and column of a map of even size. The paper's text can mean a hidden layer of
     # `hidden_units`; 0 stands for none.
     name = "paper"
     size_names = ("height", "width", "filters", "hidden_units")
@@ -176,7 +182,10 @@ class PaperQNetwork(QNetwork):
 
 
 def window_cells(shape: tuple[int, int]) -> NDArray[np.int64]:
-    """Return the cells of each window of the convolution, (L, 9); H * W stands for outside."""
+    """Return the cells of each window of the convolution, (L, 9).
+
+    The number H * W stands for all cells outside the map.
+    """
     cells = shape[0] * shape[1]
     padded = np.pad(np.arange(cells).reshape(shape), 1, constant_values=cells)
     windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))[::2, ::2]
@@ -191,8 +200,8 @@ class PropagationQNetwork(QNetwork):
     """
 
     # Learned is p(s, a), from the 3x3 patch. Related: value iteration networks (VIN,
-    # Tamar et al. 2016) learn their reward, too; VProp (Nardelli et al. 2019) learns how
-    # values propagate.
+    # Tamar et al. 2016) learn their reward, too; VProp (Nardelli et al. 2019) learns
+    # how values propagate.
     name = "propagation"
     size_names = ("filters",)
     inputs: ClassVar[int] = 9  # features
@@ -227,8 +236,8 @@ class PropagationQNetwork(QNetwork):
     def features(cls, patch_B9: NDArray[np.int8], move_rule: MoveRule) -> Array:
         """Return which cells of patches are occupied, (B, 9), see `patches`.
 
-        With costs, the costs of the cells follow, 0..1, then which cells are unknown, and
-        the rule: (B, 28).
+        With costs, the costs of the cells follow, 0..1, then which cells are unknown,
+        and the rule: (B, 28).
         """
         occupied_B9 = patch_B9 == OCCUPIED
         if not cls.uses_costs:
@@ -250,7 +259,10 @@ class PropagationQNetwork(QNetwork):
         return p_BA
 
     def tries(self, feature_BI: Array) -> Array:
-        """Return 1/p, or 1 from `CERTAIN` on; infinite if p is at most 1/2, or NaN: (B, 8)."""
+        """Return how many tries a move takes, 1/p: (B, 8).
+
+        From a p of `CERTAIN` on it is 1; where p is at most 1/2, or NaN, infinite.
+        """
         p_BA = self.success(feature_BI)
         p_BA = np.where(p_BA >= CERTAIN, np.float32(1), p_BA)
         tries_BA: Array = np.where(
@@ -259,14 +271,17 @@ class PropagationQNetwork(QNetwork):
         return tries_BA
 
     def multiplier(self, feature_BI: Array) -> Array:
-        """Return the cost multiplier of each move, at least 1: (B, 8), given features (B, I)."""
+        """Return the cost multiplier of each move, 1 or more: (B, 8)."""
         if not self.uses_costs:
             return np.ones((len(feature_BI), len(MOVES)), dtype=np.float32)
         multiplier_BA: Array = 1 + np.maximum(self._layer("prices", feature_BI), 0)
         return multiplier_BA
 
     def certificate(self, move_rule: MoveRule) -> Certificate:
-        """Return what is proved of its moves: under all rules, or the one it was trained for."""
+        """Return the proof of its moves.
+
+        A network that knows the move rule is proved for all rules.
+        """
         rules = MOVE_RULES if self.uses_costs else (move_rule,)
         if rules not in self._certificates:
             self._certificates[rules] = certify(self, rules)
@@ -298,7 +313,7 @@ class PropagationQNetwork(QNetwork):
     def _sums_of_prices(
         self, move_rule: MoveRule, legal_PA: NDArray[np.bool_]
     ) -> MoveCosts | None:
-        """Return costs by the costs of a move's two cells, if proved to be such sums."""
+        """Return costs as sums over a move's two cells, if proved to be such sums."""
         if not self.certificate(move_rule).proved:
             return None
         term_9AL = self._price_terms(move_rule)

@@ -28,7 +28,7 @@ class RobotNetwork(QNetwork):
     """
 
     # Weights are at least 0: a weight below counts as 0. One unit serves all primitives
-    # that are quarter turns of each other. The motions and the footprint are not learned.
+    # that are quarter turns of each other. Motions and footprint are not learned.
     name = "robot"
     size_names = ("units", "side", "primitives", "poses", "corners")
     max_size = 2**16
@@ -111,7 +111,7 @@ class RobotNetwork(QNetwork):
         return False
 
     def of_primitives(self, array_USS: NDArray[Any]) -> NDArray[Any]:
-        """Return the arrays of all primitives, turned from those of units: (P, S, S)."""
+        """Return the arrays of primitives, turned from those of units: (P, S, S)."""
         turned = [np.rot90(array_USS, -turns, axes=(1, 2)) for turns in range(4)]
         turned_4USS = np.stack(turned)
         return turned_4USS[self.turns, self.unit]
@@ -126,7 +126,7 @@ class RobotNetwork(QNetwork):
         )
 
     def swept(self) -> NDArray[np.bool_]:
-        """Return the cells that forbid each primitive, (P, S, S), as learned and proved."""
+        """Return the cells that forbid each primitive, as proved: (P, S, S)."""
         certificate = self.certificate()
         if not certificate.proved:
             remedy = "give a model that ddqn-planner train-robot has proved"

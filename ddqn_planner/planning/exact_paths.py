@@ -1,4 +1,4 @@
-"""Paths in metres: from where the robot is, along the cells of a plan, to exactly the goal."""
+"""Paths in metres: from the exact start, along the cells of a plan, to the exact goal."""
 
 import math
 from collections.abc import Sequence
@@ -16,8 +16,9 @@ from ddqn_planner.planning.segments import Path
 Float64 = NDArray[np.float64]
 Point = tuple[float, float]
 
-# Cells: points so near to each other are one point, and a line so near to a cell touches it. More
-# than what is rounded between metres and cells, on maps far from their frame's origin, too.
+# Cells: points so near to each other are one point, and a line so near to a cell touches
+# it. It is more than the rounding between metres and cells, also on maps far from their
+# frame's origin.
 MARGIN: Final = 1e-6
 
 
@@ -34,7 +35,7 @@ NO_PATH: Final = ExactPath(np.empty((0, 2)), 0.0)
 def exact_path(
     legs: Sequence[Path], grid: GridMap, move_rule: MoveRule, points: Sequence[Point]
 ) -> ExactPath:
-    """Return the path by the cells of some legs that begins, and ends each leg, at exact points.
+    """Return the path along the cells of legs that leads through exact points.
 
     Parameters
     ----------
@@ -44,15 +45,16 @@ def exact_path(
     move_rule : MoveRule
         How the length is measured.
     points : sequence of (x, y)
-        Metres in the map frame: one in the first cell of the first leg, and one for the end of each
-        leg. Where a point lies in another cell, as that of a goal which moved, the cell's centre
-        takes its place.
+        Metres in the map frame: the point in the first cell of the first leg, and the
+        point at the end of each leg. Where a point lies in another cell, as for a goal
+        that moved, the cell's centre takes its place.
 
     Returns
     -------
     ExactPath
-        Where a straight piece from or to an exact point would touch an occupied cell, or leave a
-        cell as it forbids, the path also passes the centre of that point's cell.
+        Where a straight piece from or to an exact point would touch an occupied cell, or
+        leave a cell as the cell forbids, the path also passes the centre of that point's
+        cell.
     """
     begin = _point_in(grid, legs[0][0], points[0])
     parts = [begin]
@@ -69,9 +71,10 @@ def exact_path(
 
 
 def dense(points: Float64, spacing: float) -> tuple[Float64, NDArray[np.int64]]:
-    """Return points on a path (M, 2), at most a spacing apart, and the piece of each but the last.
+    """Return points on a path, at most a spacing apart: (M, 2), and their pieces.
 
-    All points of the path are among them.
+    All points of the path are among them. The pieces are the numbers of the straight
+    pieces of the path that begin at or before each point except the last: (M - 1,).
     """
     lengths = np.hypot(*np.diff(points, axis=0).T)
     parts = np.ceil(lengths / spacing * (1 - MARGIN)).astype(np.int64)
@@ -97,7 +100,10 @@ def _in_cells(points: Float64, grid: GridMap) -> Float64:
 
 
 def _corners_between(path: Path, grid: GridMap, begin: Float64, end: Float64) -> Path:
-    """Return the cells of a leg whose centres lie on the way between two points in its ends."""
+    """Return the cells of a leg at whose centres the path turns between two points.
+
+    The points lie in the first and in the last cell of the leg.
+    """
     first, last = path[0], path[-1]
     is_at_first, is_at_last = _is_near(begin, first), _is_near(end, last)
     if len(path) == 1:
@@ -118,7 +124,7 @@ def _is_near(point: Float64, cell: NDArray[np.int32]) -> bool:
 
 
 def _is_clear(begin: Any, end: Any, grid: GridMap) -> bool:
-    """Return whether a straight piece touches only free cells, and leaves none as it forbids.
+    """Return whether a straight piece touches only free cells, and leaves them legally.
 
     The cells of its ends need not be free: a robot may leave an obstacle.
     """

@@ -28,20 +28,22 @@ def invalid_poses(
     distance: float = math.inf,
     clearing_radius: float = 0.0,
 ) -> NDArray[np.int64]:
-    """Return the indices of the poses that are not free, from the one nearest to the robot on.
+    """Return the indices of the poses that are not free, from the robot on.
 
-    What lies between two poses does not count.
+    The first pose checked is the one nearest to the robot. Cells between two poses do not
+    count.
 
     Parameters
     ----------
     poses : (N, 3)
-        Metres and radians in the map frame, one or more; the headings count with a body alone.
+        Metres and radians in the map frame, one pose or more. The headings count only with
+        a body.
     grid : GridMap
     robot : (x, y), optional
         Where the robot is, in metres. By default all poses count.
     body : pair of arrays, optional
-        The points of a body, see `points_of`: then only obstacles count, below all of it. By
-        default the cell of a pose must be free.
+        The points of a body, see `points_of`: then only obstacles count, below all of the
+        body. By default the cell of a pose must be free.
     unknown : (H, W) bool, optional
         Cells that count as obstacles too.
     max_cost : int
@@ -49,8 +51,9 @@ def invalid_poses(
     distance : float
         Metres along the path that are looked at; 0 or less means all.
     clearing_radius : float
-        A disc that stands in a cell which is not free may leave it by such cells. If the cell is an
-        obstacle, it may pass those within so many cells of it.
+        A disc that stands in a cell which is not free may leave it through cells that are
+        not free. If that cell is an obstacle, the disc may pass obstacles within so many
+        cells of it.
     """
     first, end = _part_to_check(poses, robot, distance)
     closed = _closed_cells(grid, body is not None, unknown, max_cost)

@@ -36,7 +36,7 @@ class PlanMethod(Choice):
     GREEDY = "greedy"
     """By greedy steps in the Q field alone."""
     ASTAR_FALLBACK = "astar_fallback"
-    """By greedy steps, or where they are trapped by a search in the order of the Q field."""
+    """By greedy steps; where they are trapped, by a search in the order of the Q field."""
 
 
 Pose: TypeAlias = tuple[float, float, float]  # metres, metres, radians; map frame
@@ -66,7 +66,7 @@ class PathRequest(Generic[Place]):
     switch_threshold: float = field(default=0.0, kw_only=True)
 
     def keeps(self, cost: float, new_cost: float) -> bool:
-        """Return whether a path under way is kept, by its cost and that of a new one."""
+        """Return whether a path under way is kept, by its cost and a new path's."""
         return cost <= (1 + self.switch_threshold) * new_cost * SAME_COST
 
 
@@ -130,31 +130,37 @@ class PoseRequest(PathRequest[Pose]):
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A path, or the reason why there is none. Equal plans may have taken different times.
+    """A path, or the reason why there is none.
+
+    Equal plans may have taken different times.
 
     Parameters
     ----------
     status : PlanStatus
     path : (N, 2) int32
-        The cells from start to goal, every move or simplified segment legal; empty unless the
-        status is SUCCEEDED. It cannot be written to.
+        The cells from start to goal, every move or simplified segment legal; empty
+        unless the status is SUCCEEDED. It cannot be written to.
     method : PlanMethod
         ASTAR_FALLBACK if it was searched for because the greedy steps were trapped.
     move_rule : MoveRule
         The rule under which the moves are legal.
     cost : float, optional
-        What the path costs, its length in each cell times the `GridMap.cost_multiplier`: on a map
-        with costs, if a planner made the plan. On a map of expected times it is in seconds.
+        The cost of the path: the sum over cells of the length in each cell times its
+        `GridMap.cost_multiplier`. Only a planner's plan on a map with costs has it. On a
+        map of expected times it is in seconds.
     goal : (x, y), optional
-        Where the path ends, or would end: the goal asked for, the nearest of several, or the cell
-        to which it moved. None for a rollout, or if no Q field was needed.
+        Where the path ends, or would end: the goal of the request, the nearest of several
+        goals, or the cell to which the goal moved. None for a rollout, or if no Q field
+        was needed.
     extra_cost : float, optional
-        The share by which the rest of the path under way costs more than a new one, if it is kept.
+        If the path under way is kept: the share by which its rest costs more than a new
+        path.
     reason : str
-        The status in words. Without a path it names unknown space, where that is the reason, and
-        what to do.
+        The status in words. If unknown space is the reason why there is no path, it says
+        so, and what to do.
     field_ms, rollout_ms : float
-        How long it took a planner to get the Q field, and the path from it, in milliseconds.
+        How long a planner took for the Q field, and for the path from it, in
+        milliseconds.
     """
 
     status: PlanStatus
@@ -170,12 +176,10 @@ class Plan:
 
     def __post_init__(self) -> None:
         path = self.path
-        if (
-            not isinstance(path, np.ndarray) or path.dtype != np.int32
-        ):  # cells do as well
-            path = numbers("the path", path, between=(-(2**31), 2**31 - 1)).astype(
-                np.int32
-            )
+        if not isinstance(path, np.ndarray) or path.dtype != np.int32:
+            # A sequence of cells is a path, too.
+            limits = (-(2**31), 2**31 - 1)
+            path = numbers("the path", path, between=limits).astype(np.int32)
         if path.size and path.shape[1:] != (2,):
             raise ValueError(f"the path has shape {path.shape}; give (N, 2)")
         path = path.reshape(-1, 2)
@@ -186,7 +190,8 @@ class Plan:
             ("method", PlanMethod),
             ("move_rule", MoveRule),
         ):
-            if type(value := getattr(self, name)) is not kind:
+            value = getattr(self, name)
+            if type(value) is not kind:
                 object.__setattr__(self, name, kind(value))
         if not self.reason:
             object.__setattr__(self, "reason", self.status.value)
@@ -205,8 +210,15 @@ class Plan:
         return hash(self._identity())
 
     def _identity(self) -> tuple[object, ...]:
-        path, costs = self.path.tobytes(), (self.cost, self.extra_cost)
-        return self.status, path, self.method, self.move_rule, costs, self.goal
+        return (
+            self.status,
+            self.path.tobytes(),
+            self.method,
+            self.move_rule,
+            self.cost,
+            self.extra_cost,
+            self.goal,
+        )
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
@@ -221,17 +233,24 @@ class Plan:
 
 @dataclass(frozen=True, eq=False)
 class PosePlan(Plan):
-    """A path for a robot with a body and a heading; its `path` has the cells of the origin."""
+    """A path for a robot with a body and a heading.
 
-    # (N, 3): x, y in metres and yaw in radians, -pi to pi, in the map frame, from start to goal, at
-    # most half a cell apart; empty unless the status is SUCCEEDED.
+    Its `path` has the cells of the origin.
+
+    Parameters
+    ----------
+    poses : (N, 3) float64
+        x, y in metres and yaw in radians, -pi to pi, in the map frame, from start to
+        goal, at most half a cell apart; empty unless the status is SUCCEEDED.
+    driven : float
+        The length of the origin's way in cells, whatever the direction.
+    bound : float
+        The proved ratio of the cost to the least cost: 1.0 if the cost is the least.
+    """
+
     poses: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)))
-    driven: float = (
-        0.0  # the length of the origin's way, in cells, whatever the direction
-    )
-    bound: float = (
-        1.0  # the proved ratio of the cost to the least one, 1.0 when it is the least
-    )
+    driven: float = 0.0
+    bound: float = 1.0
 
     @property
     def length(self) -> float:
@@ -243,22 +262,26 @@ class PosePlan(Plan):
 
 
 def joined(plans: Sequence[Plan]) -> Plan:
-    """Return the plan through several goals: each but the last succeeded, and ends at the next."""
-    first, last = plans[0], plans[-1]
+    """Return the plan through several goals, made of the plans of its legs.
+
+    Each leg except the last succeeded, and ends where the next leg begins.
+    """
+    first = plans[0]
+    last = plans[-1]
     if not last.path.size:
         return last
     searched = any(plan.method is PlanMethod.ASTAR_FALLBACK for plan in plans)
-    whole: Plan = last
+    joined_plan: Plan = last
     if isinstance(last, PosePlan):
         legs = [plan for plan in plans if isinstance(plan, PosePlan)]
-        whole = replace(
+        joined_plan = replace(
             last,
             poses=np.concatenate([legs[0].poses[:1], *(leg.poses[1:] for leg in legs)]),
             driven=sum(leg.driven for leg in legs),
             bound=max(leg.bound for leg in legs),
         )
     return replace(
-        whole,
+        joined_plan,
         path=np.concatenate([first.path[:1], *(plan.path[1:] for plan in plans)]),
         method=PlanMethod.ASTAR_FALLBACK if searched else PlanMethod.GREEDY,
         cost=None if first.cost is None else sum(plan.cost or 0.0 for plan in plans),

@@ -1,7 +1,7 @@
 """Straight segments between cells, and paths of few segments, in compiled code.
 
-A path is made straight by string pulling: cells are left out wherever the one after them
-is seen from the one before. Then the corners that remain are moved while that helps.
+A path is made straight by string pulling: cells are left out wherever the cell after
+them is seen from the cell before. Then the corners are moved while that helps.
 """
 
 import math
@@ -43,9 +43,9 @@ def simplify(
 
     A segment is legal if all cells that it passes through are free; under
     `MoveRule.ROBOT_SAFE` also the cells that it touches at a corner. None of the cells
-    except the last may forbid one of the two actions between whose directions the segment
-    lies. A segment never costs more than the moves that it replaces, so the path keeps
-    away from cells of high cost.
+    except the last may forbid one of the two actions between whose directions the
+    segment lies. A segment never costs more than the moves that it replaces, so the path
+    keeps away from cells of high cost.
 
     Parameters
     ----------
@@ -75,8 +75,8 @@ def straightened(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> Path:
     from_start = _pulled(cells, spent, layers, is_backward=False)
     if not from_start.has_moved_corners or len(cells) > LONG:
         return from_start.cells
-    # From the end, obstacles come in another order: the path may pass them on the better
-    # side.
+    # From the end, obstacles come in another order: the path may pass them on the
+    # better side.
     from_end = _pulled(cells, spent, layers, is_backward=True)
     is_better = from_end.cost * SAME_COST < from_start.cost
     return from_end.cells if is_better else from_start.cells
@@ -148,7 +148,7 @@ def _segment_costs(path: Cells, layers: Layers, legal_from: Float64) -> Float64:
     legal_from : (N,)
         From which share on the segment that ends in each cell must be legal.
     """
-    # With 64 bits, all that is computed from a cell has one type, and numba compiles once.
+    # With 64 bits, all that is computed from a cell has one type: numba compiles once.
     cells = np.array(path, np.int64)
     costs = np.zeros(len(cells))
     _write_costs(cells, legal_from, costs, layers)
@@ -181,15 +181,18 @@ def _is_free(x: int, y: int, layers: Layers) -> bool:
 def segment_cost(
     x: int, y: int, last_x: int, last_y: int, legal_from: float, layers: Layers
 ) -> float:
-    """Return the cost of a segment; infinity unless it is legal from a share of it on."""
+    """Return the cost of a segment; infinity if it is not legal.
+
+    Before the share `legal_from` of it, occupied cells do not count.
+    """
     dx = last_x - x
     dy = last_y - y
     step_x = (dx > 0) - (dx < 0)
     step_y = (dy > 0) - (dy < 0)
     length = _length(abs(dx), abs(dy))
     actions = actions_of_segment(step_x, step_y, abs(dx), abs(dy))
-    # Positions on the segment count from 0 at its first point to `end` at its last point,
-    # in units in which all crossings of edges of cells are whole numbers.
+    # Positions on the segment count from 0 at its first point to `end` at its last
+    # point, in units in which all crossings of edges of cells are whole numbers.
     columns = max(abs(dx), 1)
     rows = max(abs(dy), 1)
     end = 2 * columns * rows
@@ -231,7 +234,7 @@ def segment_cost(
 def _write_costs(
     path: CellArray, legal_from: Float64, costs: Float64, layers: Layers
 ) -> None:
-    """Write the cost of the segment that ends in each cell; infinity outside the map."""
+    """Write the cost of the segment to each cell; infinity outside the map."""
     for index in range(1, path.shape[0]):
         x = path[index - 1, 0]
         y = path[index - 1, 1]
@@ -270,7 +273,7 @@ def _is_right_angle(
 
 @inlined
 def _end_of_equal_moves(path: CellArray, first: int) -> int:
-    """Return the last cell that equal moves lead to from a cell: they are one segment."""
+    """Return the last cell to which equal moves lead: they are one segment."""
     last = path.shape[0] - 1
     dx = path[first + 1, 0] - path[first, 0]
     dy = path[first + 1, 1] - path[first, 1]
@@ -288,7 +291,7 @@ def _end_of_equal_moves(path: CellArray, first: int) -> int:
 def _cost_between(
     path: CellArray, first: int, last: int, is_backward: bool, layers: Layers
 ) -> float:
-    """Return the cost of the segment between two cells of a path, from start to goal."""
+    """Return the cost of the segment between two cells, in the path's direction."""
     begin = last if is_backward else first
     end = first if is_backward else last
     return segment_cost(
@@ -306,8 +309,8 @@ def _pull(
 ) -> int:
     """Keep cells far along a path that are seen from the one before; return how many.
 
-    The cells are moved to the front of `path`, and the costs of the segments that end in
-    them to that of `costs`. A backward path leads from the goal to the start.
+    The cells are moved to the front of `path`, and the costs of the segments that end
+    in them to the front of `costs`. A backward path leads from the goal to the start.
     """
     last = path.shape[0] - 1
     first = 0
@@ -393,7 +396,7 @@ def _move_corners(
 
 @inlined
 def _move_to_next(path: CellArray, costs: Float64, corner: int, layers: Layers) -> bool:
-    """Move a corner onto the next one if that costs no more; return whether it moved."""
+    """Move a corner onto the next one if that costs no more; return if it moved."""
     most = (costs[corner] + costs[corner + 1]) * SAME_COST
     x = path[corner - 1, 0]
     y = path[corner - 1, 1]

@@ -1,4 +1,4 @@
-"""Says why a plan has no path: where unknown space is the reason, and of several goals each."""
+"""Says why a plan has no path: because of unknown space, and for each of several goals."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ MOST_NAMED = 5  # goals
 
 
 def has_more_to_say(grid: GridMap, plan: Plan, several: bool) -> bool:
-    """Return whether to look for more than the status: unknown space, or each goal's own reason."""
+    """Return whether there may be more to say than the status.
+
+    That is unknown space as the reason, or the reason of each of several goals.
+    """
     of_goals = PlanStatus.GOAL_OUTSIDE_MAP, PlanStatus.GOAL_OCCUPIED, PlanStatus.NO_PATH
     possible = PlanStatus.START_OCCUPIED, PlanStatus.GOAL_OCCUPIED, PlanStatus.NO_PATH
     return plan.status in (of_goals if several else ()) or (
@@ -33,7 +36,10 @@ def has_more_to_say(grid: GridMap, plan: Plan, several: bool) -> bool:
 
 
 def reason_of(request: PlanRequest, plan: Plan) -> str:
-    """Return why a plan has no path: the status in words, or unknown space and what to do."""
+    """Return why a plan has no path, in words.
+
+    It is the status, or unknown space with what to do.
+    """
     grid = request.grid
     status: str = plan.status.value
     if plan.status is PlanStatus.START_OCCUPIED:
@@ -81,7 +87,7 @@ def goal_in_words(grid: GridMap, cell: Cell) -> str:
 
 
 def place_in_words(grid: GridMap, cell: Cell) -> str:
-    """Return how a cell lies that unknown space closes; empty if it is free or an obstacle is."""
+    """Return how a cell lies in or at unknown space; empty if that is not what closes it."""
     if grid.unknown is None or not grid.contains(cell) or grid.is_free(cell):
         return ""
     x, y = cell
@@ -131,9 +137,12 @@ def reason_of_goals(places: Sequence[str], through: str) -> str:
 
 
 def _grids_without_unknown(grid: GridMap) -> Iterator[GridMap]:
-    """Yield maps with free unknown cells: what is possible at most, and what is true."""
+    """Yield maps whose unknown cells are free.
+
+    On the first map, only obstacles count; on the last map, the body's radius, too.
+    """
     if grid.body_radius > 0 and grid.obstacles is not None and grid.unknown is not None:
-        # To look only at obstacles is quick, and often shows that there is no path either.
+        # The first map is quick to make, and often shows that there is no path.
         obstacles = grid.obstacles & ~grid.unknown
         yield grid.with_layers(
             occupancy=obstacles, obstacles=obstacles, cost=None, unknown=None
