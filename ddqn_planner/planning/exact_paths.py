@@ -1,24 +1,25 @@
-"""Paths in metres: from the exact start, along the cells of a plan, to the exact goal."""
+"""Paths in metres: from an exact start, along the cells of a plan, to an exact goal."""
 
 import math
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.compiled import in_place
+from ddqn_planner.compiled import in_place, inlined
 from ddqn_planner.grid import GridMap, MoveRule
-from ddqn_planner.grid.layers import actions_of_segment
+from ddqn_planner.grid.layers import Layers, actions_of_segment
 from ddqn_planner.grid.moves import positions
 from ddqn_planner.planning.segments import Path
 
-Float64 = NDArray[np.float64]
-Point = tuple[float, float]
+Float64: TypeAlias = NDArray[np.float64]
+CellXY: TypeAlias = NDArray[np.int32]  # (2,)
+Point: TypeAlias = tuple[float, float]
 
-# Cells: points so near to each other are one point, and a line so near to a cell touches
-# it. It is more than the rounding between metres and cells, also on maps far from their
-# frame's origin.
+# Cells: points so near to each other are one point, and a line so near to a cell
+# touches it. It is more than the rounding between metres and cells, also on maps far
+# from their frame's origin.
 MARGIN: Final = 1e-6
 
 
@@ -52,9 +53,9 @@ def exact_path(
     Returns
     -------
     ExactPath
-        Where a straight piece from or to an exact point would touch an occupied cell, or
-        leave a cell as the cell forbids, the path also passes the centre of that point's
-        cell.
+        Where a straight piece from or to an exact point would touch an occupied cell,
+        or leave a cell as the cell forbids, the path also passes the centre of that
+        point's cell.
     """
     begin = _point_in(grid, legs[0][0], points[0])
     parts = [begin]
@@ -86,7 +87,7 @@ def dense(points: Float64, spacing: float) -> tuple[Float64, NDArray[np.int64]]:
     return dense_points, position[:-1].astype(np.int64)
 
 
-def _point_in(grid: GridMap, cell: NDArray[np.int32], point: Point) -> Float64:
+def _point_in(grid: GridMap, cell: CellXY, point: Point) -> Float64:
     """Return a point (2,) if it lies in a cell, else the cell's centre."""
     x, y = cell.tolist()
     return np.array(
@@ -104,10 +105,12 @@ def _corners_between(path: Path, grid: GridMap, begin: Float64, end: Float64) ->
 
     The points lie in the first and in the last cell of the leg.
     """
-    first, last = path[0], path[-1]
-    is_at_first, is_at_last = _is_near(begin, first), _is_near(end, last)
     if len(path) == 1:
         return path[:0]
+    first = path[0]
+    last = path[-1]
+    is_at_first = _is_near(begin, first)
+    is_at_last = _is_near(end, last)
     if len(path) == 2:
         # Between two centres it is the plan's own segment.
         if (is_at_first and is_at_last) or _is_clear(begin, end, grid):
@@ -119,62 +122,81 @@ def _corners_between(path: Path, grid: GridMap, begin: Float64, end: Float64) ->
     return path[int(skips_first) : len(path) - int(skips_last)]
 
 
-def _is_near(point: Float64, cell: NDArray[np.int32]) -> bool:
+def _is_near(point: Float64, cell: CellXY) -> bool:
     return bool(np.abs(point - cell).max() < MARGIN)
 
 
-def _is_clear(begin: Any, end: Any, grid: GridMap) -> bool:
+def _is_clear(begin: Float64 | CellXY, end: Float64 | CellXY, grid: GridMap) -> bool:
     """Return whether a straight piece touches only free cells, and leaves them legally.
 
     The cells of its ends need not be free: a robot may leave an obstacle.
     """
     layers = grid.layers(MoveRule.ROBOT_SAFE)
-    (x, y), (to_x, to_y) = begin.tolist(), end.tolist()
-    return _touches_none(
-        float(x), float(y), float(to_x), float(to_y), layers.occupancy, layers.forbidden
-    )
+    x, y = begin.tolist()
+    last_x, last_y = end.tolist()
+    return _touches_none(float(x), float(y), float(last_x), float(last_y), layers)
+
+
+@inlined
+def _cell_at(position: float) -> int:
+    """Return the column or row in which a position lies."""
+    return math.floor(position + 0.5)
+
+
+@inlined
+def _first_touched(lowest: float) -> int:
+    """Return the first column or row that is touched from a position on."""
+    return math.floor(lowest + 0.5 - MARGIN)
+
+
+@inlined
+def _last_touched(highest: float) -> int:
+    """Return the last column or row that is touched up to a position."""
+    return math.floor(highest + 0.5 + MARGIN)
 
 
 @in_place
 def _touches_none(
-    x: float, y: float, to_x: float, to_y: float, occupancy: Any, forbidden: Any
+    x: float, y: float, last_x: float, last_y: float, layers: Layers
 ) -> bool:
     """Return whether no cell is in the way of a piece, see `_is_clear`."""
-    height, width = occupancy.shape
-    column = math.floor(x + 0.5)
-    row = math.floor(y + 0.5)
-    to_column = math.floor(to_x + 0.5)
-    to_row = math.floor(to_y + 0.5)
-    dx = to_x - x
-    dy = to_y - y
+    dx = last_x - x
+    dy = last_y - y
     step_x = (dx > MARGIN) - (dx < -MARGIN)
     step_y = (dy > MARGIN) - (dy < -MARGIN)
     actions = actions_of_segment(step_x, step_y, abs(dx), abs(dy))
-    left = min(x, to_x)
-    right = max(x, to_x)
-    bottom = min(y, to_y)
-    top = max(y, to_y)
+    left = min(x, last_x)
+    right = max(x, last_x)
     slope = dy / dx if step_x != 0 else 0.0
-    for at_x in range(
-        math.floor(left + 0.5 - MARGIN), math.floor(right + 0.5 + MARGIN) + 1
-    ):
+    for column in range(_first_touched(left), _last_touched(right) + 1):
         # The part of the piece within this column, from one edge to the other.
-        low, high = bottom, top
+        begin_y = y
+        end_y = last_y
         if step_x != 0:
-            entered = y + (max(at_x - 0.5 - MARGIN, left) - x) * slope
-            left_at = y + (min(at_x + 0.5 + MARGIN, right) - x) * slope
-            low, high = min(entered, left_at), max(entered, left_at)
-        for at_y in range(
-            math.floor(low + 0.5 - MARGIN), math.floor(high + 0.5 + MARGIN) + 1
-        ):
-            is_inside = 0 <= at_x < width and 0 <= at_y < height
-            if not is_inside or (at_x == to_column and at_y == to_row):
-                continue
-            if forbidden.size and forbidden[at_y, at_x] & actions:
-                return False
-            if occupancy[at_y, at_x] and not (at_x == column and at_y == row):
+            begin_y = y + (max(column - 0.5 - MARGIN, left) - x) * slope
+            end_y = y + (min(column + 0.5 + MARGIN, right) - x) * slope
+        low = min(begin_y, end_y)
+        high = max(begin_y, end_y)
+        for row in range(_first_touched(low), _last_touched(high) + 1):
+            is_first = column == _cell_at(x) and row == _cell_at(y)
+            is_last = column == _cell_at(last_x) and row == _cell_at(last_y)
+            if _is_in_the_way(column, row, is_first, is_last, actions, layers):
                 return False
     return True
+
+
+@inlined
+def _is_in_the_way(
+    column: int, row: int, is_first: bool, is_last: bool, actions: int, layers: Layers
+) -> bool:
+    """Return whether a cell that a piece touches is occupied or forbids actions."""
+    height, width = layers.occupancy.shape
+    is_inside = 0 <= column < width and 0 <= row < height
+    if not is_inside or is_last:
+        return False
+    if layers.forbidden.size > 0 and layers.forbidden[row, column] & actions:
+        return True
+    return bool(layers.occupancy[row, column]) and not is_first
 
 
 def _length(points: Float64, grid: GridMap) -> float:

@@ -30,20 +30,20 @@ def invalid_poses(
 ) -> NDArray[np.int64]:
     """Return the indices of the poses that are not free, from the robot on.
 
-    The first pose checked is the one nearest to the robot. Cells between two poses do not
-    count.
+    The first pose checked is the one nearest to the robot. Cells between two poses do
+    not count.
 
     Parameters
     ----------
     poses : (N, 3)
-        Metres and radians in the map frame, one pose or more. The headings count only with
-        a body.
+        Metres and radians in the map frame, one pose or more. The headings count only
+        with a body.
     grid : GridMap
     robot : (x, y), optional
         Where the robot is, in metres. By default all poses count.
     body : pair of arrays, optional
-        The points of a body, see `points_of`: then only obstacles count, below all of the
-        body. By default the cell of a pose must be free.
+        The points of a body, see `points_of`: then only obstacles count, below all of
+        the body. By default the cell of a pose must be free.
     unknown : (H, W) bool, optional
         Cells that count as obstacles too.
     max_cost : int
@@ -51,9 +51,9 @@ def invalid_poses(
     distance : float
         Metres along the path that are looked at; 0 or less means all.
     clearing_radius : float
-        A disc that stands in a cell which is not free may leave it through cells that are
-        not free. If that cell is an obstacle, the disc may pass obstacles within so many
-        cells of it.
+        A disc that stands in a cell which is not free may leave it through cells that
+        are not free. If that cell is an obstacle, the disc may pass obstacles within so
+        many cells of it.
     """
     first, end = _part_to_check(poses, robot, distance)
     closed = _closed_cells(grid, body is not None, unknown, max_cost)
@@ -61,10 +61,12 @@ def invalid_poses(
         path = in_cells(poses, grid)
         points = np.concatenate(body)
         bits = closed.view(np.uint8)
-        numbers = range(first, end)
-        return np.array(
-            [n for n in numbers if touches(path[n : n + 1], points, bits)], np.int64
-        )
+        invalid = [
+            number
+            for number in range(first, end)
+            if touches(path[number : number + 1], points, bits)
+        ]
+        return np.array(invalid, np.int64)
     cells = np.floor(
         grid.in_cells(poses[first:end, :2])
     )  # float64: they may be far away
@@ -80,11 +82,16 @@ def invalid_poses(
 def _part_to_check(poses: Float64, robot: Any, distance: float) -> tuple[int, int]:
     """Return the first pose to check, and the one after the last."""
     x, y, _ = poses.T
-    first = 0 if robot is None else int(np.hypot(x - robot[0], y - robot[1]).argmin())
+    first = 0
+    if robot is not None:
+        distance_to_robot = np.hypot(x - robot[0], y - robot[1])  # (N,)
+        first = int(distance_to_robot.argmin())
     if not distance > 0:
         return first, len(poses)
-    ahead = np.cumsum(np.hypot(np.diff(x[first:]), np.diff(y[first:])))
-    return first, first + 1 + int(np.count_nonzero(ahead <= distance))
+    steps = np.hypot(np.diff(x[first:]), np.diff(y[first:]))
+    distance_from_first = np.cumsum(steps)  # of each pose after it
+    poses_ahead = int(np.count_nonzero(distance_from_first <= distance))
+    return first, first + 1 + poses_ahead
 
 
 def _closed_cells(

@@ -36,11 +36,12 @@ class PlanMethod(Choice):
     GREEDY = "greedy"
     """By greedy steps in the Q field alone."""
     ASTAR_FALLBACK = "astar_fallback"
-    """By greedy steps; where they are trapped, by a search in the order of the Q field."""
+    """By greedy steps; where these are trapped, by a search in the Q field's order."""
 
 
 Pose: TypeAlias = tuple[float, float, float]  # metres, metres, radians; map frame
 Place = TypeVar("Place", Cell, Pose)
+Number = TypeVar("Number", bound=np.generic)
 
 
 @dataclass(frozen=True)
@@ -146,18 +147,18 @@ class Plan:
         The rule under which the moves are legal.
     cost : float, optional
         The cost of the path: the sum over cells of the length in each cell times its
-        `GridMap.cost_multiplier`. Only a planner's plan on a map with costs has it. On a
-        map of expected times it is in seconds.
+        `GridMap.cost_multiplier`. Only a planner's plan on a map with costs has it. On
+        a map of expected times it is in seconds.
     goal : (x, y), optional
-        Where the path ends, or would end: the goal of the request, the nearest of several
-        goals, or the cell to which the goal moved. None for a rollout, or if no Q field
-        was needed.
+        Where the path ends, or would end: the goal of the request, the nearest of
+        several goals, or the cell to which the goal moved. None for a rollout, or if no
+        Q field was needed.
     extra_cost : float, optional
         If the path under way is kept: the share by which its rest costs more than a new
         path.
     reason : str
-        The status in words. If unknown space is the reason why there is no path, it says
-        so, and what to do.
+        The status in words. If unknown space is the reason why there is no path, it
+        says so, and what to do.
     field_ms, rollout_ms : float
         How long a planner took for the Q field, and for the path from it, in
         milliseconds.
@@ -266,25 +267,32 @@ def joined(plans: Sequence[Plan]) -> Plan:
 
     Each leg except the last succeeded, and ends where the next leg begins.
     """
-    first = plans[0]
     last = plans[-1]
     if not last.path.size:
         return last
-    searched = any(plan.method is PlanMethod.ASTAR_FALLBACK for plan in plans)
-    joined_plan: Plan = last
-    if isinstance(last, PosePlan):
-        legs = [plan for plan in plans if isinstance(plan, PosePlan)]
-        joined_plan = replace(
-            last,
-            poses=np.concatenate([legs[0].poses[:1], *(leg.poses[1:] for leg in legs)]),
-            driven=sum(leg.driven for leg in legs),
-            bound=max(leg.bound for leg in legs),
-        )
+    has_costs = plans[0].cost is not None
+    was_searched = PlanMethod.ASTAR_FALLBACK in {plan.method for plan in plans}
     return replace(
-        joined_plan,
-        path=np.concatenate([first.path[:1], *(plan.path[1:] for plan in plans)]),
-        method=PlanMethod.ASTAR_FALLBACK if searched else PlanMethod.GREEDY,
-        cost=None if first.cost is None else sum(plan.cost or 0.0 for plan in plans),
+        _with_poses_of(plans) if isinstance(last, PosePlan) else last,
+        path=_end_to_end([plan.path for plan in plans]),
+        method=PlanMethod.ASTAR_FALLBACK if was_searched else PlanMethod.GREEDY,
+        cost=sum(plan.cost or 0.0 for plan in plans) if has_costs else None,
         field_ms=sum(plan.field_ms for plan in plans),
         rollout_ms=sum(plan.rollout_ms for plan in plans),
     )
+
+
+def _with_poses_of(plans: Sequence[Plan]) -> PosePlan:
+    """Return the last plan with the poses of all plans."""
+    legs = [plan for plan in plans if isinstance(plan, PosePlan)]
+    return replace(
+        legs[-1],
+        poses=_end_to_end([leg.poses for leg in legs]),
+        driven=sum(leg.driven for leg in legs),
+        bound=max(leg.bound for leg in legs),
+    )
+
+
+def _end_to_end(legs: Sequence[NDArray[Number]]) -> NDArray[Number]:
+    """Return the rows of legs that begin with the last row of the leg before."""
+    return np.concatenate([legs[0][:1], *(leg[1:] for leg in legs)])

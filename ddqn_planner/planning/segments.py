@@ -44,8 +44,8 @@ def simplify(
     A segment is legal if all cells that it passes through are free; under
     `MoveRule.ROBOT_SAFE` also the cells that it touches at a corner. None of the cells
     except the last may forbid one of the two actions between whose directions the
-    segment lies. A segment never costs more than the moves that it replaces, so the path
-    keeps away from cells of high cost.
+    segment lies. A segment never costs more than the moves that it replaces, so the
+    path keeps away from cells of high cost.
 
     Parameters
     ----------
@@ -203,26 +203,26 @@ def segment_cost(
     weighted_length = 0.0  # each cell's part of the segment times the cell's multiplier
     costs_differ = has_costs(layers)
     while position < end:
-        until = min(next_column, next_row, end)  # where the segment leaves the cell
+        cell_end = min(next_column, next_row, end)  # where the segment leaves the cell
         column = np.uint64(x)  # unsigned: no index counts from the end
         row = np.uint64(y)
         is_blocked = layers.occupancy[row, column]
-        if layers.forbidden.size > 0 and until < end:
+        if layers.forbidden.size > 0 and cell_end < end:
             is_blocked |= (layers.forbidden[row, column] & actions) != 0
-        is_at_corner = next_column == next_row and until < end
+        is_at_corner = next_column == next_row and cell_end < end
         if is_at_corner and not layers.cuts_corners:
             is_blocked |= layers.occupancy[row, np.uint64(x + step_x)]
             is_blocked |= layers.occupancy[np.uint64(y + step_y), column]
-        if is_blocked and until > first_legal:
+        if is_blocked and cell_end > first_legal:
             return np.inf
         if costs_differ:
             multiplier = multiplier_at(x, y, np.float64(1), layers)
-            weighted_length += (until - position) * multiplier
-        position = until
-        if next_column == until:
+            weighted_length += (cell_end - position) * multiplier
+        position = cell_end
+        if next_column == cell_end:
             x += step_x
             next_column += 2 * rows
-        if next_row == until:
+        if next_row == cell_end:
             y += step_y
             next_row += 2 * columns
     if costs_differ:
@@ -247,7 +247,7 @@ def _write_costs(
 
 @inlined
 def _is_right_angle(
-    path: CellArray, before: int, corner: int, after: int, layers: Layers
+    path: CellArray, first: int, corner: int, last: int, layers: Layers
 ) -> bool:
     """Return whether a corner is a right angle around an occupied cell, without costs.
 
@@ -257,17 +257,17 @@ def _is_right_angle(
         return False
     x = path[corner, 0]
     y = path[corner, 1]
-    is_vertical_first = path[before, 0] == x
-    is_vertical_last = path[after, 0] == x
-    is_horizontal_first = path[before, 1] == y
-    is_horizontal_last = path[after, 1] == y
-    if not (is_vertical_first or is_vertical_last):
-        return False
-    if not (is_horizontal_first or is_horizontal_last):
+    first_dx = path[first, 0] - x
+    first_dy = path[first, 1] - y
+    last_dx = path[last, 0] - x
+    last_dy = path[last, 1] - y
+    has_vertical_side = first_dx == 0 or last_dx == 0
+    has_horizontal_side = first_dy == 0 or last_dy == 0
+    if not (has_vertical_side and has_horizontal_side):
         return False
     # The cell between the two sides of the angle.
-    dx = path[before, 0] + path[after, 0] - 2 * x
-    dy = path[before, 1] + path[after, 1] - 2 * y
+    dx = first_dx + last_dx
+    dy = first_dy + last_dy
     return bool(layers.occupancy[y + (dy > 0) - (dy < 0), x + (dx > 0) - (dx < 0)])
 
 
@@ -397,17 +397,17 @@ def _move_corners(
 @inlined
 def _move_to_next(path: CellArray, costs: Float64, corner: int, layers: Layers) -> bool:
     """Move a corner onto the next one if that costs no more; return if it moved."""
-    most = (costs[corner] + costs[corner + 1]) * SAME_COST
+    highest_cost = (costs[corner] + costs[corner + 1]) * SAME_COST
     x = path[corner - 1, 0]
     y = path[corner - 1, 1]
     next_x = path[corner + 1, 0]
     next_y = path[corner + 1, 1]
-    if _length(abs(next_x - x), abs(next_y - y)) >= most:
+    if _length(abs(next_x - x), abs(next_y - y)) >= highest_cost:
         return False
     if not _is_free(next_x, next_y, layers):
         return False
     cost = segment_cost(x, y, next_x, next_y, 0.0, layers)
-    if cost >= most:
+    if cost >= highest_cost:
         return False
     path[corner, 0] = next_x
     path[corner, 1] = next_y

@@ -1,10 +1,12 @@
-"""Says why a plan has no path: because of unknown space, and for each of several goals."""
+"""Says why a plan has no path: unknown space, and the reason of each goal."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Final
+
+import numpy as np
 
 from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.grid.boxes import Box, wider
@@ -22,17 +24,28 @@ MAYBE_THROUGH_UNKNOWN_SPACE = "but a path may lead through unknown space"
 
 MOST_NAMED = 5  # goals
 
+# Of several goals, each may have a reason of its own.
+DIFFERS_BY_GOAL: Final = (
+    PlanStatus.GOAL_OUTSIDE_MAP,
+    PlanStatus.GOAL_OCCUPIED,
+    PlanStatus.NO_PATH,
+)
+# Unknown space may be the reason.
+POSSIBLY_UNKNOWN: Final = (
+    PlanStatus.START_OCCUPIED,
+    PlanStatus.GOAL_OCCUPIED,
+    PlanStatus.NO_PATH,
+)
 
-def has_more_to_say(grid: GridMap, plan: Plan, several: bool) -> bool:
+
+def has_more_to_say(grid: GridMap, plan: Plan, has_several_goals: bool) -> bool:
     """Return whether there may be more to say than the status.
 
     That is unknown space as the reason, or the reason of each of several goals.
     """
-    of_goals = PlanStatus.GOAL_OUTSIDE_MAP, PlanStatus.GOAL_OCCUPIED, PlanStatus.NO_PATH
-    possible = PlanStatus.START_OCCUPIED, PlanStatus.GOAL_OCCUPIED, PlanStatus.NO_PATH
-    return plan.status in (of_goals if several else ()) or (
-        grid.unknown is not None and plan.status in possible
-    )
+    if has_several_goals and plan.status in DIFFERS_BY_GOAL:
+        return True
+    return grid.unknown is not None and plan.status in POSSIBLY_UNKNOWN
 
 
 def reason_of(request: PlanRequest, plan: Plan) -> str:
@@ -71,8 +84,8 @@ def _leads_through_unknown_space(request: PlanRequest) -> bool:
         goals = tuple(
             sorted({goal for goal in request.goals if possible.is_free(goal)})
         )
-        found = way_and_ends(replace(request, grid=possible), goals)
-        if isinstance(found, PlanStatus):
+        outcome = way_and_ends(replace(request, grid=possible), goals)
+        if isinstance(outcome, PlanStatus):
             return False
     return True
 
@@ -87,7 +100,7 @@ def goal_in_words(grid: GridMap, cell: Cell) -> str:
 
 
 def place_in_words(grid: GridMap, cell: Cell) -> str:
-    """Return how a cell lies in or at unknown space; empty if that is not what closes it."""
+    """Return how a cell lies that unknown space closes; empty for all other cells."""
     if grid.unknown is None or not grid.contains(cell) or grid.is_free(cell):
         return ""
     x, y = cell
@@ -96,13 +109,15 @@ def place_in_words(grid: GridMap, cell: Cell) -> str:
     if grid.obstacles is None or grid.is_obstacle(cell) or grid.body_radius == 0:
         return ""
     cells = grid.body_radius * (1 - ROUNDING) / grid.resolution
-    rows, columns = wider(
-        Box(slice(y, y + 1), slice(x, x + 1)), int(cells) + 1, grid.occupancy.shape
-    )
-    obstacles = grid.obstacles[rows, columns] & ~grid.unknown[rows, columns]
-    for row, column in zip(*obstacles.nonzero(), strict=True):
-        if math.hypot(row + rows.start - y, column + columns.start - x) < cells:
-            return ""
+    box_of_cell = Box(slice(y, y + 1), slice(x, x + 1))
+    box = wider(box_of_cell, int(cells) + 1, grid.occupancy.shape)
+    is_obstacle = grid.obstacles[box] & ~grid.unknown[box]
+    rows, columns = is_obstacle.nonzero()
+    distances = np.hypot(
+        rows + box.rows.start - y, columns + box.columns.start - x
+    )  # to each obstacle in the box
+    if (distances < cells).any():
+        return ""
     return "is nearer to unknown space than the robot's body allows"
 
 
@@ -112,19 +127,16 @@ def reason_of_goals(places: Sequence[str], through: str) -> str:
     Parameters
     ----------
     places : sequence of str
-        Why no path can end at each goal; empty for a goal to which none leads.
+        Why no path can end at each goal; empty for a goal to which no path leads.
     through : str
-        What is said of a path through unknown space; empty if there is none.
+        The words for a path through unknown space; empty if there is no such path.
     """
     is_unknown = [UNKNOWN_SPACE in place for place in places]
-    # Of many, those that the remedy is for are named first of all.
-    named = sorted(range(len(places)), key=lambda index: not is_unknown[index])[
-        :MOST_NAMED
-    ]
-    reasons = [
-        f"goal {index + 1} {places[index]}" for index in sorted(named) if places[index]
-    ]
-    cut_off = [str(index + 1) for index in sorted(named) if not places[index]]
+    # Of many goals, those in unknown space are named first, as the remedy is for them.
+    unknown_first = sorted(range(len(places)), key=lambda index: not is_unknown[index])
+    named = sorted(unknown_first[:MOST_NAMED])
+    reasons = [f"goal {index + 1} {places[index]}" for index in named if places[index]]
+    cut_off = [str(index + 1) for index in named if not places[index]]
     if cut_off:
         goals = "goals" if len(cut_off) > 1 else "goal"
         reasons.append(f"no path leads to {goals} {', '.join(cut_off)}")
