@@ -63,32 +63,32 @@ class Declared(NamedTuple):
 
         A whole number is a number, and 65.0 is 65. A choice may have capitals and blanks around it.
         """
-        kind = type(self.default)
-        if isinstance(value, array):  # what ROS makes of a list of numbers
+        default_type = type(self.default)
+        if isinstance(value, array):  # ROS makes it of a list of numbers
             value = value.tolist()
-        if kind is list:
+        if default_type is list:
             return self._read_names(name, value)
-        if kind is float and type(value) is int:
+        if default_type is float and type(value) is int:
             value = float(value)
-        if kind is int and type(value) is float and value.is_integer():
+        if default_type is int and type(value) is float and value.is_integer():
             value = int(value)
-        if type(value) is not kind:
+        if type(value) is not default_type:
             raise ValueError(f"{name} is {self._shown(value)}; give {self._wanted}")
         if isinstance(self.allowed, tuple):
             return self._read_number(name, value, *self.allowed)
         if isinstance(self.allowed, list):
-            choice = value.strip().lower()
-            if choice in self.replaced:
-                today = self.replaced[choice]
-                raise ValueError(f"{name} {choice} is gone; give {today}")
-            if choice not in self.allowed:
-                choices = ", ".join(choice or "''" for choice in self.allowed)
-                raise ValueError(f"{name} is {value!r}; give one of {choices}")
-            return choice
+            return self._read_choice(name, value, self.allowed)
         if self.allowed == NOT_EMPTY and not value.strip():
-            what = self.description[0].lower() + self.description[1:]
-            raise ValueError(f"{name} is {value!r}; name {what}")
+            words = self.description[0].lower() + self.description[1:]
+            raise ValueError(f"{name} is {value!r}; name {words}")
         return value
+
+    def _read_choice(self, name: str, value: str, choices: list[str]) -> str:
+        choice = value.strip().lower()
+        if choice in choices:
+            return choice
+        names = ", ".join(choice or "''" for choice in choices)
+        raise ValueError(f"{name} is {value!r}; give one of {names}")
 
     def _read_number(self, name: str, value: Any, low: float, high: float) -> Any:
         if low <= value <= high:

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
@@ -28,14 +28,11 @@ from ddqn_planner.nodes.diagnostics import Diagnostics
 from ddqn_planner.nodes.outcome import RequestError
 from ddqn_planner.nodes.ros_packages import apt_install
 
-READ_PERIOD, TF_DEPTH = (
-    0.5,
-    1000,
-)  # seconds between two reads, and messages that come meanwhile
-AGE_OF_FIRST_POSE = (
-    1.0  # seconds that a pose may be older than the first transform heard
-)
-SILENCE = 2.0  # seconds after which odometry that comes no more does not tell where the robot is
+READ_PERIOD = 0.5  # seconds between two reads of TF
+TF_DEPTH = 1000  # messages that come between two reads
+# Seconds that a pose may be older than the first transform received.
+AGE_OF_FIRST_POSE = 1.0
+SILENCE = 2.0  # seconds without odometry after which the robot's pose is unknown
 REMEDY = f"; or install tf2_ros ({apt_install('tf2-ros-py')}), which transforms it"
 NEWEST = Time()
 TYPES = {
@@ -129,6 +126,17 @@ class Frames:
         """Return where a frame's origin is now; ValueError if TF does not know it of now."""
         return transformed(PoseStamped(), self._lookup(map_frame, frame))
 
+    def _age_problem(self, transform: TransformStamped) -> str:
+        """Return why the newest transform is too old, or too new; empty if it is not."""
+        stamp = Time.from_msg(transform.header.stamp)
+        age = (self._node.get_clock().now() - stamp).nanoseconds / 1e9
+        limit = self._tolerance()
+        # Static transforms have the stamp 0, and are never too old.
+        if not stamp.nanoseconds or abs(age) <= limit:
+            return ""
+        words = f"{age:.3g} s old" if age > 0 else f"{-age:.3g} s in the future"
+        return f"the newest is {words}, more than transform_tolerance, {limit:g} s"
+
     def _lookup(
         self, target: str, source: str, stamp: Time = NEWEST
     ) -> TransformStamped:
@@ -136,28 +144,20 @@ class Frames:
         self.listen()
         self._read()
         try:
-            found = self._buffer.lookup_transform(target, source, stamp)
-            of = Time.from_msg(found.header.stamp)
-            age, limit = (
-                (self._node.get_clock().now() - of).nanoseconds / 1e9,
-                self._tolerance(),
-            )
-            # Static transforms have the stamp 0, and are never too old.
-            if not of.nanoseconds or stamp.nanoseconds or abs(age) <= limit:
-                return found
-            when = f"{age:.3g} s old" if age > 0 else f"{-age:.3g} s in the future"
-            why = f"the newest is {when}, more than transform_tolerance, {limit:g} s"
+            transform = self._buffer.lookup_transform(target, source, stamp)
+            problem = "" if stamp.nanoseconds else self._age_problem(transform)
+            if not problem:
+                return transform
         except self._tf2_ros.TransformException as error:
             if stamp.nanoseconds:
                 newest = self._lookup(target, source)
                 later = (Time.from_msg(newest.header.stamp) - stamp).nanoseconds / 1e9
-                if (
-                    0 < later <= AGE_OF_FIRST_POSE
-                ):  # the pose is from before the node listened
+                # The pose may be from before the node began to listen.
+                if 0 < later <= AGE_OF_FIRST_POSE:
                     return newest
-            why = "; ".join([str(error), *self._checked.refused.values()])
+            problem = "; ".join([str(error), *self._checked.refused.values()])
         raise ValueError(
-            f"no transform leads from {source!r} to {target!r} ({why}); publish one"
+            f"no transform leads from {source!r} to {target!r} ({problem}); publish one"
         )
 
     def listen(self) -> None:
@@ -196,20 +196,19 @@ class Frames:
 
 
 def transform_problem(stamped: TransformStamped) -> str:
-    """Return what is wrong with the numbers of a transform, and what to do; empty if nothing is."""
-    of_frames = (
-        f"the transform from {stamped.child_frame_id!r} to {stamped.header.frame_id!r}"
-    )
+    """Return what is wrong with a transform's numbers, and a remedy; empty if good."""
+    frame, child = stamped.header.frame_id, stamped.child_frame_id
+    name = f"the transform from {child!r} to {frame!r}"
     turn = rotation(stamped.transform.rotation)
     if not turn.is_rounded:
         numbers = ", ".join(f"{number:.6g}" for number in turn)
-        wrong = f"{of_frames} has the quaternion ({numbers}) of norm {turn.norm:.6g}"
+        wrong = f"{name} has the quaternion ({numbers}) of norm {turn.norm:.6g}"
         return f"{wrong}; publish one of norm 1"
     shift = stamped.transform.translation
     metres = shift.x, shift.y, shift.z
     if not all(map(math.isfinite, metres)):
         numbers = ", ".join(f"{number:.6g}" for number in metres)
-        return f"{of_frames} has the translation ({numbers}); publish finite numbers"
+        return f"{name} has the translation ({numbers}); publish finite numbers"
     return ""
 
 
@@ -221,28 +220,39 @@ def transformed(stamped: PoseStamped, transform: TransformStamped) -> PoseStampe
     wrong = transform_problem(transform)
     if wrong:
         raise ValueError(wrong)
-    turn = rotation(transform.transform.rotation)
-    turn = turn.normalised()
+    turn = rotation(transform.transform.rotation).normalised()
+    position = stamped.pose.position
+    translation = transform.transform.translation
+    turned_position = _turned(turn, Vector(position.x, position.y, position.z))
     facing = rotation(stamped.pose.orientation).normalised()
-    position, shift = stamped.pose.position, transform.transform.translation
-    x, y, _ = _turned(turn, (position.x, position.y, position.z))
-    ahead_x, ahead_y, _ = _turned(turn, _turned(facing, (1.0, 0.0, 0.0)))
+    direction = _turned(turn, _turned(facing, Vector(1.0, 0.0, 0.0)))
     result = PoseStamped(header=transform.header)
-    result.pose.position.x, result.pose.position.y = x + shift.x, y + shift.y
-    result.pose.orientation = quaternion(math.atan2(ahead_y, ahead_x))
+    result.pose.position.x = turned_position.x + translation.x
+    result.pose.position.y = turned_position.y + translation.y
+    result.pose.orientation = quaternion(math.atan2(direction.y, direction.x))
     return result
 
 
-def _turned(turn: Rotation, point: tuple[float, ...]) -> tuple[float, ...]:
-    """Return p + 2 r × (r × p + w p), where r is the quaternion's vector and w its real part."""
+class Vector(NamedTuple):
+    """A vector in space."""
+
+    x: float
+    y: float
+    z: float
+
+
+def _turned(turn: Rotation, point: Vector) -> Vector:
+    """Return a point p turned by a unit quaternion (r, w): p + 2 r × (r × p + w p)."""
     x, y, z, w = turn
-    px, py, pz = point
-    a, b, c = (
-        y * pz - z * py + w * px,
-        z * px - x * pz + w * py,
-        x * py - y * px + w * pz,
+    # (a, b, c) is r × p + w p.
+    a = y * point.z - z * point.y + w * point.x
+    b = z * point.x - x * point.z + w * point.y
+    c = x * point.y - y * point.x + w * point.z
+    return Vector(
+        point.x + 2 * (y * c - z * b),
+        point.y + 2 * (z * a - x * c),
+        point.z + 2 * (x * b - y * a),
     )
-    return px + 2 * (y * c - z * b), py + 2 * (z * a - x * c), pz + 2 * (x * b - y * a)
 
 
 def listen(
@@ -341,19 +351,27 @@ class Places(Frames):
                     f"the start is unknown: {error}, or set robot_frame or start_source"
                 )
                 raise RequestError("NO_START", reason, self.began) from None
-        topic, is_set = self._subscription.topic_name, self.topic == "initialpose"
-        problem, since = f"nothing came on {topic} in the map's frame", self._heard_from
-        if is_set:
-            problem, since = f"set it on {topic} (in RViz: 2D Pose Estimate)", -math.inf
-        if self._pose is not None:  # its stamp may be that of another clock
-            silent = (self._node.get_clock().now() - self._came).nanoseconds / 1e9
-            if is_set or silent <= max(
-                self._node.value("transform_tolerance"), SILENCE
-            ):
+        topic = self._subscription.topic_name
+        if self.topic == "initialpose":
+            if self._pose is not None:  # its stamp may be that of another clock
                 return self._pose
-            often = "publish it more often, set transform_tolerance"
-            problem = f"nothing came on {topic} for {silent:.3g} s; {often}"
+            problem = f"set it on {topic} (in RViz: 2D Pose Estimate)"
+            listening_since = -math.inf  # a user sets it: there is nothing to wait for
+        else:
+            problem = self._odometry_problem(topic)
+            if self._pose is not None and not problem:
+                return self._pose
+            listening_since = self._heard_from
         remedy = "or set start_source, or give the request's start its frame"
-        raise RequestError(
-            "NO_START", f"the start is unknown; {problem}; {remedy}", since
-        )
+        reason = f"the start is unknown; {problem}; {remedy}"
+        raise RequestError("NO_START", reason, listening_since)
+
+    def _odometry_problem(self, topic: str) -> str:
+        """Return why odometry does not tell the robot's pose now; empty if it does."""
+        if self._pose is None:
+            return f"nothing came on {topic} in the map's frame"
+        silence = (self._node.get_clock().now() - self._came).nanoseconds / 1e9
+        if silence <= max(self._node.value("transform_tolerance"), SILENCE):
+            return ""
+        remedy = "publish it more often, set transform_tolerance"
+        return f"nothing came on {topic} for {silence:.3g} s; {remedy}"
