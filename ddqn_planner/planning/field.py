@@ -137,41 +137,54 @@ class DistanceField(QField):
     def __init__(
         self, goals: Goals, grid: GridMap, costs: MoveCosts, move_rule: MoveRule
     ) -> None:
-        self.grid, self.costs, self.move_rule = grid, costs, move_rule
-        self.goal, self.goals = goals[0], goals
+        self.grid = grid
+        self.costs = costs
+        self.move_rule = move_rule
+        self.goal = goals[0]
+        self.goals = goals
         self._lock = threading.RLock()
+        # None before the first growth, and while a thread changes it: if it is
+        # interrupted, the field begins anew.
+        self._known: Known | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy has: it grows anew, under a lock of its own."""
         state = vars(self).copy()  # other threads add to it
-        return {
-            name: value
-            for name, value in state.items()
-            if name not in ("known", "_lock")
-        }
+        for name in ("_known", "_lock"):
+            del state[name]
+        return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Begin as a copy."""
         vars(self).update(state)
         self._lock = threading.RLock()
+        self._known = None
 
-    @cached_property
+    @property
     def known(self) -> Known:
         """What is known, at first the goals alone."""
+        if self._known is None:
+            self._known = self._goals_alone()
+        return self._known
+
+    def _goals_alone(self) -> Known:
+        """Return what is known before any growth."""
         cells = self.costs.patch.size
-        distance, mark = np.zeros(cells), np.zeros(cells, np.uint8)
+        distance = np.zeros(cells)
+        mark = np.zeros(cells, np.uint8)
         roots = np.array([self._number(goal) for goal in self.goals], np.int32)
-        distance[roots], mark[roots] = cell_space.AT_GOAL, wavefront.OPEN
+        distance[roots] = cell_space.AT_GOAL
+        mark[roots] = wavefront.OPEN
         return Known(distance, mark, roots)
 
     def _number(self, cell: Any) -> Any:
-        """Return the number of a cell, or of each of many (arrays), on the padded map."""
+        """Return the number of a cell on the padded map; of many, if x and y are arrays."""
         return (cell[1] + 1) * self.costs.width + cell[0] + 1
 
-    def _take(self) -> Known:
-        """Return what is known, to change it: so after any exception on the way it begins anew."""
+    def _take_known(self) -> Known:
+        """Take what is known away, to change it, and return it."""
         known = self.known
-        del self.known
+        self._known = None
         return known
 
     def grow(self, start: Cell | None = None, limit: int = 2**62) -> bool:
@@ -180,67 +193,80 @@ class DistanceField(QField):
         with self._lock:
             done = _is_final(self.known, number)
             if not done:
-                self.known, done = cell_space.grow(
-                    self._take(), self.costs, number, limit
+                self._known, done = cell_space.grow(
+                    self._take_known(), self.costs, number, limit
                 )
         return done
 
     def is_known(self, start: Cell) -> bool:
         """Return whether no more of the field is needed for the rollout from a start."""
-        known: Known | None = vars(self).get(
-            "known"
-        )  # None while another thread computes it
+        known = self._known  # None while another thread computes it
         return known is not None and _is_final(known, self._number(start))
 
     def rollout(self, start: Cell, straight: bool = False) -> Plan:
         """Return the path; there is none only if there is no way to the goal."""
         start = cell_inside(start, self.grid.occupancy.shape, "the start")
-        number, toward = self._number(start), self.goal if straight else start
+        number = self._number(start)
+        toward_x, toward_y = self.goal if straight else start
         with self._lock:
             self.grow(start)
             known = self.known
             if known.mark[number] != wavefront.CLOSED:
                 return Plan(PlanStatus.NO_PATH, move_rule=self.move_rule)
-            most = 2 + int(
-                1.01 * known.distance[number]
-            )  # no move costs less than 1; sums are rounded
-            path = np.empty((min(most, known.distance.size), 2), np.int32)
+            # No move costs less than 1; sums are rounded.
+            most_cells = 2 + int(1.01 * known.distance[number])
+            path = np.empty((min(most_cells, known.distance.size), 2), np.int32)
             length = cell_space.roll_out(
-                known.distance, number, path, *toward, step_costs(self.costs)
+                known.distance,
+                number,
+                path,
+                toward_x,
+                toward_y,
+                step_costs(self.costs),
             )
         return Plan(PlanStatus.SUCCEEDED, path[:length], move_rule=self.move_rule)
 
     def take_over(self, old: DistanceField, start: Cell | None = None) -> bool:
-        """Repair and take what an older field knows, or begin if quicker; False for other maps."""
+        """Repair what an older field knows and take it, or begin where that is quicker.
+
+        Return False, and change nothing, if that field is of another map.
+        """
         cells = changed_cells(old.grid, self.grid)
         if cells is None:
             return False
-        # Moves of the cells around may differ, too, but there are none on the map's border.
-        width, last = self.costs.width, self.costs.patch.size - self.costs.width - 1
-        around = (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel()
-        changed = (around[:, None] + self._number(cells.T)).astype(np.int32)
-        changed = np.sort(changed[(changed > width) & (changed < last)])
-        changed = changed[
-            np.diff(changed, prepend=0) > 0
-        ]  # a fifth of the time of `np.unique`
-        # For one start, repair and new field take turns, each time with four times the limit: the
-        # quicker one wins. The older field then begins anew, or else stays as it is.
-        most = max(REPAIRED, int(REPAIRED_SHARE * self.grid.occupancy.size))
-        limit = most if start is None else REPAIRED
+        changed = self._numbers_around(cells)
+        # For one start, repair and new field take turns, each time with four times the
+        # limit: the quicker one wins. The older field then begins anew; or it stays as
+        # it is.
+        most_repaired = max(REPAIRED, int(REPAIRED_SHARE * self.grid.occupancy.size))
+        limit = most_repaired if start is None else REPAIRED
         with old._lock:
-            # A repair may look at cells anywhere, also where the older field has read no rows.
+            # A repair may look at any cell, also where the older field read no rows.
             self.costs.read(0, self.grid.height)
-            taken = old._take()
-            while (
-                repaired := cell_space.take_back(taken, self.costs, changed, limit)
-            ) is None:
+            known = old._take_known()
+            repaired = cell_space.take_back(known, self.costs, changed, limit)
+            while repaired is None:
                 limit *= 4
-                if start and limit <= most and not self.grow(start, VISITS * limit):
-                    continue
-                old.known = taken
-                return True
-            self.known = repaired
+                is_repair_slower = start is None or limit > most_repaired
+                if is_repair_slower or self.grow(start, VISITS * limit):
+                    old._known = known
+                    return True
+                repaired = cell_space.take_back(known, self.costs, changed, limit)
+            self._known = repaired
         return True
+
+    def _numbers_around(self, cells: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Return the numbers of some cells (N, 2) and of their neighbours, sorted.
+
+        Moves of the neighbours may differ, too. On the map's border there are none.
+        """
+        width = self.costs.width
+        end = self.costs.patch.size - width - 1
+        offsets = (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel()  # (9,)
+        numbers = (offsets[:, None] + self._number(cells.T)).astype(np.int32)  # (9, N)
+        inside = np.sort(numbers[(numbers > width) & (numbers < end)])
+        is_new = np.diff(inside, prepend=0) > 0  # a fifth of the time of `np.unique`
+        return inside[is_new]
 
     def _layer(self, write: Callable[..., None], layer: NDArray[Any]) -> NDArray[Any]:
         """Return what a kernel writes for each cell of the whole field: (..., H, W)."""
@@ -282,9 +308,7 @@ class DistanceField(QField):
     @property
     def nbytes(self) -> int:
         """Memory, bytes: 9 per cell for what is known, and that of its arrays."""
-        known: Known | None = vars(self).get(
-            "known"
-        )  # None while another thread computes it
+        known = self._known  # None while another thread computes it
         opened = 0 if known is None else known.opened.nbytes
         return 9 * self.costs.patch.size + opened + super().nbytes
 
