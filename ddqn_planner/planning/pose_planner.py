@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import compress
@@ -134,68 +134,100 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         start: State = tuple(starts[0].tolist())
         goals = compress(request.goals, inside)
         states = np.concatenate([self._at(grid, goal, world) for goal in goals])
-        plan = PosePlan(PlanStatus.GOAL_OCCUPIED)
-        for may_move in (False, True) if any(request.tolerance) else (False,):
-            states = self._around(request, start, world) if may_move else states
-            if not len(states):
-                continue
-            while (found := self._grow(request, states, start, clock)) is None:
-                yield
-            plan = found
-            if plan.poses.size:
-                break
+        plan = yield from self._to_states(request, states, start, clock)
+        if plan.poses.size or not any(request.tolerance):
+            return plan
+        states_around = self._around(request, start, world)
+        if not len(states_around):
+            return plan
+        return (yield from self._to_states(request, states_around, start, clock))
+
+    def _to_states(
+        self,
+        request: PoseRequest,
+        states: NDArray[np.int64],
+        start: State,
+        clock: Clock,
+    ) -> Finding[PosePlan]:
+        """Return the plan from a start to the nearest of some states."""
+        if not len(states):
+            return PosePlan(PlanStatus.GOAL_OCCUPIED)
+        plan = self._grow(request, states, start, clock)
+        while plan is None:
+            yield
+            plan = self._grow(request, states, start, clock)
         return plan
 
-    def _reason(
-        self, request: PoseRequest, plan: PosePlan
-    ) -> Generator[None, None, str]:
-        """Return why there is no path, after None before each slow step."""
+    def _reason(self, request: PoseRequest, plan: PosePlan) -> Finding[str]:
+        """Return why there is no path, in words."""
         status: str = plan.status.value
-        several = len(request.goals) > 1
-        start_cell, *cells = request.cells
-        if not any(map(request.grid.contains, cells)):
-            return unknown_space.reason_of_goals(
-                [unknown_space.OUTSIDE] * len(cells), ""
-            )
-        grid = with_unknown_free(request.grid)
-        world = world_of(grid, self.body)
-        starts = self._at(grid, request.start, world)
-        if not len(starts) and not several:
-            return status
+        start_cell, *goal_cells = request.cells
+        if not any(map(request.grid.contains, goal_cells)):
+            outside = [unknown_space.OUTSIDE] * len(goal_cells)
+            return unknown_space.reason_of_goals(outside, "")
+        free_grid = with_unknown_free(request.grid)
+        possible = world_of(free_grid, self.body)
+        starts = self._at(free_grid, request.start, possible)
         if plan.status is PlanStatus.START_OCCUPIED:
             if not len(starts):
                 return status
-            return (
-                f"the start {self._place(request, start_cell)}; {unknown_space.REMEDY}"
-            )
-        places = [self._goal_in_words(request, goal, world) for goal in request.goals]
-        if several and (all(places) or request.grid.unknown is None or not len(starts)):
-            return unknown_space.reason_of_goals(places, "")
-        if not several and unknown_space.UNKNOWN_SPACE in places[0]:
+            place = self._place(request, start_cell)
+            return f"the start {place}; {unknown_space.REMEDY}"
+        has_several_goals = len(request.goals) > 1
+        if not len(starts) and not has_several_goals:
+            return status
+        places = [
+            self._goal_in_words(request, goal, possible) for goal in request.goals
+        ]
+        if has_several_goals:
+            has_unknown_cells = request.grid.unknown is not None
+            if all(places) or not has_unknown_cells or not len(starts):
+                return unknown_space.reason_of_goals(places, "")
+        elif unknown_space.UNKNOWN_SPACE in places[0]:
             return f"the goal {places[0]}; {unknown_space.REMEDY}"
         start: State = tuple(starts[0].tolist())
-        # Of several goals those count at which the body has room.
-        ends = [
-            goal for goal, place in zip(request.goals, places, strict=True) if not place
-        ]
-        ends = ends or [*request.goals]
-        states = np.concatenate([self._at(grid, goal, world) for goal in ends])
-        if any(request.tolerance):
-            states = self._around(replace(request, grid=grid), start, world)
+        states = self._ends_with_room(request, places, start, free_grid, possible)
         if not len(states):
             return status
-        field = PoseField(states, grid, world)
-        words = unknown_space.MAYBE_THROUGH_UNKNOWN_SPACE
+        field = PoseField(states, free_grid, possible)
+        through = yield from self._through_unknown_space(field, start)
+        if has_several_goals:
+            return unknown_space.reason_of_goals(places, through)
+        if not through:
+            return status
+        return f"{status}, {through}; {unknown_space.REMEDY}"
+
+    def _ends_with_room(
+        self,
+        request: PoseRequest,
+        places: Sequence[str],
+        start: State,
+        free_grid: GridMap,
+        possible: World,
+    ) -> NDArray[np.int64]:
+        """Return the states (N, 3) in which a path may end if unknown cells are free.
+
+        `places` says of each goal why no path can end there, empty where the body has
+        room: of several goals, those with room count.
+        """
+        if any(request.tolerance):
+            return self._around(replace(request, grid=free_grid), start, possible)
+        goals = [
+            goal for goal, place in zip(request.goals, places, strict=True) if not place
+        ]
+        goals = goals or [*request.goals]
+        return np.concatenate([self._at(free_grid, goal, possible) for goal in goals])
+
+    def _through_unknown_space(self, field: PoseField, start: State) -> Finding[str]:
+        """Return words if a path leads through unknown space, or may; empty if none does."""
         for _ in range(MOST_STEPS_OF_REASON):
             bound = field.reach(start, BOUND_OF_REASON, VISITS)
+            if bound == math.inf:
+                return ""
             if bound is not None:
-                words = unknown_space.THROUGH_UNKNOWN_SPACE
-                break
+                return unknown_space.THROUGH_UNKNOWN_SPACE
             yield
-        words = "" if bound == math.inf else words
-        if several:
-            return unknown_space.reason_of_goals(places, words)
-        return f"{status}, {words}; {unknown_space.REMEDY}" if words else status
+        return unknown_space.MAYBE_THROUGH_UNKNOWN_SPACE
 
     def _goal_in_words(self, request: PoseRequest, goal: Pose, possible: World) -> str:
         """Return why no path can end at a pose; empty if the body has room there.
@@ -240,114 +272,164 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         return rest if paths.is_free(rest, grid, self.points) else poses[:0]
 
     def _keep_or_switch(self, request: PoseRequest, plan: PosePlan) -> PosePlan:
-        """Return the rest of the path under way if it hardly costs more than a plan, or that."""
-        has_plan, grid = plan.poses.size > 0, request.grid
-        reach = paths.REACH if has_plan else BESIDE_PATH
-        rest = self.rest_of(request.under_way, request.start, grid, reach)
-        ends = np.array([*plan.poses[-1:], *request.goals])
-        if not len(rest) or paths.nearest_pose(ends, rest[-1], grid, SAME_END) < 0:
-            return plan
-        cost, new = (paths.cost_of_poses(way, grid) for way in (rest, plan.poses))
-        if has_plan and not request.keeps(cost, new):
-            return plan
-        share, least = (
-            cost / new if new else 1.0,
-            0.0,
-        )  # without a plan nothing is proved
-        if has_plan:
-            of_plan = (plan.cost or 0.0) / (grid.seconds_per_cell or 1.0)
-            cost, least = share * of_plan, of_plan / plan.bound
-        cells, spent = (
-            paths.cells_of(paths.in_cells(rest, grid)),
-            np.linspace(0, cost, len(rest)),
+        """Return the rest of the path under way if it hardly costs more than a plan.
+
+        Or return that plan.
+        """
+        grid = request.grid
+        has_plan = plan.poses.size > 0
+        rest = self.rest_of(
+            request.under_way,
+            request.start,
+            grid,
+            paths.REACH if has_plan else BESIDE_PATH,
         )
-        kept = paths.Way(rest, cells, spent, least).plan(0, grid)
-        ms = plan.field_ms, plan.rollout_ms
-        return replace(kept, extra_cost=share - 1, field_ms=ms[0], rollout_ms=ms[1])
+        if not len(rest):
+            return plan
+        ends = np.array([*plan.poses[-1:], *request.goals])
+        if paths.nearest_pose(ends, rest[-1], grid, SAME_END) < 0:
+            return plan
+        cost = paths.cost_of_poses(rest, grid)
+        least_cost = 0.0  # without a plan nothing is proved
+        ratio = 1.0
+        if has_plan:
+            new_cost = paths.cost_of_poses(plan.poses, grid)
+            if not request.keeps(cost, new_cost):
+                return plan
+            if new_cost:
+                ratio = cost / new_cost
+            # The costs of poses are nearly those of primitives: their ratio counts.
+            cost_of_plan = (plan.cost or 0.0) / (grid.seconds_per_cell or 1.0)
+            cost = ratio * cost_of_plan
+            least_cost = cost_of_plan / plan.bound
+        cells = paths.cells_of(paths.in_cells(rest, grid))
+        spent = np.linspace(0, cost, len(rest))
+        return replace(
+            paths.Way(rest, cells, spent, least_cost).plan(0, grid),
+            extra_cost=ratio - 1,
+            field_ms=plan.field_ms,
+            rollout_ms=plan.rollout_ms,
+        )
 
     def _check(self, grid: GridMap) -> None:
         """Raise a ValueError if the map's cells are not of the size that the robot learned."""
-        known, given = self.motions.resolution, grid.resolution
-        if not math.isclose(given, known, rel_tol=1e-3):
-            problem = f"the robot learned cells of {known:g} m, and the map's have {given:g} m"
-            remedy = f"give a map of {known:g} m, or run ddqn-planner train-robot with --resolution"
-            raise ValueError(f"{problem}; {remedy} {given:g}")
+        learned = self.motions.resolution
+        resolution = grid.resolution
+        if not math.isclose(resolution, learned, rel_tol=1e-3):
+            raise ValueError(
+                f"the robot learned cells of {learned:g} m, and the map's have"
+                f" {resolution:g} m; give a map of {learned:g} m, or run ddqn-planner"
+                f" train-robot with --resolution {resolution:g}"
+            )
 
     def _at(self, grid: GridMap, pose: Pose, world: World) -> NDArray[np.int64]:
         """Return the state (1, 3) of a pose, of the nearer of two headings with room, or none."""
-        apart = np.abs(turn_between(self.motions.angles, pose[2] - grid.origin[2]))
-        cell = grid.world_to_cell(*pose[:2])
-        states = np.array(
-            [(*cell, heading) for heading in np.argsort(apart, kind="stable")[:2]]
-        )
-        return states[: min(standing(states, world), 1)]
+        x, y, yaw = pose
+        turn = np.abs(turn_between(self.motions.angles, yaw - grid.origin[2]))
+        nearest_headings = np.argsort(turn, kind="stable")[:2]
+        column, line = grid.world_to_cell(x, y)
+        states = np.array([(column, line, heading) for heading in nearest_headings])
+        count = standing(states, world)
+        return states[: min(count, 1)]
 
     def _around(
         self, request: PoseRequest, start: State, world: World
     ) -> NDArray[np.int64]:
         """Return the states (N, 3) within the tolerance of the goal at which a path may end."""
-        grid, (metres, radians), (x, y, yaw) = (
-            request.grid,
-            request.tolerance,
-            request.goals[0],
-        )
-        column, line = grid.world_to_cell(x, y)
+        grid = request.grid
+        metres, radians = request.tolerance
+        x, y, yaw = request.goals[0]
+        goal_column, goal_row = grid.world_to_cell(x, y)
+        radius = metres * ROUNDING / grid.resolution  # cells
         turn = np.abs(turn_between(self.motions.angles, yaw - grid.origin[2]))
-        is_meant = turn <= max(radians * ROUNDING, turn.min())
-        far = metres * ROUNDING / grid.resolution
-        if is_meant[start[2]] and math.dist(start[:2], (column, line)) <= far:
+        may_end = turn <= max(radians * ROUNDING, turn.min())  # (16,)
+        start_column, start_row, start_heading = start
+        start_distance = math.hypot(start_column - goal_column, start_row - goal_row)
+        if may_end[start_heading] and start_distance <= radius:
             return np.array([start])
-        columns, rows = np.arange(grid.width) - column, np.arange(grid.height) - line
-        columns, rows = columns[abs(columns) <= far], rows[abs(rows) <= far]
-        nearer, apart = np.where(is_meant, -1.0, far), np.hypot(columns, rows[:, None])
-        for heading in np.flatnonzero(is_meant):
-            into = self.motions.end == heading
-            if is_meant[self.motions.start[into]].all():
-                # A path ends where it first may: it comes to what is further inside from such.
-                nearer[heading] = far - np.hypot(*self.motions.offset[into].T).max()
-        end, row, place = np.nonzero((nearer[:, None, None] < apart) & (apart <= far))
-        states = np.column_stack([column + columns[place], line + rows[row], end])
+        columns = np.arange(grid.width) - goal_column
+        columns = columns[abs(columns) <= radius]  # (C,): relative to the goal
+        rows = np.arange(grid.height) - goal_row
+        rows = rows[abs(rows) <= radius]  # (R,)
+        distance = np.hypot(columns, rows[:, None])  # (R, C)
+        least_distance = self._least_distance_of_ends(may_end, radius)  # (16,)
+        is_end = (least_distance[:, None, None] < distance) & (distance <= radius)
+        heading, row, column = np.nonzero(is_end)
+        states = np.column_stack(
+            [goal_column + columns[column], goal_row + rows[row], heading]
+        )
         return states[: standing(states, world)]
+
+    def _least_distance_of_ends(
+        self, may_end: NDArray[np.bool_], radius: float
+    ) -> NDArray[np.float64]:
+        """Return how far from a goal a path may end at least, by the heading: (16,).
+
+        A path ends where it first may: states further inside the radius are reached
+        through such an end, if all primitives that lead there begin with a heading in
+        which a path may end. Nowhere, in a heading in which no path may end.
+        """
+        motions = self.motions
+        least_distance = np.where(may_end, -1.0, radius)
+        for heading in np.flatnonzero(may_end):
+            leads_there = motions.end == heading
+            if may_end[motions.start[leads_there]].all():
+                longest = np.hypot(*motions.offset[leads_there].T).max()
+                least_distance[heading] = radius - longest
+        return least_distance
 
     def _from_last_path(self, request: PoseRequest) -> PosePlan | None:
         """Return the rest of the path that was planned last, if the start lies on it."""
-        for asked, known in self._fields.items():
-            if (
-                asked[:2] != (request.goals, request.tolerance)
-                or (way := known.way) is None
-            ):
+        for (goals, tolerance, _), field in self._fields.items():
+            if goals != request.goals or tolerance != request.tolerance:
                 continue
-            cells = self._differences(known.grid, request.grid)
-            if cells is None or len(cells):
+            path = field.way
+            if path is None:
                 continue
-            first = paths.nearest_pose(way.poses, request.start, request.grid, ON_PATH)
-            plan = way.plan(first, request.grid) if first >= 0 else None
-            if plan is not None and plan.bound <= request.bound * paths.SAME:
+            changed = self._differences(field.grid, request.grid)
+            if changed is None or len(changed):
+                continue
+            first = paths.nearest_pose(path.poses, request.start, request.grid, ON_PATH)
+            if first < 0:
+                continue
+            plan = path.plan(first, request.grid)
+            if plan.bound <= request.bound * paths.SAME:
                 return plan
         return None
 
     def _world(self, grid: GridMap) -> World:
         """Return a map for kernels, from the last one where that is quicker."""
-        cells = self._differences(self._map[0], grid) if self._map else None
-        older = self._map[1] if self._map else None
-        self._map = grid, world_of(grid, self.body, older, cells)
-        return self._map[1]
+        older_world = None
+        changed = None
+        if self._map is not None:
+            older_grid, older_world = self._map
+            changed = self._differences(older_grid, grid)
+        world = world_of(grid, self.body, older_world, changed)
+        self._map = grid, world
+        return world
 
     def _field(self, request: PoseRequest, states: NDArray[np.int64]) -> PoseField:
         """Return a field toward some states: as it is, repaired, or new."""
-        grid, asked = request.grid, (request.goals, request.tolerance, states.tobytes())
-        field = self._fields.pop(asked, None)
-        if field is None or field.grid is not grid:
-            cells = self._differences(field.grid, grid) if field else None
-            world = self._world(grid)
-            kept = (
-                field.repaired(grid, world, cells)
-                if field and cells is not None
-                else None
-            )
-            field = kept or PoseField(states, grid, world)
-        self._fields = dict([*self._fields.items(), (asked, field)][-KEPT:])
+        key = request.goals, request.tolerance, states.tobytes()
+        older = self._fields.pop(key, None)
+        field = self._field_on(request.grid, states, older)
+        used_last = [*self._fields.items(), (key, field)]
+        self._fields = dict(used_last[-KEPT:])
         return field
+
+    def _field_on(
+        self, grid: GridMap, states: NDArray[np.int64], older: PoseField | None
+    ) -> PoseField:
+        """Return a field on a map, from an older one toward the same states if possible."""
+        if older is None:
+            return PoseField(states, grid, self._world(grid))
+        if older.grid is grid:
+            return older
+        changed = self._differences(older.grid, grid)
+        world = self._world(grid)
+        if changed is None:
+            return PoseField(states, grid, world)
+        return older.repaired(grid, world, changed)
 
     def _grow(
         self,
@@ -364,18 +446,18 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
             if bound is None:
                 return None
             clock.end_field()
-            found = field.rollout(start)
-            if found is None:
+            rows = field.rollout(start)
+            if rows is None:
                 return PosePlan(PlanStatus.NO_PATH, field_ms=clock.field_ms)
-            x, y, yaw, spent = found
-            poses = np.column_stack(
-                [
-                    grid.centres(np.column_stack([x, y])),
-                    turn_between(0, yaw + grid.origin[2]),
-                ]
+            x, y, yaw, spent = rows
+            in_cells = np.column_stack([x, y])
+            yaw_on_map = turn_between(0, yaw + grid.origin[2])
+            field.way = paths.Way(
+                poses=np.column_stack([grid.centres(in_cells), yaw_on_map]),
+                cells=paths.cells_of(in_cells),
+                spent=spent.copy(),
+                least=float(spent[-1]) / bound,
             )
-            cells = paths.cells_of(np.column_stack([x, y]))
-            field.way = paths.Way(poses, cells, spent.copy(), float(spent[-1]) / bound)
             plan = field.way.plan(0, grid)
         return replace(plan, field_ms=clock.field_ms, rollout_ms=clock.rollout_ms)
 
