@@ -23,8 +23,8 @@ Goals: TypeAlias = tuple[
     Cell, ...
 ]  # different free cells, sorted: a path may end in any of them
 REPAIRED = 100  # cells that a repair may take back before a new field is begun
-# Visits of a new field per cell that a repair may take back, while both take turns: to take a cell
-# back takes longer, and it is visited again. See docs/benchmarks.md.
+# Visits of a new field per cell that a repair may take back, while both take turns: to
+# take a cell back takes longer, and it is visited again. See docs/benchmarks.md.
 VISITS = 8
 REPAIRED_SHARE = 0.02  # of the map's cells that a repair may take back
 CACHE_BYTES = (
@@ -45,7 +45,8 @@ class QField:
     goal : (x, y)
         A free cell.
     q : (8, H, W) float32
-        The network's value of each action in each cell; -inf where no way to the goal is known.
+        The network's value of each action in each cell; -inf where no way to the goal
+        is known.
     legal : (8, H, W) bool
         The legal moves. The robot knows its map and takes no other.
     move_rule : MoveRule
@@ -54,7 +55,8 @@ class QField:
 
     grid: GridMap  # the last one with such cells, of a field that a planner keeps
     costs: MoveCosts | None = None
-    # The number and the bytes of arrays of its map and its costs, which others may keep, too.
+    # The number and the bytes of arrays of its map and its costs, which others may
+    # keep, too.
     shared: Sequence[tuple[int, int]] = ()
 
     def __init__(
@@ -112,9 +114,10 @@ class QField:
     def rollout(self, start: Cell, straight: bool = False) -> Plan:
         """Take greedy steps from a free cell until the goal, and return the path.
 
-        The plan is ROLLOUT_TRAPPED as soon as a cell is entered again: the steps would repeat. A
-        start that is no cell of the map is a ValueError. A straight rollout takes, of steps
-        as good as each other, those along the line to the goal: a `DistanceField` has many.
+        The plan is ROLLOUT_TRAPPED as soon as a cell is entered again: the steps would
+        repeat. A start that is no cell of the map is a ValueError. A straight rollout
+        takes, of steps as good as each other, those along the line to the goal: a
+        `DistanceField` has many.
         """
         policy, steps = self.policy, MOVES.tolist()
         cell = cell_inside(start, policy.shape, "the start")
@@ -340,8 +343,8 @@ class FieldCache:
     def __init__(self, network: QNetwork) -> None:
         self.network = network
         self.nbytes = CACHE_BYTES  # the bound; the fields used last are kept
-        # Used last at the end. Threads need no lock, as the list is replaced and never changed: one
-        # may at worst forget what another has just kept.
+        # Used last at the end. Threads need no lock, as the list is replaced and never
+        # changed: one may at worst forget what another has just kept.
         self._kept: list[QField] = []
 
     def __getstate__(self) -> dict[str, Any]:
@@ -404,8 +407,8 @@ class FieldCache:
         else:
             field = DistanceField(goals, grid, costs, rule)
             older = [old for old in self._of_rule(rule) if old.goals == goals]
-            # The place will hardly be again what it was. If the last ones are of other maps, so
-            # are those before them: with new expected times all are.
+            # The place will hardly be again what it was. If the last ones are of other
+            # maps, so are those before them: with new expected times all are.
             for old in older[:ALWAYS_KEPT]:
                 if field.take_over(old, start):
                     replaced = old

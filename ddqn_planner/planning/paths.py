@@ -21,7 +21,8 @@ from ddqn_planner.planning.segments import (
 )
 
 REACH = 5  # cells along an axis that a robot may be beside its path, and still come back to it
-# Of ways out of one length, the one that ends nearer to the goal: so little its distance counts.
+# Of ways out of one length, the one that ends nearer to the goal: so little its
+# distance counts.
 NEARER_TO_GOAL = 1e-9
 
 
@@ -36,8 +37,9 @@ def search(
     value: NDArray[np.float32] | None = None,
 ) -> tuple[Cell, ...]:
     """Return a legal path to a cell, or to the nearest of a mask; empty without one."""
-    # A* (Hart, Nilsson and Raphael 1968) with -V as its heuristic: a good field leads straight to
-    # the end, and with any, each cell is visited at most once. Without values it is Dijkstra.
+    # A* (Hart, Nilsson and Raphael 1968) with -V as its heuristic: a good field leads
+    # straight to the end, and with any, each cell is visited at most once. Without
+    # values it is Dijkstra.
     shape = grid.occupancy.shape
     if not isinstance(end, np.ndarray):
         (x, y), end = end, np.zeros(shape, dtype=np.bool_)
@@ -62,7 +64,8 @@ def _search(
     height, width = ends.shape
     entered_by = np.full(ends.shape, -1, dtype=np.int8)
     visited = np.zeros(ends.shape, dtype=np.bool_)
-    # Of each move: its order, the cost of the path with it, the cell it leads to, the action.
+    # Of each move: its order, the cost of the path with it, the cell it leads to, the
+    # action.
     waiting = [(0.0, 0.0, start[1] * width + start[0], -1)]
     while len(waiting) > 0:
         _, cost, cell, entered = heapq.heappop(waiting)
@@ -172,7 +175,8 @@ def rest_of_path(
     for index in near[np.lexsort((-near, distances[near]))].tolist():
         vector = passed[index] - robot
         dx, dy = np.abs(vector)
-        # Diagonal moves first, or one axis after the other: past a corner that a segment grazes.
+        # Diagonal moves first, or one axis after the other: past a corner that a
+        # segment grazes.
         for waits in ((0, 0), (0, dx), (dy, 0)):
             steps = np.arange(1 + max(dx + waits[0], dy + waits[1]))[:, None]
             way = robot + np.sign(vector) * np.clip(steps - waits, 0, (dx, dy))

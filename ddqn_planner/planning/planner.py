@@ -76,8 +76,8 @@ class Planner:
     ) -> QField:
         """Return the Q field of a map toward a goal, a free cell, computed or from the cache.
 
-        The move rule is by default the one that the model was trained for. A goal that is not free,
-        or a map of a size that the model cannot plan on, is a ValueError.
+        The move rule is by default the one that the model was trained for. A goal that
+        is not free, or a map of a size that the model cannot plan on, is a ValueError.
         """
         check_grid(grid)
         goal, rule = as_cell(goal, "the goal"), self._rule(move_rule)
@@ -119,25 +119,27 @@ class Planner:
         method : PlanMethod
             Whether to search where the greedy steps are trapped.
         tolerance : float
-            How far a goal that is occupied or cut off may move, in cells: to the nearest free cell
-            that a path reaches.
+            How far a goal that is occupied or cut off may move, in cells: to the
+            nearest free cell that a path reaches.
         simplified : bool
             Whether to leave out cells, see `simplify`.
         start_clearing_radius : float
-            Where the start is an obstacle, those within so many cells of it do not count until the
-            path has reached its first free cell, the nearest one. With 0 they count.
+            Where the start is an obstacle, those within so many cells of it do not
+            count until the path has reached its first free cell, the nearest one. With
+            0 they count.
 
         Returns
         -------
         Plan
-            Every move of its path is legal under the rule, whatever the network says. The cells
-            are free, except the first ones of a start that is too near to an obstacle, or on one.
+            Every move of its path is legal under the rule, whatever the network says.
+            The cells are free, except the first ones of a start that is too near to an
+            obstacle, or on one.
 
         Raises
         ------
         ValueError
-            If the tolerance or the radius is negative or NaN, the start or a goal is no pair of
-            whole numbers, or there is no goal or no such move rule or method.
+            If the tolerance or the radius is negative or NaN, the start or a goal is no
+            pair of whole numbers, or there is no goal or no such move rule or method.
         """
         request = PlanRequest(
             grid,
@@ -163,8 +165,8 @@ class Planner:
     ) -> Plan:
         """Plan a path to the goal that the cheapest path reaches; `Plan.goal` tells which.
 
-        Goals that are occupied or outside the map are left out. If all are, the status says so:
-        GOAL_OCCUPIED if any lies on the map.
+        Goals that are occupied or outside the map are left out. If all are, the status
+        says so: GOAL_OCCUPIED if any lies on the map.
 
         Parameters
         ----------
@@ -200,9 +202,11 @@ class Planner:
         Parameters
         ----------
         grid, start, move_rule, method, tolerance, simplified, start_clearing_radius
-            As for `plan`. The tolerance holds for each goal. A simplified path keeps all goals.
+            As for `plan`. The tolerance holds for each goal. A simplified path keeps
+            all goals.
         goals : sequence of (x, y)
-            At least one. If one has no path, the plan's status tells why, and its goal which.
+            At least one. If one has no path, the plan's status tells why, and its goal
+            which.
         """
         plans: list[Plan] = []
         cells = _cells_of_goals(goals)
@@ -239,17 +243,18 @@ class Planner:
         grid : GridMap
             With cells of the size that the robot learned.
         start : (x, y, yaw)
-            Metres and radians in the map frame. The path begins in the middle of its cell, with one
-            of 16 headings: the nearest one, or else the next, where the body has room. Where at
-            most half a cell and 11.25 degrees part it from the path planned last, the plan is the
-            rest of that path.
+            Metres and radians in the map frame. The path begins in the middle of its
+            cell, with one of 16 headings: the nearest one, or else the next, where the
+            body has room. Where at most half a cell and 11.25 degrees part it from the
+            path planned last, the plan is the rest of that path.
         goal : (x, y, yaw), or several
             Likewise; of several, the one that the cheapest path reaches.
         tolerance : (float, float)
             Metres and radians by which a goal without room or without a way may move.
         bound : float
-            How many times the least cost a path may have at most, 1 or more: with 1 it is the
-            least, and takes longer. `PosePlan.bound` tells what is proved of the path.
+            How many times the least cost a path may have at most, 1 or more: with 1 it
+            is the least, and takes longer. `PosePlan.bound` tells what is proved of the
+            path.
 
         Returns
         -------
@@ -259,7 +264,8 @@ class Planner:
         Raises
         ------
         ValueError
-            If the model knows no body, the map's resolution is another, or an argument is wrong.
+            If the model knows no body, the map's resolution is another, or an argument
+            is wrong.
         """
         check_grid(grid)
         limits = _tolerance_of_poses(tolerance)

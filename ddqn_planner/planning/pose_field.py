@@ -50,11 +50,12 @@ def _untouched(count: int, dtype: DTypeLike) -> NDArray[Any]:
 class PoseField:
     """The least costs that are known from poses to the nearest of some goals."""
 
-    # Grown from the goals toward a start: first by weighted A* that closes a state once, as the
-    # rounds of ARA* do (Likhachev et al. 2003), then, if the bound is not proved, by A*. On a
-    # cheapest path to the start lies a state that is open or waits, and whose cost is the least;
-    # else the start's is. So the least cost of one of these, plus what is left from there at least,
-    # is a lower bound, which proves how good the start's cost is.
+    # Grown from the goals toward a start: first by weighted A* that closes a state
+    # once, as the rounds of ARA* do (Likhachev et al. 2003), then, if the bound is not
+    # proved, by A*. On a cheapest path to the start lies a state that is open or waits,
+    # and whose cost is the least; else the start's is. So the least cost of one of
+    # these, plus what is left from there at least, is a lower bound, which proves how
+    # good the start's cost is.
 
     def __init__(
         self, goals: NDArray[np.int64], grid: GridMap, world: World, aim: Aim = NOWHERE

@@ -37,16 +37,17 @@ from ddqn_planner.planning.pose_world import (
 from ddqn_planner.robot.motions import HEADINGS, turn_between
 
 VISITS = 2**16  # states that a field visits in one step of a plan: some 30 ms
-# Whether a path leads through unknown space is looked for in so many such steps, some 0.5 s, within
-# a bound that hardly takes longer than any path.
+# Whether a path leads through unknown space is looked for in so many such steps, some
+# 0.5 s, within a bound that hardly takes longer than any path.
 MOST_STEPS_OF_REASON, BOUND_OF_REASON = 16, 10.0
 KEPT: Final = 3  # fields, those used last
 SAME_END = (
     1.0,
     0.5,
 )  # cells and radians: no yaw is farther from the two headings nearest to it
-# So near to its path, a robot keeps it even if there is none from the state nearest to its pose:
-# a controller has driven it a little aside, where the body of that state has no room.
+# So near to its path, a robot keeps it even if there is none from the state nearest to
+# its pose: a controller has driven it a little aside, where the body of that state has
+# no room.
 BESIDE_PATH = 1.0, 2 * math.pi / HEADINGS
 ON_PATH = (
     0.5,
