@@ -580,7 +580,7 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
             from ddqn_planner.training.prior_training import prior_of
 
             experience.prior = prior_of(
-                grid, experience.evidence.table, experience.prior
+                grid, experience.evidence.places, experience.prior
             )
         except ImportError as error:
             print(f"the map's prior is not trained: {with_remedy(error)}")

@@ -186,10 +186,10 @@ class TaughtExperience(Experience):
     def record(self, seconds: Any, positions: Any) -> Learned:
         """Learn from a drive."""
         learned = super().record(seconds, positions)
-        places = len(self.evidence.table)
+        places = len(self.evidence.places)
         if places > self.places and places >= MORE_PLACES * self.places:
             self.places = places
-            self.prior = prior_of(self.grid, self.evidence.table, self.prior)
+            self.prior = prior_of(self.grid, self.evidence.places, self.prior)
         return learned
 
 

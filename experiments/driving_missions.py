@@ -91,7 +91,7 @@ def run(job: Job) -> Result:
         )
         taught = world_of(source)
         run_in(replace(source, missions=TEACHING), taught, teacher)
-        learner.prior = prior_of(taught.grid, teacher.evidence.table, teacher.prior)
+        learner.prior = prior_of(taught.grid, teacher.evidence.places, teacher.prior)
     return run_in(job, world, learner)
 
 

@@ -142,7 +142,7 @@ def learned() -> Experience:
 
 def test_each_public_call_that_names_a_file_knows_the_home_folder(home: Path) -> None:
     learned().save("~/new/e.npz")
-    assert Experience.load("~/new/e.npz").evidence.table.size
+    assert Experience.load("~/new/e.npz").evidence.places
     network, metadata = load_model("any_map")
     save_model("~/m.safetensors", network, metadata)
     assert find_model("~/m.safetensors") == home / "m.safetensors"
@@ -155,7 +155,7 @@ def test_each_public_call_that_names_a_file_knows_the_home_folder(home: Path) ->
     (home / "n.yaml").write_text(MAP.replace("m.pgm", "~/m.pgm"))
     assert load_map("~/n.yaml").width == 2
     with DriveFolder("~/drives", 0.5, 0.5, "~/new/e.npz") as folder:
-        assert folder.experience.evidence.table.size
+        assert folder.experience.evidence.places
     scenario = paper_scenario()
     with TrainingRun("~/run", [scenario], HyperParameters(steps=1), 0) as run:
         assert run.folder == home / "run"

@@ -14,12 +14,10 @@ from numpy.typing import NDArray
 from ddqn_planner.experience.experience import (
     EXPERIENCE,
     LATEST,
-    STAND_DISTANCE,
     Experience,
     Learned,
-    averaged,
-    ways,
 )
+from ddqn_planner.experience.visits import STAND_DISTANCE, averaged, ways
 from ddqn_planner.files import (
     MAX_RECORD_BYTES,
     Appender,

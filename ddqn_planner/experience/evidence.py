@@ -1,298 +1,305 @@
-"""What drives showed at places of the world: how slow driving is, and where robots wait."""
+"""What drives showed of places of the world: how slow driving is, where robots wait."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.experience.posterior import (
-    FEW_PLACES,
-    NOISE,
-    Posterior,
-)
+from ddqn_planner.experience.places import COLUMNS, NOISE, Float64, Int64, Places
+from ddqn_planner.experience.population import KNOWN_WEIGHT, population_of
+from ddqn_planner.experience.posterior import Posterior
 from ddqn_planner.experience.prior import Prior
+from ddqn_planner.experience.visits import Visits
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
 from ddqn_planner.grid.grid_map import check_grid
 
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
+# Metres from the origin of the map. A place farther away is not believed.
+FARTHEST = 1e7
 
-FARTHEST = 1e7  # metres from the origin of the map: a place beyond is not believed
+# A drive has found a change if the mean log slowness of so many known places in a row
+# is off by more than so many standard deviations.
+PART = 8
+SURPRISE = 3.5
+# The standard deviation of that mean, as each path through a place is another.
+PART_NOISE = 0.12
+# From bound to bound of drives' errors. Where errors are larger, so is a surprise.
+USUAL_RANGE = 4.0
+# A surprise is also more than so many times this quantile of the largest surprises of
+# earlier drives.
+UNUSUAL = 2.5
+SURPRISE_QUANTILE = 0.95
+# The share of all evidence that remains after a change: other places may have changed.
+SHARE_AFTER_CHANGE = 0.01
 
-VARIANCE, VARIED_PLACES = 1.0, 4.0  # of the log slowness of places, as if of so many
-LEAST_VARIANCE, MOST_VARIANCE = 0.05, 2.0
-ALIKE = 8.0  # so many places of a path tell as much of other places as one alone
-NOMINAL = (
-    2.0  # inverse variance of the log slowness of all places, before the first drive
-)
-TRUST, TRUSTED = 0.2, 1.0  # in the prior: at first, and the inverse variance of that
-SURE_PLACES = 20  # fewer say nothing about the robot's speed in the open
-KNOWN = 0.7  # weight of visits from which a place is known
+MOST_PASSAGES = 20.0  # a wait is the mean over about so many passages
+# A passage counts for the waits up to so many sides of a place away.
+NEAR_WAIT = 4
 
-PART, SURPRISE = (
-    8,
-    3.5,
-)  # so many places have changed if they are off by more deviations
-USUAL = 4.0  # from bound to bound of drives' errors; where it is more, so is a surprise
-UNUSUAL, OF_DRIVES = (
-    2.5,
-    0.95,
-)  # and by so many times this quantile of drives' greatest surprises
-PART_NOISE = 0.12  # of their mean log slowness, as each way through a place is another
-CHANGED = (
-    0.01  # share of all evidence that is left then: where one place changed, others did
-)
+# A drive through fewer places says little about how sure expected times are.
+SHORTEST = 8
+# So many drives' errors count, and so many normal errors are assumed before them.
+LAST_DRIVES = 64
+ASSUMED_DRIVES = 8
+# 90 % of a normal distribution lie within so many standard deviations.
+NORMAL = 1.645
+# The share of the errors beyond each bound: not 5 %, as few drives tell little of the
+# next drive.
+TAIL = 0.025
 
-MOST_PASSAGES = 20.0  # a wait is the mean of about the last so many
-
-SHORTEST = (
-    8  # a drive through fewer places says little about how sure expected times are
-)
-KEPT, ASSUMED = (
-    64,
-    8,
-)  # drives whose errors count, and drives assumed before, with normal errors
-NORMAL = 1.645  # 90 % of a normal distribution lie within so many standard deviations
-TAIL = 0.025  # of these errors beyond each bound: not 5 %, as few drives tell little of the next
-
-# Of each place: the weight of its visits, that times their log slowness, the weight of those since
-# a robot first waited near, the seconds that robots waited there, what the prior foretold of it
-# before, and where it was visited first.
-COLUMNS = "weight", "log", "passed", "waited", "foretold", "x", "y"
-
-
-class Visits(NamedTuple):
-    """What a drive showed of its V places, one after the other, and of its W waits."""
-
-    position: Float64  # (V, 2)
-    seconds: Float64  # (V,): without waits
-    metres: Float64  # (V,)
-    waits: Float64  # (W, 3): x, y, seconds
+Square = tuple[int, int]
 
 
 class Evidence:
-    """What was seen at each place, a square of the world. It fades with the time that is driven."""
+    """What was seen at each place. It fades with the time that is driven."""
 
     def __init__(
         self, nominal_speed: float, robot_width: float, half_life: float
     ) -> None:
-        self.nominal_speed, self.half_life, self.side = (
-            nominal_speed,
-            half_life,
-            robot_width / 2,
-        )
+        self.nominal_speed = nominal_speed
+        self.half_life = half_life
+        self.side = robot_width / 2  # of a place, metres
         self.forget()
 
     def forget(self) -> None:
         """Forget all."""
         self.prior: Prior | None = None
-        self.driven = 0.0
-        self.table = np.zeros((0, len(COLUMNS)))
-        self.rows: dict[complex, int] = {}  # of the table, by square of the world
-        # Of the last drives' log times, and the greatest of each, both in standard deviations.
-        self.errors, self.surprises = (
-            deque[float](maxlen=KEPT),
-            deque[float](maxlen=KEPT),
-        )
+        self.driven = 0.0  # seconds
+        self.places = Places.none()
+        self._rows: dict[Square, int] = {}  # of the places
+        # Of the last drives: the error of the log time, and the largest surprise, both
+        # in standard deviations.
+        self.errors = deque[float](maxlen=LAST_DRIVES)
+        self.surprises = deque[float](maxlen=LAST_DRIVES)
         self.posterior: Posterior | None = None  # over the last map
         self._fit()
+
+    def _fit(self) -> None:
+        self.population = population_of(self.places)
 
     def add(self, visits: Visits) -> None:
         """Learn from a drive."""
         self._compare(visits)
-        weight, slowness = visits.metres / self.side, visits.seconds / visits.metres
-        log = np.log(
-            np.clip(slowness * self.nominal_speed, 1 / MAX_SLOWNESS, MAX_SLOWNESS)
-        )
-        rows, waited = (
-            self._rows_at(visits.position),
-            self._rows_at(visits.waits[:, :2]),
-        )
-        if self._has_changed(rows, log):
-            self._fade(CHANGED)
-        np.add.at(self.table[:, 3], waited, visits.waits[:, 2])
-        # Only passages from the first wait on tell how long a wait is.
-        away = visits.position[:, None] - self.table[self.table[:, 3] > 0, 5:]
-        is_near = (
-            np.hypot(away[..., 0], away[..., 1]).min(axis=1, initial=np.inf)
-            <= 4 * self.side
-        )
-        seen = weight[:, None] * np.column_stack([np.ones(len(log)), log, is_near])
-        np.add.at(self.table[:, :3], rows, seen)
-        self.table[waited, 2] = np.maximum(self.table[waited, 2], 1)
-        self.table[:, 2:4] /= np.maximum(self.table[:, 2:3] / MOST_PASSAGES, 1)
-        seconds = float(visits.seconds.sum() + visits.waits[:, 2].sum())
-        self.driven += seconds
-        self._fade(0.5 ** (seconds / self.half_life))
+        slowness = visits.seconds / visits.metres * self.nominal_speed  # (V,)
+        log = np.log(np.clip(slowness, 1 / MAX_SLOWNESS, MAX_SLOWNESS))
+        rows = self._rows_at(visits.position)
+        rows_of_waits = self._rows_at(visits.waits.position)
+        surprises = self._surprises_of(rows, log)
+        if surprises:
+            largest = max(surprises)
+            has_changed = largest > self._usual_surprise()
+            self.surprises.append(largest)
+            if has_changed:
+                self.places.fade(SHARE_AFTER_CHANGE)
+        self._add_visits(visits, rows, log, rows_of_waits)
+        self.driven += visits.total_seconds
+        self.places.fade(0.5 ** (visits.total_seconds / self.half_life))
         self._fit()
 
-    def _fade(self, share: float) -> None:
-        """Let all evidence count less."""
-        self.table[:, :4] *= share
+    def _add_visits(
+        self, visits: Visits, rows: Int64, log: Float64, rows_of_waits: Int64
+    ) -> None:
+        """Add the visits and waits of a drive to the sums of their places.
 
-    def _has_changed(self, rows: Int64, log: Float64) -> bool:
-        """Return whether a part of a drive was other than all before."""
-        weight = self.table[rows, 0]
-        known = np.flatnonzero(weight >= KNOWN)
-        surprises = log.copy()
-        surprises[known] -= self.table[rows[known], 1] / weight[known]
-        found = []
-        for part in np.array_split(known, max(1, len(known) // PART)):
-            if len(part) >= PART / 2:
-                surprise = surprises[part].mean()
-                variance = (
-                    NOISE * (1 + 1 / weight[part]).mean() / len(part) + PART_NOISE**2
-                )
-                found.append(abs(float(surprise)) / math.sqrt(variance))
+        Parameters
+        ----------
+        visits : Visits
+            V visits and W waits.
+        rows, log : (V,) int64, (V,) float64
+            The place of each visit, and its log slowness.
+        rows_of_waits : (W,) int64
+            The place of each wait.
+        """
+        places = self.places
+        np.add.at(places.waited, rows_of_waits, visits.waits.seconds)
+        # Only passages from the first wait on tell how long a wait is.
+        position_of_waits = places.position[places.waited > 0]
+        away = visits.position[:, None] - position_of_waits  # (V, all waits, 2)
+        distance = np.hypot(away[..., 0], away[..., 1])
+        nearest = distance.min(axis=1, initial=np.inf)
+        passes_wait = nearest <= NEAR_WAIT * self.side
+        weight = visits.metres / self.side
+        np.add.at(places.weight, rows, weight)
+        np.add.at(places.sum_of_log, rows, weight * log)
+        np.add.at(places.passages, rows, weight * passes_wait)
+        places.passages[rows_of_waits] = np.maximum(places.passages[rows_of_waits], 1)
+        excess = np.maximum(places.passages / MOST_PASSAGES, 1)
+        places.passages /= excess
+        places.waited /= excess
+
+    def _surprises_of(self, rows: Int64, log: Float64) -> list[float]:
+        """Return how far the known parts of a drive are from what was seen before.
+
+        Each surprise is in standard deviations.
+        """
+        weight = self.places.weight[rows]  # (V,)
+        known = np.flatnonzero(weight >= KNOWN_WEIGHT)
+        mean = self.places.sum_of_log[rows[known]] / weight[known]
+        differences = log[known] - mean
+        visits = 1 + 1 / weight[known]  # the variance of each difference, in NOISE
+        count = max(1, len(known) // PART)
+        surprises = []
+        for part in np.array_split(np.arange(len(known)), count):
+            if len(part) < PART / 2:
+                continue
+            variance = NOISE * visits[part].mean() / len(part) + PART_NOISE**2
+            difference = abs(float(differences[part].mean()))
+            surprises.append(difference / math.sqrt(variance))
+        return surprises
+
+    def _usual_surprise(self) -> float:
+        """Return up to which surprise nothing has changed."""
         # What is often slower in one direction has not changed.
         low, _, high = self.quantiles()
-        usual = UNUSUAL * float(
-            np.quantile([*self.surprises, *[1.0] * ASSUMED], OF_DRIVES)
-        )
-        if found:
-            self.surprises.append(max(found))
-        return max(found, default=0) > max(
-            SURPRISE * max(float(high - low) / USUAL, 1), usual
-        )
+        from_errors = SURPRISE * max(float(high - low) / USUAL_RANGE, 1)
+        surprises = [*self.surprises, *[1.0] * ASSUMED_DRIVES]
+        from_surprises = UNUSUAL * float(np.quantile(surprises, SURPRISE_QUANTILE))
+        return max(from_errors, from_surprises)
 
     def _rows_at(self, position: Float64) -> Int64:
-        """Return the row of each position (N, 2); new places get one, in the order of visits."""
-        squares = (np.floor(position / self.side) @ [1, 1j]).tolist()
-        rows = np.array(
-            [self.rows.setdefault(it, len(self.rows)) for it in squares], np.int64
-        )
-        found, first = np.unique(rows, return_index=True)
-        new = position[first[found >= len(self.table)]]
-        fresh = np.zeros((len(new), len(COLUMNS)))
-        fresh[:, 5:] = new
+        """Return the row of each position (N, 2); new places are added in their order."""
+        squares = np.floor(position / self.side).astype(np.int64)
+        rows = np.empty(len(squares), np.int64)
+        new = []  # indices of the positions
+        for index, (x, y) in enumerate(squares.tolist()):
+            square = x, y
+            if square not in self._rows:
+                self._rows[square] = len(self._rows)
+                new.append(index)
+            rows[index] = self._rows[square]
+        predicted = np.zeros(len(new))
         if self.posterior is not None:
-            fresh[:, 4] = np.append(self.posterior.foretold, 0)[
-                self.posterior.places_at(new)
-            ]
-        self.table = np.concatenate([self.table, fresh])
+            # The place of a position off the map is -1: the last value.
+            of_places = np.append(self.posterior.predicted, 0)
+            predicted = of_places[self.posterior.places_at(position[new])]
+        self.places.append(predicted, position[new])
         return rows
 
-    def _fit(self) -> None:
-        """Learn what all places have in common, how they differ, and what the prior is worth."""
-        used = self.table[:, 0] >= 0.2
-        weight, sum_of_log, foretold = (
-            self.table[used, 0],
-            self.table[used, 1],
-            self.table[used, 4],
-        )
-        log = sum_of_log / weight
-        columns = np.column_stack([np.ones(len(log)), foretold])
-        self.variance = VARIANCE  # of the log slowness of places
-        for _ in range(3):  # either tells of the other
-            # Bayesian regression of the log slowness on 1 and on what the prior foretold.
-            shares = columns.T / (self.variance + NOISE / weight) / ALIKE
-            variances = np.linalg.inv(np.diag([NOMINAL, TRUSTED]) + shares @ columns)
-            # Few places may be slow by chance where the prior says so: it is worth a standard
-            # error less than they tell.
-            doubt = (1 - TRUSTED * variances[1, 1]) * math.sqrt(variances[1, 1])
-            fitted = variances[1] @ ([0, TRUSTED * TRUST] + shares @ log)
-            worth = max(float(fitted) - doubt, 0)
-            in_common = (
-                shares[0] @ (log - worth * foretold) / (NOMINAL + shares[0].sum())
-            )
-            self.trust = float(in_common), worth
-            squares = (log - columns @ self.trust) ** 2 - NOISE / weight
-            total = VARIED_PLACES * VARIANCE + squares.sum() / ALIKE
-            variance = total / (VARIED_PLACES + len(log) / ALIKE)
-            self.variance = float(np.clip(variance, LEAST_VARIANCE, MOST_VARIANCE))
-        # The mean of an exponential is more than 1, as far as drives have shown that times differ.
-        self.surplus = (self.variance + NOISE) / 2 * len(log) / (FEW_PLACES + len(log))
-        sure = log[weight >= KNOWN]
-        # Logarithms of how slow the robot is in the open, and where it is fastest.
-        quantiles = (
-            np.quantile(sure, (0.25, 0.05)) if len(sure) >= SURE_PLACES else np.zeros(2)
-        )
-        self.open, self.fastest = map(float, quantiles)
-
     def _compare(self, visits: Visits) -> None:
-        """Compare the time of a drive with the one expected on the last map."""
+        """Compare the time of a drive with the time expected on the last map."""
         if self.posterior is None:
             return
         places = self.posterior.places_at(visits.position)
-        free = places >= 0
-        if free.sum() >= SHORTEST:
-            nominal = visits.metres[free] / self.nominal_speed
-            level = nominal * self.posterior.slowness[places[free]]
-            expected, deviation = self.posterior.time(level, places[free])
-            seconds = visits.seconds[free].sum() + visits.waits[:, 2].sum()
-            self.errors.append(math.log(seconds / expected) / deviation)
+        is_free = places >= 0
+        if is_free.sum() < SHORTEST:
+            return
+        nominal = visits.metres[is_free] / self.nominal_speed
+        seconds_of_places = nominal * self.posterior.slowness[places[is_free]]
+        expected, deviation = self.posterior.time(seconds_of_places, places[is_free])
+        seconds = visits.seconds[is_free].sum() + visits.waits.seconds.sum()
+        self.errors.append(math.log(seconds / expected) / deviation)
 
     def quantiles(self) -> Float64:
-        """Return the lower bound, the mean, and the upper bound of 90 % of the errors of drives."""
-        errors = np.concatenate(
-            [self.errors, NORMAL * np.linspace(-1.05, 1.05, ASSUMED)]
-        )
+        """Return the lower bound, mean and upper bound of 90 % of drives' errors: (3,)."""
+        assumed = NORMAL * np.linspace(-1.05, 1.05, ASSUMED_DRIVES)
+        errors = np.concatenate([self.errors, assumed])
         low, high = np.quantile(errors, (TAIL, 1 - TAIL))
         return np.array([low, errors.mean(), high])
 
     def over(self, grid: GridMap) -> Posterior:
-        """Return the posterior over a map, whose places are found anew if the map is another."""
+        """Return the posterior over a map, from the last one if the cells are the same."""
         check_grid(grid)
-        posterior, self.posterior = (
-            self.posterior,
-            None,
-        )  # an exception must not leave a part of it
-        if (
-            posterior is None
-            or (posterior.grid.resolution, posterior.grid.origin)
-            != (grid.resolution, grid.origin)
-            or not np.array_equal(posterior.grid.occupancy, grid.occupancy)
-        ):
-            posterior = Posterior(grid, self.side)
+        posterior = self.posterior
+        # An exception must not leave a posterior that is half updated.
+        self.posterior = None
+        if posterior is None or not _has_cells_of(posterior.grid, grid):
+            posterior = Posterior(grid, self.side, self.nominal_speed)
         posterior.grid = grid
-        posterior.update(self)
+        posterior.update(self.places, self.population, self.prior)
         self.posterior = posterior
         return posterior
 
     def merge(self, other: Evidence) -> None:
-        """Add what other evidence has, which takes over the prior."""
-        known, prior = (
-            len(self.table),
-            other.prior if self.prior is None else self.prior,
-        )
-        for each in (self, other):
-            each.use_prior(prior)
-        rows = self._rows_at(other.table[:, 5:])
-        self.table[rows, :4] += other.table[:, :4]
-        self.table[rows[rows >= known], 4] = other.table[rows >= known, 4]
+        """Add other evidence, whose predictions change to the prior of both."""
+        prior = other.prior if self.prior is None else self.prior
+        self.use_prior(prior)
+        other.use_prior(prior)
+        count = len(self.places)
+        rows = self._rows_at(other.places.position)
+        places = self.places
+        places.weight[rows] += other.places.weight
+        places.sum_of_log[rows] += other.places.sum_of_log
+        places.passages[rows] += other.places.passages
+        places.waited[rows] += other.places.waited
+        is_new = rows >= count
+        places.predicted[rows[is_new]] = other.places.predicted[is_new]
         self.errors += other.errors
         self.surprises += other.surprises
         self.driven += other.driven
         self._fit()
 
     def use_prior(self, prior: Prior | None) -> None:
-        """Let another prior foretell; its level, learned from these places, counts but once."""
-        old, new = (
-            0.0 if each is None else float(each.level) for each in (self.prior, prior)
-        )
-        self.table[:, 4] += new - old
+        """Predict with another prior.
+
+        The level of a prior was learned from these places. Their predictions move by the
+        difference of the two levels, so that it does not count twice.
+        """
+        self.places.predicted += _level_of(prior) - _level_of(self.prior)
         self.prior = prior
         self._fit()
 
-    def restore(self, *arrays: NDArray[Any]) -> None:
-        """Take the table and all else of a file; a ValueError if that cannot be true."""
-        given = [array.astype(np.float64) for array in arrays]
-        table, driven, errors, surprises = given
-        places = len(table)
-        shapes = (places, len(COLUMNS)), (), (errors.size,), (surprises.size,)
-        if (
-            shapes != tuple(array.shape for array in given)
-            or not all(np.isfinite(array).all() for array in given)
-            or min(table[:, [0, 2, 3]].min(initial=0), driven) < 0
-            or np.abs(table[:, 5:]).max(initial=0) > FARTHEST
-            or len(np.unique(self._rows_at(table[:, 5:]))) < places
-        ):
+    def restore(
+        self,
+        table: NDArray[np.float64],
+        driven: NDArray[np.float64],
+        errors: NDArray[np.float64],
+        surprises: NDArray[np.float64],
+    ) -> None:
+        """Restore from arrays; a ValueError if they are inconsistent.
+
+        Parameters
+        ----------
+        table : (N, 7) float64
+            See `Places.table`.
+        driven : () float64
+            Seconds.
+        errors, surprises : (D,) float64
+            Of the last drives.
+        """
+        if not _is_consistent(table, driven, errors, surprises):
             raise ValueError("its evidence cannot be true")
-        self.table, self.driven = table, float(driven)
-        self.errors, self.surprises = deque(errors, KEPT), deque(surprises, KEPT)
+        places = Places.from_table(table)
+        rows = self._rows_at(places.position)
+        if len(np.unique(rows)) < len(places):
+            raise ValueError("its evidence cannot be true")
+        self.places = places
+        self.driven = float(driven)
+        self.errors = deque(errors.tolist(), LAST_DRIVES)
+        self.surprises = deque(surprises.tolist(), LAST_DRIVES)
         self._fit()
+
+
+def _has_cells_of(grid: GridMap, other: GridMap) -> bool:
+    """Return whether two maps have the same free cells at the same places."""
+    return (
+        grid.resolution == other.resolution
+        and grid.origin == other.origin
+        and np.array_equal(grid.occupancy, other.occupancy)
+    )
+
+
+def _level_of(prior: Prior | None) -> float:
+    return 0.0 if prior is None else float(prior.level)
+
+
+def _is_consistent(
+    table: Float64, driven: Float64, errors: Float64, surprises: Float64
+) -> bool:
+    """Return whether arrays can be those of evidence."""
+    if table.ndim != 2 or table.shape[1] != COLUMNS or driven.shape != ():
+        return False
+    if errors.ndim != 1 or surprises.ndim != 1:
+        return False
+    if not all(np.isfinite(a).all() for a in (table, driven, errors, surprises)):
+        return False
+    places = Places.from_table(table)
+    lowest = min(
+        places.weight.min(initial=0),
+        places.passages.min(initial=0),
+        places.waited.min(initial=0),
+        driven,
+    )
+    return bool(lowest >= 0 and np.abs(places.position).max(initial=0) <= FARTHEST)

@@ -6,9 +6,8 @@ import copy
 import io
 import math
 import reprlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 from zlib import crc32
@@ -16,8 +15,16 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ddqn_planner.experience.evidence import FARTHEST, Evidence, Visits
+from ddqn_planner.experience.evidence import FARTHEST, Evidence
+from ddqn_planner.experience.posterior import Posterior
 from ddqn_planner.experience.prior import Prior
+from ddqn_planner.experience.visits import (
+    Limits,
+    Visits,
+    speeds_of,
+    visits_of,
+    window_of,
+)
 from ddqn_planner.files import as_path, differences, locked, read_file, write_atomically
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import (
@@ -35,14 +42,9 @@ Float64 = NDArray[np.float64]
 
 MAX_FILE_BYTES = 2**27  # a larger file is refused before it is read
 VERSION = 3  # 2 was never released
+FIRST_VERSION = 1  # until 0.4.0
 PRIOR = "prior_"  # before the names of its arrays in a file
 EXPERIENCE = "experience.npz"  # the name of the file in a folder
-ARRAYS = (
-    "evidence",
-    "driven",
-    "errors",
-    "surprises",
-)  # see `Evidence.restore`
 SPEEDS = 0.001, 1000.0  # metres per second
 WIDTHS = 0.01, 100.0  # metres
 # The range of each option, and its unit.
@@ -54,28 +56,12 @@ OPTIONS = {
 }
 
 LATEST = 1e12  # seconds of a clock: a pose of a later time is not believed
-MOST_SPEED = (
-    10.0  # times the nominal speed: a robot that usually drives faster is not believed
-)
-WINDOW, LONGEST_WINDOW = (
-    0.15,
-    0.3,
-)  # metres at nominal speed, in whose time poses are averaged
-LEFT_NOISE = 0.015  # metres: the deviation of these means; more would hide slowness
-STAND_DISTANCE = 0.1  # metres within which a robot stands
-STAND = (
-    1.5  # metres at nominal speed: a robot that drives needs less time to leave a place
-)
-FAST_STEP = 0.1  # of the log speed, by which the fastest move that a map knows of becomes faster
-CORRECTION = (
-    0.25  # metres by which a localisation may move a pose at once: the drive goes on
-)
-RELOCATION = (
-    1.0  # a jump by this many metres more puts the robot at a place not believed
-)
-MEMORY = (
-    60.0  # seconds over which a robot whose pose is not believed counts as driving on
-)
+# Times the nominal speed: a robot that usually drives faster is not believed.
+MOST_SPEED = 10.0
+# Times the usual speed: a faster move is not believed.
+MOST_OF_USUAL_SPEED = 3
+# Of the log speed: the steps in which the fastest move that a map knows of changes.
+FAST_STEP = 0.1
 
 
 class ExperienceFileError(ValueError):
@@ -96,12 +82,18 @@ class Learned(NamedTuple):
     places: int  # that were passed, or waited at
     seconds: float  # that were spent there
     reason: str = ""  # why nothing was learned, and what to do
-    is_possible: bool = (
-        True  # no robot with the nominal speed can have driven so, if False
-    )
+    # False if no robot with the nominal speed can have driven so.
+    is_possible: bool = True
 
     def __bool__(self) -> bool:
         return self.places > 0
+
+
+class Clip(NamedTuple):
+    """N poses of a drive that are possible."""
+
+    time: Float64  # (N,): seconds
+    position: Float64  # (N, 2): metres
 
 
 class Experience:
@@ -136,10 +128,10 @@ class Experience:
         half_life: float = 36_000.0,
         max_pause: float = 90.0,
     ) -> None:
-        values = nominal_speed, robot_width, half_life, max_pause
-        self.nominal_speed, self.robot_width, self.half_life, self.max_pause = (
-            _as_option(name, value) for name, value in zip(OPTIONS, values, strict=True)
-        )
+        self.nominal_speed = _as_option("nominal_speed", nominal_speed)
+        self.robot_width = _as_option("robot_width", robot_width)
+        self.half_life = _as_option("half_life", half_life)
+        self.max_pause = _as_option("max_pause", max_pause)
         self.evidence = Evidence(self.nominal_speed, self.robot_width, self.half_life)
         # The file that holds this experience, less what is new.
         self._synchronised: tuple[Path | None, int] = None, 0
@@ -177,46 +169,53 @@ class Experience:
         count = numbers("seconds", seconds).size
         time = numbers("seconds", seconds, (count,)).astype(np.float64)
         position = numbers("positions", positions, (count, 2)).astype(np.float64)
-        # Comparisons with NaN are false.
-        possible = (np.abs(time) < LATEST) & (np.abs(position) < FARTHEST).all(axis=1)
-        time, position = time[possible], position[possible]
-        fresh = np.diff(time, prepend=np.nan) != 0  # a repeated time adds nothing
-        time, position = time[fresh], position[fresh]
-        if len(time) >= 2:
-            window = _window(time, position, self.learned_speed)
-            speeds = _speeds(time, position, window)
-            usual_speed = float(np.median(speeds)) if len(speeds) else 0.0
-            if usual_speed > self.nominal_speed * MOST_SPEED:
-                return Learned(0, 0.0, self._too_fast(usual_speed), is_possible=False)
-            visits = self._measured(time, position, window, usual_speed)
-            places = len(visits.seconds) + len(visits.waits)
-            fastest = float(speeds.max(initial=0))
-            if places and fastest < self.nominal_speed / MAX_SLOWNESS:
-                return Learned(0, 0.0, self._too_slow(fastest), is_possible=False)
-            self._learn(partial(Evidence.add, visits=visits))
-            if places:
-                return Learned(
-                    places, float(visits.seconds.sum() + visits.waits[:, 2].sum())
-                )
-        return Learned(0, 0.0, self._why_nothing(time, position, count))
+        poses = _possible(time, position)
+        if len(poses.time) < 2:
+            return Learned(0, 0.0, self._why_nothing(poses, count))
+        window = window_of(poses.time, poses.position, self.learned_speed)
+        speeds = speeds_of(poses.time, poses.position, window)
+        usual_speed = float(np.median(speeds)) if len(speeds) else 0.0
+        if usual_speed > self.nominal_speed * MOST_SPEED:
+            return Learned(0, 0.0, self._too_fast(usual_speed), is_possible=False)
+        limits = Limits(
+            window=window,
+            speed=self.learned_speed,
+            max_speed=max(self.max_speed, MOST_OF_USUAL_SPEED * usual_speed),
+            max_pause=self.max_pause,
+        )
+        visits = visits_of(poses.time, poses.position, self.evidence.side, limits)
+        places = len(visits.seconds) + len(visits.waits.seconds)
+        fastest = float(speeds.max(initial=0))
+        if places and fastest < self.nominal_speed / MAX_SLOWNESS:
+            return Learned(0, 0.0, self._too_slow(fastest), is_possible=False)
+        self._learn(partial(Evidence.add, visits=visits))
+        if not places:
+            return Learned(0, 0.0, self._why_nothing(poses, count))
+        return Learned(places, visits.total_seconds)
 
-    def _why_nothing(self, time: Float64, position: Float64, count: int) -> str:
-        """Return why poses (N,) that are possible, of so many, are no drive."""
-        if len(time) < 2:
-            given = (
-                f"{len(time)} of {count} poses are possible and differ in their time"
+    def _why_nothing(self, poses: Clip, count: int) -> str:
+        """Return why the possible ones among `count` poses are no drive."""
+        if len(poses.time) < 2:
+            return (
+                f"{len(poses.time)} of {count} poses are possible and differ in their "
+                "time; give two or more, in finite seconds, and metres up to "
+                f"{FARTHEST:g}"
             )
-            limits = f"finite seconds, and metres up to {FARTHEST:g}"
-            return f"{given}; give two or more, in {limits}"
-        elapsed, metres = np.diff(time), np.hypot(*np.diff(position, axis=0).T)
-        if (elapsed < 0).any():
-            return f"{np.count_nonzero(elapsed < 0)} times are earlier than those before; sort them"
+        elapsed = np.diff(poses.time)
+        dx, dy = np.diff(poses.position, axis=0).T
+        backwards = np.count_nonzero(elapsed < 0)
+        if backwards:
+            return f"{backwards} times are earlier than those before; sort them"
         if (elapsed > self.max_pause).any():
-            return f"the times are up to {elapsed.max():.3g} s apart; give at most {self.max_pause:g}"
-        fastest = float((metres / elapsed).max())
+            return (
+                f"the times are up to {elapsed.max():.3g} s apart; give at most "
+                f"{self.max_pause:g}"
+            )
+        fastest = float((np.hypot(dx, dy) / elapsed).max())
         if fastest > self.max_speed:
             return self._too_fast(fastest)
-        extent = float(np.hypot(*(position - position[0]).T).max())
+        from_start_x, from_start_y = (poses.position - poses.position[0]).T
+        extent = float(np.hypot(from_start_x, from_start_y).max())
         return f"the robot comes no farther than {extent:.2g} m; give a longer drive"
 
     def _too_fast(self, speed: float) -> str:
@@ -227,43 +226,18 @@ class Experience:
         remedy = f"give metres and seconds, or a nominal_speed less than {self.nominal_speed:g}"
         return f"the robot moves at most at {speed:.3g} m/s; {remedy} m/s"
 
-    def _measured(
-        self, time: Float64, position: Float64, window: float, usual_speed: float
-    ) -> Visits:
-        """Return the visits of a drive."""
-        speed, side = self.learned_speed, self.evidence.side
-        max_speed, step = max(self.max_speed, 3 * usual_speed), max(side, WINDOW) / 2
-        steps, waits = [np.zeros((0, 3))], [np.zeros((0, 3))]
-        for part in _believed_parts(time, position, max_speed, self.max_pause):
-            seconds, at = averaged(time[part], position[part], window)
-            # Standing at the ends of a drive is no waiting on the way.
-            way = np.array(ways(at, STAND_DISTANCE)[1:], dtype=np.int64)
-            if not len(way):
-                continue
-            stood = seconds[way[1:] - 1] - seconds[way[:-1]]
-            stood[stood < STAND / speed] = 0
-            # A robot waits for what is ahead, often where ways part: no other way waits for it.
-            waited = np.column_stack([at[way[1:]], stood])
-            waits.append(waited[(stood > 0) & (stood <= self.max_pause)])
-            steps.append(_steps(np.diff(seconds[way]) - stood, at[way], step))
-        rows = np.concatenate(steps)
-        rows = rows[step <= max_speed * rows[:, 2]]
-        squares = np.floor(rows[:, :2] / side)
-        entered = np.flatnonzero(
-            (np.diff(squares, axis=0, prepend=np.nan) != 0).any(axis=1)
-        )
-        count, sums = np.diff(entered, append=len(rows)), np.add.reduceat(rows, entered)
-        middle, waited = sums[:, :2] / count[:, None], np.concatenate(waits)
-        return Visits(middle, sums[:, 2], step * count, waited)
-
     def record_failure(self, position: Sequence[float]) -> None:
         """Learn that the robot failed at a place: it costs as much as a wait of `max_pause`."""
-        near, remedy = (-FARTHEST, FARTHEST), f"metres, at most {FARTHEST:g}"
         point = numbers(
-            "the position", position, (2,), between=near, whole=False, remedy=remedy
+            "the position",
+            position,
+            (2,),
+            between=(-FARTHEST, FARTHEST),
+            whole=False,
+            remedy=f"metres, at most {FARTHEST:g}",
         )
-        none, waits = np.zeros((0, 2)), np.array([[*point, self.max_pause]])
-        visits = Visits(none, none[:, 0], none[:, 0], waits)
+        x, y = point.tolist()
+        visits = Visits.of_wait(x, y, self.max_pause)
         self._learn(partial(Evidence.add, visits=visits))
 
     def _learn(self, step: Callable[[Evidence], None]) -> None:
@@ -288,7 +262,8 @@ class Experience:
         if not isinstance(other, Experience):
             remedy = "give an Experience, as Experience.load returns it"
             raise ValueError(f"the other experience is {reprlib.repr(other)}; {remedy}")
-        if changed := differences(other.options, self.options):
+        changed = differences(other.options, self.options)
+        if changed:
             raise ValueError(
                 f"the other experience has {changed}; give those of one kind of robot"
             )
@@ -301,7 +276,7 @@ class Experience:
     @property
     def learned_speed(self) -> float:
         """Metres per second in the open, as drives show; at first the nominal speed."""
-        return self.nominal_speed / math.exp(self.evidence.open)
+        return self.nominal_speed / math.exp(self.evidence.population.open_log)
 
     @property
     def prior(self) -> Prior | None:
@@ -314,9 +289,13 @@ class Experience:
 
     def take_over(self, older: Experience) -> None:
         """Use what older experience solved for its map, which forgets it."""
-        mine, its = self.evidence, older.evidence
-        if mine.side == its.side:
-            mine.posterior, its.posterior = its.posterior, None
+        is_alike = (
+            self.robot_width == older.robot_width
+            and self.nominal_speed == older.nominal_speed
+        )
+        if is_alike:
+            self.evidence.posterior = older.evidence.posterior
+            older.evidence.posterior = None
 
     def apply(self, grid: GridMap, exploration: float = 0.0) -> GridMap:
         """Return a map whose moves cost expected time, so that `Plan.cost` is in seconds.
@@ -331,26 +310,34 @@ class Experience:
             share. `Plan.cost` is what is expected.
         """
         share = as_number("exploration", exploration, 0, 10, "0 to 10")
-        evidence, posterior = self.evidence, self.evidence.over(grid)
-        fastest = FAST_STEP * min(0, math.floor(evidence.fastest / FAST_STEP + 0.5))
-
-        def hoping(name: str, hope: Float64 | float, most: float) -> GridMap:
-            slowness = posterior.paint(name, hope, fastest - most)
-            seconds = grid.resolution / self.nominal_speed * math.exp(fastest - most)
-            return grid.with_layers(slowness=slowness, seconds_per_cell=seconds)
-
-        expected = hoping("expected", 0.0, 0.0)
+        population = self.evidence.population
+        posterior = self.evidence.over(grid)
+        steps = math.floor(population.fastest_log / FAST_STEP + 0.5)
+        fastest = FAST_STEP * min(0, steps)
+        expected = self._timed(grid, posterior, "expected", 0.0, fastest)
         if not share:
             return expected
-        most, hope = (
-            math.log(1 + share),
-            math.sqrt(evidence.variance) * posterior.unknown,
-        )
-        safe = hoping("safe", np.minimum(hope, most), most)
-        bold = hoping(
-            "bold", hope, FAST_STEP * math.ceil(hope.max(initial=0) / FAST_STEP)
-        )
+        # (P,): one standard deviation of the log slowness of each place.
+        deviation = math.sqrt(population.variance) * posterior.unknown
+        limit = math.log(1 + share)
+        limited = np.minimum(deviation, limit)
+        safe = self._timed(grid, posterior, "safe", limited, fastest - limit)
+        largest = FAST_STEP * math.ceil(deviation.max(initial=0) / FAST_STEP)
+        bold = self._timed(grid, posterior, "bold", deviation, fastest - largest)
         return expected.with_layers(exploration=Exploration(share, bold, safe))
+
+    def _timed(
+        self,
+        grid: GridMap,
+        posterior: Posterior,
+        name: str,
+        optimism: Float64 | float,
+        fastest: float,
+    ) -> GridMap:
+        """Return the map with the expected times of places; see `Posterior.paint`."""
+        slowness = posterior.paint(name, optimism, fastest)
+        seconds = grid.resolution / self.nominal_speed * math.exp(fastest)
+        return grid.with_layers(slowness=slowness, seconds_per_cell=seconds)
 
     def slowness(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: seconds, with waits, over those at nominal speed."""
@@ -361,7 +348,7 @@ class Experience:
         """Return (H, W) float32: the standard deviation of the log slowness, most if unknown."""
         posterior = self.evidence.over(grid)
         unknown: Float32 = posterior.over(posterior.unknown.astype(np.float32), 1)
-        return math.sqrt(self.evidence.variance) * unknown
+        return math.sqrt(self.evidence.population.variance) * unknown
 
     def expected_time(self, grid: GridMap, cells: Cells) -> ExpectedTime:
         """Return the time that a path takes, with an interval of 90 %.
@@ -378,10 +365,13 @@ class Experience:
         corners = cells_inside(cells, grid.occupancy.shape)
         if len(corners) < 2:
             return ExpectedTime(0.0, 0.0, 0.0)
-        path, position = cells_along(corners)
-        of_segments = np.hypot(*np.diff(corners, axis=0).T) * grid.resolution
-        metres = np.diff(position) * of_segments[position[:-1].astype(np.int64)]
-        places = posterior.place[path[:, 1], path[:, 0]]
+        path, position = cells_along(corners)  # (N, 2), and (N,) in segments
+        dx, dy = np.diff(corners, axis=0).T
+        metres_of_segments = np.hypot(dx, dy) * grid.resolution
+        segment = position[:-1].astype(np.int64)
+        metres = np.diff(position) * metres_of_segments[segment]  # (N - 1,)
+        x, y = path.T
+        places = posterior.place[y, x]
         slowness = posterior.slowness[places]
         expected = metres / self.nominal_speed * (slowness[1:] + slowness[:-1]) / 2
         seconds, deviation = posterior.time(expected, places[1:])
@@ -421,13 +411,20 @@ class Experience:
 
     def to_bytes(self) -> bytes:
         """Return all as bytes, for a file or a message."""
+        evidence = self.evidence
+        arrays: dict[str, Any] = {
+            "version": VERSION,
+            "options": list(self.options.values()),
+            "evidence": evidence.places.table(),
+            "driven": evidence.driven,
+            "errors": evidence.errors,
+            "surprises": evidence.surprises,
+        }
+        if evidence.prior is not None:
+            for name, array in evidence.prior._asdict().items():
+                arrays[PRIOR + name] = array
         content = io.BytesIO()
-        prior = self.prior._asdict() if self.prior is not None else {}
-        arrays: dict[str, Any] = {PRIOR + name: array for name, array in prior.items()}
-        options, kept = list(self.options.values()), self.evidence
-        tables = kept.table, kept.driven, kept.errors, kept.surprises
-        arrays |= dict(zip(ARRAYS, tables, strict=True))
-        np.savez(content, version=VERSION, options=options, **arrays)
+        np.savez(content, **arrays)
         return content.getvalue()
 
     @classmethod
@@ -439,43 +436,36 @@ class Experience:
         ExperienceFileError
             If the bytes are broken, or no experience.
         """
+        # Broken bytes make zipfile and NumPy raise many kinds of errors.
         try:
-            with np.lib.npyio.NpzFile(
-                io.BytesIO(data)
-            ) as file:  # which unpickles nothing
-                size = sum(entry.file_size for entry in file.zip.infolist())
-                if size > MAX_FILE_BYTES:  # a small file can claim arrays of any size
-                    raise ValueError(
-                        f"it unpacks to {size} bytes, over {MAX_FILE_BYTES}"
-                    )
-                arrays = dict.fromkeys(ARRAYS, np.zeros(0)) | dict(
-                    file
-                )  # older ones lack some
-            version = int(arrays["version"])
-            if version not in (1, VERSION):
-                raise ValueError(f"it has version {version}, not {VERSION}")
-            options = dict(zip(OPTIONS, arrays["options"].tolist(), strict=True))
-            experience = cls(**options)
-            if (
-                version == 1
-            ):  # until 0.4.0 failures stood there, and when a place was visited
-                table = arrays["evidence"]
-                age = (arrays["driven"] - table[:, 5:]) / experience.half_life
-                faded = table[:, :2] * 0.5**age
-                arrays["evidence"] = np.hstack(
-                    [faded, np.zeros((len(faded), 3)), table[:, 3:5]]
-                )
-            experience.evidence.restore(*(arrays[name] for name in ARRAYS))
-            prior = {
-                n.removeprefix(PRIOR): a
-                for n, a in arrays.items()
-                if n.startswith(PRIOR)
-            }
-            experience.evidence.prior = Prior.from_arrays(prior) if prior else None
-        except (
-            Exception
-        ) as error:  # broken bytes make zipfile and NumPy raise many kinds of errors
+            return cls._from_arrays(_arrays_in(data))
+        except Exception as error:
             raise ExperienceFileError(f"no experience: {error}") from error
+
+    @classmethod
+    def _from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Experience:
+        """Return the experience in the arrays of a file."""
+        version = int(arrays["version"])
+        if version not in (FIRST_VERSION, VERSION):
+            raise ValueError(f"it has version {version}, not {VERSION}")
+        options = dict(zip(OPTIONS, arrays["options"].tolist(), strict=True))
+        experience = cls(**options)
+        table = arrays["evidence"].astype(np.float64)
+        driven = arrays["driven"].astype(np.float64)
+        if version == FIRST_VERSION:
+            table = _converted(table, float(driven), experience.half_life)
+        # The first files have neither errors nor surprises.
+        nothing = np.zeros(0)
+        errors = arrays.get("errors", nothing).astype(np.float64)
+        surprises = arrays.get("surprises", nothing).astype(np.float64)
+        experience.evidence.restore(table, driven, errors, surprises)
+        prior = {
+            name.removeprefix(PRIOR): array
+            for name, array in arrays.items()
+            if name.startswith(PRIOR)
+        }
+        if prior:
+            experience.evidence.prior = Prior.from_arrays(prior)
         return experience
 
     @classmethod
@@ -507,68 +497,37 @@ def _as_option(name: str, value: Any) -> float:
     return as_number(name, value, lowest, highest, f"{unit}, {lowest:g} to {highest:g}")
 
 
-def _believed_parts(
-    time: Float64, position: Float64, max_speed: float, max_pause: float
-) -> Iterator[slice]:
-    """Yield the parts of a drive without jumps; after a far one, none until the pose is back."""
-    elapsed, last = np.diff(time), 0
-    far = np.hypot(*np.diff(position, axis=0).T) > max_speed * elapsed + CORRECTION
-    breaks = np.flatnonzero((elapsed <= 0) | (elapsed > max_pause) | far) + 1
-    for first, end in pairwise([0, *breaks.tolist(), len(time)]):
-        way = max_speed * min(max(time[first] - time[last], 0), MEMORY) + RELOCATION
-        if end - first > 1 and math.dist(position[first], position[last]) <= way:
-            last = end - 1
-            yield slice(first, end)
+def _possible(time: Float64, position: Float64) -> Clip:
+    """Return the poses that are possible, and whose time is not that of the one before."""
+    # Comparisons with NaN are false.
+    is_time = np.abs(time) < LATEST
+    is_place = (np.abs(position) < FARTHEST).all(axis=1)
+    is_possible = is_time & is_place
+    time = time[is_possible]
+    position = position[is_possible]
+    is_new = np.diff(time, prepend=np.nan) != 0
+    return Clip(time[is_new], position[is_new])
 
 
-def _speeds(time: Float64, position: Float64, window: float) -> Float64:
-    """Return the speeds of a drive from window to window, in metres per second."""
-    seconds, at = averaged(time, position, window)
-    elapsed = np.abs(np.diff(seconds))
-    metres = np.hypot(*np.diff(at, axis=0).T)
-    speeds: Float64 = metres[elapsed > 0] / elapsed[elapsed > 0]
-    return speeds
+def _arrays_in(data: bytes) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a file by name; nothing is unpickled."""
+    with np.lib.npyio.NpzFile(io.BytesIO(data)) as file:
+        # A small file can claim arrays of any size.
+        size = sum(entry.file_size for entry in file.zip.infolist())
+        if size > MAX_FILE_BYTES:
+            raise ValueError(f"it unpacks to {size} bytes, over {MAX_FILE_BYTES}")
+        return dict(file)
 
 
-def _window(time: Float64, position: Float64, speed: float) -> float:
-    """Return in how many seconds poses are averaged: longer if they have more noise."""
-    bends = np.hypot(*np.diff(position, 2, axis=0).T)
-    if not len(bends):
-        return WINDOW / speed
-    # The median length of second differences of normal noise is 2.88 times its deviation.
-    count = (float(np.median(bends)) / 2.88 / LEFT_NOISE) ** 2
-    least = count * float(np.median(np.abs(np.diff(time)))) * speed
-    return min(max(least, WINDOW), LONGEST_WINDOW) / speed
+def _converted(table: Float64, driven: Float64 | float, half_life: float) -> Float64:
+    """Return the table of a file of version 1 as one of today.
 
-
-def averaged(
-    time: Float64, position: Float64, window: float
-) -> tuple[Float64, Float64]:
-    """Return the means of poses over windows of time: noise of poses is no way that is driven."""
-    begins = np.flatnonzero(
-        np.diff(np.floor((time - time[:1]) / window), prepend=np.nan) != 0
-    )
-    count = np.diff(begins, append=len(time))[:, None]
-    means = np.add.reduceat(np.column_stack([time, position]), begins) / count
-    return means[:, 0], means[:, 1:]
-
-
-def ways(position: Float64, metres: float) -> list[int]:
-    """Return the indices of the first position, and of each that is so far from the one before."""
-    kept, points = [0], position.tolist()
-    for index, at in enumerate(points):
-        if math.dist(at, points[kept[-1]]) >= metres:
-            kept.append(index)
-    return kept
-
-
-def _steps(seconds: Float64, position: Float64, step: float) -> Float64:
-    """Return the middle of each step of a path, and its seconds: (N, 3)."""
-    metres = np.hypot(*np.diff(position, axis=0).T)
-    along, clock = (np.cumsum(np.append(0, values)) for values in (metres, seconds))
-    ends = np.arange(0, along[-1], step)
-    points = np.column_stack(
-        [np.interp(ends, along, axis) for axis in (*position.T, clock)]
-    )
-    middle = (points[1:] + points[:-1]) / 2
-    return np.column_stack([middle[:, :2], np.diff(points[:, 2])])
+    Its columns are weight, sum of the log slowness, failures, x, y, and the seconds that
+    were driven before the last visit.
+    """
+    weight_and_sum = table[:, :2]
+    position = table[:, 3:5]
+    age = (driven - table[:, 5:]) / half_life  # (N, 1): half-lives since the last visit
+    faded = weight_and_sum * 0.5**age
+    nothing = np.zeros((len(table), 3))  # passages, waits, and predictions
+    return np.hstack([faded, nothing, position])

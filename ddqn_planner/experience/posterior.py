@@ -3,228 +3,349 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place
+from ddqn_planner.experience.places import NOISE, Float64, Int64, Places
+from ddqn_planner.experience.population import FEW_PLACES, Population
 from ddqn_planner.experience.prior import Prior, map_features
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
 
-if TYPE_CHECKING:
-    from ddqn_planner.experience.evidence import Evidence
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
-
-NOISE = 0.1  # variance of the log slowness of one visit
 CORRELATION = 1.0  # metres: how far the slowness of a place tells of that of others
-STEP = 0.02  # slowness is told in steps of this share: fields need no repair for less
+# Slowness is rounded to steps of this share: fields need no repair for less.
+STEP = 0.02
 STEPS = (1 + STEP) ** np.arange(1 + round(math.log(MAX_SLOWNESS) / math.log(1 + STEP)))
 STEPS = np.minimum(STEPS, MAX_SLOWNESS).astype(np.float32)
-ACCURACY = (
-    0.01  # of the log slowness: no place is farther from the solution of its equations
-)
+# Of the log slowness: no place is farther from the solution of its equations.
+ACCURACY = 0.01
 OVER_RELAXATION = 1.4  # of the solver: neighbours agree sooner
-WAIT_PLACES = (
-    0.1  # so many places around each one are assumed to be driven without a wait
-)
-FEW_PLACES = 16.0  # it is assumed that so many were driven where nothing was slow
-# Standard deviations of the log time of a drive: on ways that are known, and that are not.
-DRIVE_NOISE, UNSURE = 0.05, 0.42
+# Around each place, so many places are assumed to be driven without a wait.
+WAIT_PLACES = 0.1
+# Standard deviations of the log time of a drive: on known places, and what is added on
+# places that nobody drove.
+DRIVE_NOISE = 0.05
+UNKNOWN_NOISE = 0.42
+
+
+class Painted(NamedTuple):
+    """A layer of the map, and the values of the places from which it was made."""
+
+    values: NDArray[Any]  # (P,)
+    layer: NDArray[Any]  # (H, W)
+
+
+class Equations(NamedTuple):
+    """The linear equations (diagonal - links) x = right of P places, with L links."""
+
+    begins: NDArray[np.int32]  # (P + 1,): the first link of each place
+    neighbours: NDArray[np.int32]  # (L,): the other place of each link
+    strengths: Float64  # (L,)
+    diagonal: Float64  # (P,)
+    tolerance: Float64  # (P,): of the square of a residual
+
+
+class SumsOnMap(NamedTuple):
+    """The sums of `Places`, by the P places of a map: (P,) each."""
+
+    weight: Float64
+    sum_of_log: Float64
+    passages: Float64
+    waited: Float64
 
 
 class Posterior:
     """The posterior of each place of a map: a connected part of a block of free cells.
 
-    The log slowness of a place is normal around what the map lets expect. Neighbours are alike,
-    but not through walls.
+    The log slowness of a place is normal around what the map lets expect. Neighbours
+    are alike, but not through walls.
+
+    Attributes
+    ----------
+    known, unknown : (P,) float64
+        The share of each place's log slowness that was seen, and the share of its
+        standard deviation that remains.
+    mean : (P,) float64
+        The expected log slowness, without waits.
+    slowness : (P,) float64
+        The expected seconds over those at nominal speed, with waits.
     """
 
-    def __init__(self, grid: GridMap, side: float) -> None:
+    def __init__(self, grid: GridMap, side: float, nominal_speed: float) -> None:
         from scipy.ndimage import distance_transform_edt
 
         self.grid = grid
-        self.size = max(1, round(side / grid.resolution))
-        self.spacing = self.size * grid.resolution
-        self.place, self.middle = _places_of(
-            grid, self.size
-        )  # (H, W), -1 where occupied
+        self.side = side
+        self.nominal_speed = nominal_speed
+        self.size = max(1, round(side / grid.resolution))  # cells of a block's side
+        self.spacing = self.size * grid.resolution  # metres
+        # (H, W), -1 where occupied; and (P, 2).
+        self.place, self.middle = _places_of(grid, self.size)
         away, (y, x) = distance_transform_edt(self.place < 0, return_indices=True)
         self.nearest = np.where(away <= 1.5 * self.size, self.place[y, x], -1)
         count = len(self.middle)
         self.links = _links_of(self.place, self.size, count)
-        self.linked = self.links.sum(axis=1)
-        # The solution of linear equations: real, what was seen beyond what is expected; imaginary,
-        # the share that is known.
-        self.solution = np.zeros(count, dtype=np.complex128)
+        self.linked: Float64 = self.links.sum(axis=1)
+        # (P, 2), the solutions of two systems of equations: what was seen beyond what
+        # is expected, and the share that is known.
+        self.solution = np.zeros((count, 2))
         self.prior: Prior | None = None
-        self.foretold = np.zeros(count)  # by the prior
-        self.painted: dict[
-            str, tuple[NDArray[Any], NDArray[Any]]
-        ] = {}  # steps, and the map
+        self.predicted = np.zeros(count)  # log slowness, by the prior
+        self.painted: dict[str, Painted] = {}
 
     def time(self, seconds: Float64, places: Int64) -> tuple[float, float]:
-        """Return the seconds of a path, given those in its places, and their log's deviation."""
+        """Return the seconds of a path and the standard deviation of their logarithm.
+
+        Parameters
+        ----------
+        seconds, places : (N,) float64, (N,) int64
+            The expected seconds of each part of the path, and its place.
+        """
         total = float(seconds.sum())
         unknown = float(seconds @ self.unknown[places] / total)
-        return total, math.hypot(DRIVE_NOISE, UNSURE * unknown)
+        return total, math.hypot(DRIVE_NOISE, UNKNOWN_NOISE * unknown)
 
     def places_at(self, position: Float64) -> Int64:
-        """Return the place of each position (N, 2), the nearest within a place's side, or -1."""
-        cells, inside = cells_of(position, self.grid)
-        x, y = cells.T
-        return np.where(inside, self.nearest[y, x], -1)
+        """Return the place of each position (N, 2), the nearest within a place's side.
 
-    def update(self, evidence: Evidence) -> None:
-        """Take what changed in the evidence, and solve again."""
-        if evidence.prior is not self.prior:
-            self.prior = evidence.prior
-            x, y = self.middle.T
-            features = map_features(self.grid)[y, x]
-            self.foretold[:] = self.prior.log_slowness(features) if self.prior else 0
-        self.expected = evidence.trust[0] + evidence.trust[1] * self.foretold
-        places = self.places_at(evidence.table[:, 5:])
-        on, count = places >= 0, len(self.middle)
-        sums: list[Any] = [
-            np.bincount(places[on], rows[on], count) for rows in evidence.table[:, :4].T
-        ]
-        weight, log, passed, waited = sums
-        # A lattice whose links have strength 1 has about the variance ln(32 / kappa) / 4 pi;
-        # 1 is added for cells of many metres, where that would be negative.
-        kappa = (self.spacing / CORRELATION) ** 2
-        scale = evidence.variance / (math.log1p(32 / kappa) / (4 * math.pi)) / NOISE
-        visits = scale * weight
-        # Half of the noise is added, as the mean of its exponential is more than 1.
-        seen = scale * (log + weight * NOISE / 2)
-        right = seen - visits * self.expected + 1j * visits
-        # The equations map the same error everywhere to its product with these, and greater errors
-        # to greater residuals: residuals up to that product prove that no error is greater.
-        most = (ACCURACY * (kappa + visits)) ** 2
-        diagonal = kappa + self.linked + visits
-        links = self.links.indptr, self.links.indices, self.links.data
-        _relax(*links, diagonal, most, right, self.solution)
-        # Of each place: the share of its log slowness that was seen, that of its standard deviation
-        # which is left, and expected seconds over those at nominal speed, with waits.
-        self.known = np.clip(self.solution.imag, 0, 1)
-        self.unknown = np.sqrt(1 - self.known)
-        self.mean = (
-            self.expected + self.solution.real + evidence.surplus * (1 - self.known)
-        )
-        self.slowness = np.exp(self.mean)
-        if waited.any():
-            self.slowness += evidence.nominal_speed * self._waits(
-                passed, waited, evidence.side
-            )
-
-    def _waits(self, passed: Float64, waited: Float64, side: float) -> Float64:
-        """Return the seconds that a robot waits for each metre through each place.
-
-        They are those waited around it, over the metres driven around it. So each way through costs
-        what a passage did, also beside the place where robots stood.
+        It is -1 where no place is so near.
         """
-        reach = round(2 * side / self.spacing)
-        seconds, places = self._around(waited, reach), self._around(passed, reach)
-        waits = seconds / (places + WAIT_PLACES) / side
-        # Robots wait where nobody drove, too; but one place of waits says nothing of others.
-        most = np.zeros(len(waits))
-        most[waited.argmax()] = 1
-        others = self.known * (self._around(most, 2 * reach) == 0)
-        elsewhere = float(waits @ others) / (FEW_PLACES + float(self.known.sum()))
-        return waits + elsewhere * (1 - self.known)
+        cells, is_inside = cells_of(position, self.grid)
+        x, y = cells.T
+        return np.where(is_inside, self.nearest[y, x], -1)
+
+    def update(
+        self, places: Places, population: Population, prior: Prior | None
+    ) -> None:
+        """Solve again with what was seen at places of the world."""
+        self._predict(prior)
+        self.expected = population.level + population.prior_weight * self.predicted
+        sums = self._sums_of(places)
+        self._solve(sums, population.variance)
+        seen = self.solution[:, 0]
+        self.known: Float64 = np.clip(self.solution[:, 1], 0, 1)
+        self.unknown = np.sqrt(1 - self.known)
+        self.mean = self.expected + seen + population.surplus * (1 - self.known)
+        self.slowness = np.exp(self.mean)
+        if sums.waited.any():
+            waits = self._waits(sums.passages, sums.waited)
+            self.slowness += self.nominal_speed * waits
+
+    def _predict(self, prior: Prior | None) -> None:
+        """Predict the log slowness of each place, if the prior is another."""
+        if prior is self.prior:
+            return
+        self.prior = prior
+        if prior is None:
+            self.predicted[:] = 0
+        else:
+            x, y = self.middle.T
+            self.predicted[:] = prior.log_slowness(map_features(self.grid)[y, x])
+
+    def _sums_of(self, places: Places) -> SumsOnMap:
+        """Return what was seen at each place of the map."""
+        numbers = self.places_at(places.position)
+        is_on_map = numbers >= 0
+        numbers = numbers[is_on_map]
+
+        def summed(values: Float64) -> Float64:
+            sums = np.bincount(numbers, values[is_on_map], len(self.middle))
+            return sums.astype(np.float64)
+
+        return SumsOnMap(
+            weight=summed(places.weight),
+            sum_of_log=summed(places.sum_of_log),
+            passages=summed(places.passages),
+            waited=summed(places.waited),
+        )
+
+    def _solve(self, sums: SumsOnMap, variance: float) -> None:
+        """Solve the equations of the field, beginning with the last solution."""
+        # A lattice whose links have strength 1 has about the variance
+        # ln(32 / kappa) / 4 pi; 1 is added for cells of many metres, where that would be
+        # negative.
+        kappa = (self.spacing / CORRELATION) ** 2
+        scale = variance / (math.log1p(32 / kappa) / (4 * math.pi)) / NOISE
+        visits = scale * sums.weight
+        # Half of the noise is added, as the mean of its exponential is more than 1.
+        seen = scale * (sums.sum_of_log + sums.weight * NOISE / 2)
+        right = np.column_stack([seen - visits * self.expected, visits])  # (P, 2)
+        # The equations map the same error everywhere to its product with `kappa +
+        # visits`, and greater errors to greater residuals: residuals up to that product
+        # prove that no error is greater.
+        tolerance = (ACCURACY * (kappa + visits)) ** 2
+        equations = Equations(
+            begins=self.links.indptr,
+            neighbours=self.links.indices,
+            strengths=self.links.data,
+            diagonal=kappa + self.linked + visits,
+            tolerance=tolerance,
+        )
+        _relax(equations, right, self.solution)
+
+    def _waits(self, passages: Float64, waited: Float64) -> Float64:
+        """Return the seconds that a robot waits per metre through each place.
+
+        They are the seconds waited around the place, over the metres driven around it.
+        So each path through costs what a passage did, also beside the place where
+        robots stood.
+        """
+        reach = round(2 * self.side / self.spacing)
+        seconds_around = self._around(waited, reach)
+        passages_around = self._around(passages, reach)
+        waits = seconds_around / (passages_around + WAIT_PLACES) / self.side
+        # Robots wait where nobody drove, too. But one place of waits says nothing of
+        # others, so the surroundings of the longest wait do not count.
+        longest = np.zeros(len(waits))
+        longest[waited.argmax()] = 1
+        is_elsewhere = self._around(longest, 2 * reach) == 0
+        known_elsewhere = self.known * is_elsewhere
+        mean = float(waits @ known_elsewhere) / (FEW_PLACES + float(self.known.sum()))
+        waits_in_unknown: Float64 = mean * (1 - self.known)
+        return waits + waits_in_unknown
 
     def _around(self, values: Float64, reach: int) -> Float64:
-        """Return a weighted mean of the places around each one, none of them behind a wall."""
+        """Return a weighted mean over the places around each, none behind a wall."""
         for _ in range(reach):
-            values = (values + self.links @ values) / 5
+            neighbours: Float64 = self.links @ values
+            mean: Float64 = (values + neighbours) / 5
+            values = mean
         return values
 
     def paint(
-        self, name: str, hope: Float64 | float, fastest: float
+        self, name: str, optimism: Float64 | float, fastest: float
     ) -> NDArray[np.float32]:
-        """Return (H, W) float32: the slowness over that of the fastest place, which has this log.
+        """Return (H, W) float32: the slowness over that of the fastest place.
 
-        Each place counts as faster by its hope (P,), a logarithm, too.
+        The array is the same as before while no value changes.
+
+        Parameters
+        ----------
+        name : str
+            Which of the layers.
+        optimism : (P,) float64, or float
+            The logarithm by which each place is assumed to be faster than expected.
+        fastest : float
+            The log slowness of the fastest place.
         """
-        log = np.log(self.slowness) - hope - fastest
+        log = np.log(self.slowness) - optimism - fastest
         steps = np.rint(np.clip(log, 0, math.log(MAX_SLOWNESS)) / math.log(1 + STEP))
-        return self.layer(name, STEPS.take(steps.astype(np.int64)), 1)
-
-    def layer(self, name: str, values: NDArray[Any], occupied: int) -> NDArray[Any]:
-        """Return the same as `over`, and the same array while no value changes."""
-        if name not in self.painted or not np.array_equal(
-            values, self.painted[name][0]
-        ):
-            self.painted[name] = values, self.over(values, occupied)
-        return self.painted[name][1]
+        values = STEPS.take(steps.astype(np.int64))
+        painted = self.painted.get(name)
+        if painted is None or not np.array_equal(values, painted.values):
+            painted = Painted(values, self.over(values, 1))
+            self.painted[name] = painted
+        return painted.layer
 
     def over(self, values: NDArray[Any], occupied: int) -> NDArray[Any]:
-        """Return (H, W): of each cell the value of its place."""
-        return np.append(values, values.dtype.type(occupied)).take(
-            self.place, mode="wrap"
-        )
+        """Return the value of each cell's place, or that of occupied cells: (H, W)."""
+        # The place of an occupied cell is -1: the last value.
+        of_places = np.append(values, values.dtype.type(occupied))
+        return of_places.take(self.place, mode="wrap")
 
 
 def _places_of(grid: GridMap, size: int) -> tuple[Int64, Int64]:
-    """Return the place of each cell, and a cell (x, y) of each place, near its block's middle."""
+    """Return the place of each cell, (H, W), and a cell (x, y) near the middle of each place.
+
+    A place is a connected part of a block of `size` x `size` cells.
+    """
     from scipy.ndimage import label
 
     # Between the blocks are rows and columns that connect nothing.
-    rows, columns = (
-        np.arange(cells) + np.arange(cells) // size for cells in grid.occupancy.shape
-    )
+    height, width = grid.occupancy.shape
+    rows = np.arange(height) + np.arange(height) // size
+    columns = np.arange(width) + np.arange(width) // size
     apart = np.zeros((rows[-1] + 1, columns[-1] + 1), dtype=np.bool_)
     apart[np.ix_(rows, columns)] = ~grid.occupancy
-    place = label(apart, output=np.int64)[0][np.ix_(rows, columns)] - 1
+    labels: Int64 = label(apart, output=np.int64)[0]
+    place = labels[np.ix_(rows, columns)] - 1
     y, x = np.nonzero(place >= 0)
     middle = (size - 1) / 2
-    order = np.argsort(np.hypot(x % size - middle, y % size - middle), kind="stable")
+    away = np.hypot(x % size - middle, y % size - middle)
+    order = np.argsort(away, kind="stable")
     cells = np.column_stack([x, y])[order]
-    return place, cells[np.unique(place[y, x][order], return_index=True)[1]]
+    _, first = np.unique(place[y, x][order], return_index=True)
+    return place, cells[first]
 
 
 def _links_of(place: Int64, size: int, count: int) -> Any:
-    """Return how strongly places are linked, by the share of a block's side that they have."""
+    """Return the links of places, a sparse (P, P) array.
+
+    A link's strength is the share of a block's side along which two places touch.
+    """
     from scipy.sparse import csr_array
 
-    sides = (place[:, :-1], place[:, 1:]), (place[:-1], place[1:])
-    one, other = np.hstack([[one.ravel(), other.ravel()] for one, other in sides])
-    linked = (one != other) & (one >= 0) & (other >= 0)
-    ends = one[linked], other[linked]
-    links = csr_array((np.full(len(ends[0]), 1 / size), ends), shape=(count, count))
+    left_of = place[:, :-1].ravel()
+    right_of = place[:, 1:].ravel()
+    below = place[:-1].ravel()
+    above = place[1:].ravel()
+    first = np.concatenate([left_of, below])
+    second = np.concatenate([right_of, above])
+    is_linked = (first != second) & (first >= 0) & (second >= 0)
+    ends = first[is_linked], second[is_linked]
+    strength = np.full(np.count_nonzero(is_linked), 1 / size)
+    links = csr_array((strength, ends), shape=(count, count))
     return (links + links.T).tocsr()
 
 
 @in_place
-def _relax(*arrays: Any) -> None:
-    """Solve (diagonal - links) x = right by residuals, until the square of none is too great."""
-    begins, to, weights, diagonal, most, residual, x = arrays
-    # The residual is given as the right side.
-    for place in range(x.size):
-        residual[place] -= diagonal[place] * x[place]
+def _relax(equations: Equations, residual: Float64, solution: Float64) -> None:
+    """Solve two systems of equations by residuals, until none is above its tolerance.
+
+    Parameters
+    ----------
+    equations : Equations
+        The equations of both systems.
+    residual : (P, 2) float64
+        The right sides of the systems; it becomes their residuals.
+    solution : (P, 2) float64
+        An estimate; it becomes the solution.
+    """
+    begins = equations.begins
+    neighbours = equations.neighbours
+    strengths = equations.strengths
+    diagonal = equations.diagonal
+    count = diagonal.size
+    for place in range(count):
+        residual[place, 0] -= diagonal[place] * solution[place, 0]
+        residual[place, 1] -= diagonal[place] * solution[place, 1]
         for link in range(begins[place], begins[place + 1]):
-            residual[place] += weights[link] * x[to[link]]
+            neighbour = neighbours[link]
+            residual[place, 0] += strengths[link] * solution[neighbour, 0]
+            residual[place, 1] += strengths[link] * solution[neighbour, 1]
     is_solved = False
     while not is_solved:
         is_solved = True
-        for place in range(x.size):
-            left = residual[place]
-            if left.real * left.real + left.imag * left.imag > most[place]:
-                is_solved = False
-                change = OVER_RELAXATION * left / diagonal[place]
-                x[place] += change
-                residual[place] -= change * diagonal[place]
-                for link in range(begins[place], begins[place + 1]):
-                    residual[to[link]] += weights[link] * change
+        for place in range(count):
+            excess = residual[place, 0]
+            excess_known = residual[place, 1]
+            square = excess * excess + excess_known * excess_known
+            is_off = square > equations.tolerance[place]
+            if not is_off:
+                continue
+            is_solved = False
+            # The change that makes this place's residual 0, and a little more.
+            change = OVER_RELAXATION * excess / diagonal[place]
+            change_known = OVER_RELAXATION * excess_known / diagonal[place]
+            solution[place, 0] += change
+            solution[place, 1] += change_known
+            residual[place, 0] -= change * diagonal[place]
+            residual[place, 1] -= change_known * diagonal[place]
+            for link in range(begins[place], begins[place + 1]):
+                neighbour = neighbours[link]
+                residual[neighbour, 0] += strengths[link] * change
+                residual[neighbour, 1] += strengths[link] * change_known
 
 
 def cells_of(position: Float64, grid: GridMap) -> tuple[Int64, NDArray[np.bool_]]:
-    """Return the nearest cells of positions, (N, 2) as (x, y), and which are on the map: (N,)."""
-    *origin, yaw = grid.origin
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    along = (position - origin) @ [[cos, -sin], [sin, cos]]
+    """Return the nearest cells (N, 2) of positions (N, 2), and which lie on the map (N,)."""
+    *corner, yaw = grid.origin
+    cos = math.cos(yaw)
+    sin = math.sin(yaw)
+    along = (position - corner) @ [[cos, -sin], [sin, cos]]
     cells = np.floor(along / grid.resolution).astype(np.int64)
     nearest = np.clip(cells, 0, [grid.width - 1, grid.height - 1])
     return nearest, (cells == nearest).all(axis=1)

@@ -1,5 +1,6 @@
 """A learner from drives: those of the node's robot, or of a fleet."""
 
+import copy
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -18,13 +19,13 @@ from ddqn_planner.experience.drives import (
     DriveRecorder,
     read_drives,
 )
+from ddqn_planner.experience.places import Places
 from ddqn_planner.experience.prior import Prior
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.clocks import STEADY
 from ddqn_planner.nodes.conversions import occupancy_message
 from ddqn_planner.nodes.learning_node import (
     Answer,
-    Float64,
     LearningNode,
     MapInFrame,
     Recording,
@@ -202,7 +203,7 @@ class Driving:
         self._check_speed(folder)
         self._lines["drives"] = str(folder.drives)
         self._lines["learned speed (m/s)"] = f"{experience.learned_speed:.3f}"
-        self._lines["places"] = str(len(experience.evidence.table))
+        self._lines["places"] = str(len(experience.evidence.places))
         self._lines["folder"] = str(folder.folder)
         self._node.tell_saved(
             experience.to_bytes(), folder.experience_path, folder.save_error
@@ -211,9 +212,10 @@ class Driving:
     def _check_speed(self, folder: DriveFolder) -> None:
         """Warn when the nominal speed turns out to be wrong."""
         experience = folder.experience
-        evidence = experience.evidence
+        population = experience.evidence.population
         # Where most places are slow, the fastest places are slow, too, if the robot is.
-        is_wrong = evidence.open < -WRONG_SPEED or evidence.fastest > WRONG_SPEED
+        is_slower = population.fastest_log > WRONG_SPEED
+        is_wrong = population.open_log < -WRONG_SPEED or is_slower
         if is_wrong and not self._is_speed_wrong:
             speeds = (
                 f"the robot drives {experience.learned_speed:.3g} m/s in the open, "
@@ -229,17 +231,17 @@ class Driving:
         if on_map is None or folder is None:
             return
         evidence = folder.experience.evidence
-        places = len(evidence.table)
+        places = len(evidence.places)
         if not self._is_prior_due(places):
             return
         self._places_of_prior = places
         seed: int = self._node.value("seed")
         try:
-            # A copy of the table, as drives change it meanwhile.
+            # A copy, as drives change it meanwhile.
             prior: Prior | None = await self._node.worker.call(
                 _trained_prior,
                 on_map.grid,
-                evidence.table.copy(),
+                copy.deepcopy(evidence.places),
                 evidence.prior,
                 seed,
             )
@@ -251,7 +253,7 @@ class Driving:
             return
         # Meanwhile the drives may have been forgotten, or another folder begun.
         evidence = folder.experience.evidence
-        if folder is self._folder and len(evidence.table) >= places:
+        if folder is self._folder and len(evidence.places) >= places:
             folder.experience.prior = prior
             folder.try_to_save()
 
@@ -369,8 +371,8 @@ class Driving:
 
 
 def _trained_prior(
-    grid: GridMap, table: Float64, older: Prior | None, seed: int
+    grid: GridMap, places: Places, older: Prior | None, seed: int
 ) -> Prior | None:
     from ddqn_planner.training.prior_training import prior_of  # it imports torch
 
-    return prior_of(grid, table, older, seed)
+    return prior_of(grid, places, older, seed)

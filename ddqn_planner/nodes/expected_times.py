@@ -113,7 +113,7 @@ class ExpectedTimes:
 
     def apply(self, grid: GridMap) -> GridMap:
         """Return a map whose moves cost expected time; the same map before a drive."""
-        if self._experience is None or not len(self._experience.evidence.table):
+        if self._experience is None or not len(self._experience.evidence.places):
             return grid
         if self._spread_on is None or not is_like(grid, self._spread_on):
             self._spread_on = grid

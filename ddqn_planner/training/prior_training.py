@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from ddqn_planner.experience.places import Places
 from ddqn_planner.experience.posterior import cells_of
 from ddqn_planner.experience.prior import (
     FEATURES,
@@ -38,19 +39,19 @@ MIN_SUM = 1e-9  # in place of a sum of 0 that divides
 
 
 def prior_of(
-    grid: GridMap, table: Any, older: Prior | None, seed: int = 0
+    grid: GridMap, places: Places, older: Prior | None, seed: int = 0
 ) -> Prior | None:
-    """Train a prior on places of `Evidence.table` that are free on a map; few change nothing."""
-    cells, inside = cells_of(table[:, 5:], grid)
+    """Train a prior on the places that are free on a map; few change nothing."""
+    cells, inside = cells_of(places.position, grid)
     x, y = cells.T
-    seen = inside & ~grid.occupancy[y, x] & (table[:, 0] > 0)
+    seen = inside & ~grid.occupancy[y, x] & (places.weight > 0)
     if seen.sum() < FEWEST_PLACES:
         return older
-    weight, log = table[seen, :2].T
+    weight = places.weight[seen]
+    log = places.sum_of_log[seen] / weight
+    limited_weight = np.minimum(weight, LARGEST_WEIGHT)
     features = map_features(grid)[y[seen], x[seen]]
-    new = np.column_stack(
-        [table[seen, 5:], features, log / weight, np.minimum(weight, LARGEST_WEIGHT)]
-    )
+    new = np.column_stack([places.position[seen], features, log, limited_weight])
     return train_prior(new.astype(np.float32), older, seed)
 
 

@@ -57,16 +57,18 @@ def test_the_posterior_is_that_of_a_gaussian_markov_random_field(seed: int) -> N
     for _ in range(3):
         drives.append(straight(*random.uniform(0.5, 9.5, (2, 2)), random.uniform(1, 6)))
     occupancy = random.random((40, 60)) < 0.2
-    x, y = np.floor(driven(*drives).evidence.table[:, 5:] / 0.25).astype(int).T
+    x, y = np.floor(driven(*drives).evidence.places.position / 0.25).astype(int).T
     occupancy[y, x] = False
     grid, experience = GridMap(occupancy, 0.25), Experience(SPEED)
     for drive in drives:  # solved again where evidence changed
         experience.record(*drive)
         posterior = experience.evidence.over(grid)
     # What a robot expects decides what is a wait, and so where it sees places.
-    x, y = np.floor(experience.evidence.table[:, 5:] / 0.25).astype(int).T
+    places = experience.evidence.places
+    x, y = np.floor(places.position / 0.25).astype(int).T
     assume(not occupancy[y, x].any())
-    variance, surplus = experience.evidence.variance, experience.evidence.surplus
+    population = experience.evidence.population
+    variance, surplus = population.variance, population.surplus
     common = posterior.expected[0]
     # The same from its definition, with one equation per free cell.
     free = ~grid.occupancy
@@ -79,9 +81,11 @@ def test_the_posterior_is_that_of_a_gaussian_markov_random_field(seed: int) -> N
             precision[[i, j], [j, i]] -= 1
     precision += np.eye(len(precision)) * 0.25**2
     precision *= np.log1p(32 / 0.25**2) / (4 * np.pi) / variance
-    table, (seen, visits) = experience.evidence.table, np.zeros((2, len(precision)))
-    cells = np.floor(table[:, 5:] / 0.25).astype(int)
-    for (x, y), weight, log in zip(cells, table[:, 0], table[:, 1], strict=True):
+    seen, visits = np.zeros((2, len(precision)))
+    cells = np.floor(places.position / 0.25).astype(int)
+    for (x, y), weight, log in zip(
+        cells, places.weight, places.sum_of_log, strict=True
+    ):
         precision[number[y, x], number[y, x]] += weight / NOISE
         visits[number[y, x]] += weight / NOISE
         seen[number[y, x]] += (log + weight * (NOISE / 2 - common)) / NOISE
@@ -182,14 +186,20 @@ def test_a_place_that_changes_is_learned_anew_at_once() -> None:
     assert at(HALL, experience.slowness(HALL), 7, 2) == pytest.approx(3, rel=0.15)
 
 
+def unsure_at(experience: Experience, x: float, y: float) -> float:
+    """How unsure the slowness of a place is, beside that of places without a drive."""
+    uncertainty = experience.uncertainty(HALL)
+    return at(HALL, uncertainty, x, y) / float(uncertainty.max())
+
+
 def test_what_is_slow_in_one_direction_alone_is_no_change() -> None:
     experience = driven(*[straight((2, 2), (12, 2), 3)] * 3)
-    elsewhere = experience.evidence.table[:, 0].copy()
+    before = unsure_at(experience, 7, 2)
     for number in range(40):
         experience.apply(HALL)  # so that it learns how sure expected times are
         up, down = straight((2, 8), (12, 8), 4), straight((12, 8), (2, 8))
         experience.record(*(up if number % 4 else down))
-    assert (experience.evidence.table[: len(elsewhere), 0] > 0.9 * elsewhere).all()
+    assert unsure_at(experience, 7, 2) < 1.5 * before
 
 
 def test_where_parts_of_drives_often_surprise_a_surprise_is_no_change() -> None:
@@ -208,13 +218,10 @@ def test_where_parts_of_drives_often_surprise_a_surprise_is_no_change() -> None:
         experience.apply(HALL)
         if number == 20:
             experience.record(*straight((2, 9.5), (12, 9.5)))
-            row, weight = (
-                len(experience.evidence.table) - 1,
-                experience.evidence.table[-1, 0],
-            )
+            before = unsure_at(experience, 7, 9.5)
         experience.record(*drive(4 if number % 4 == 0 else 1))
         experience = Experience.from_bytes(experience.to_bytes())
-    assert experience.evidence.table[row, 0] > 0.8 * weight
+    assert unsure_at(experience, 7, 9.5) < 1.5 * before
 
 
 def waited(seconds: float, x: float = 7.0) -> Poses:

@@ -32,8 +32,7 @@ def test_without_drives_every_place_takes_its_nominal_time() -> None:
         experience.record(
             *straight((9, 5), (4, 6), 2)
         )  # as if there had been no drive before
-    assert forgotten.evidence.driven == experience.evidence.driven
-    np.testing.assert_array_equal(forgotten.evidence.table, experience.evidence.table)
+    assert forgotten.to_bytes() == experience.to_bytes()
 
 
 @given(
@@ -126,7 +125,10 @@ def test_places_with_and_without_waits_count_as_faster_the_less_of_them_is_known
         for each in (grid, *grid.exploration[1:])
     )
     of_a_step = 0.021  # in which slowness is told
-    unseen, most = math.sqrt(experience.evidence.variance), math.log(1 + share)
+    unseen, most = (
+        math.sqrt(experience.evidence.population.variance),
+        math.log(1 + share),
+    )
     deviation = experience.uncertainty(HALL)
     often, once, never = (at(HALL, deviation, 7, y) for y in (5, 6.5, 9))
     assert often < 0.15 * unseen < once < 0.5 * unseen < 0.8 * unseen < never < unseen

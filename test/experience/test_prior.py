@@ -79,13 +79,14 @@ def test_what_was_foretold_of_places_stays_with_them_after_a_merge() -> None:
     for one in (nothing, elsewhere):
         one.merge(other)
     assert nothing.to_bytes() == other.to_bytes()
-    foretold = other.evidence.table[:, 4]
-    assert (foretold != other.prior.level).all()
-    assert (elsewhere.evidence.table[-len(foretold) :, 4] == foretold).all()
+    predicted = other.evidence.places.predicted
+    assert (predicted != other.prior.level).all()
+    merged = elsewhere.evidence.places.predicted[-len(predicted) :]
+    assert (merged == predicted).all()
     own = Experience(0.5)
     own.prior = some_prior()._replace(level=np.float32(0.25))
     own.merge(other)  # its own prior stays, and each level counts but once
-    level = own.evidence.table[:, 4] - foretold
+    level = own.evidence.places.predicted - predicted
     assert level == pytest.approx(0.25 - float(some_prior().level), abs=1e-9)
 
 

@@ -91,7 +91,7 @@ def test_an_older_map_is_not_forgotten_and_known_places_are_not_kept_twice() -> 
 
 
 def teach_prior(experience: Experience, grid: GridMap) -> None:
-    experience.prior = prior_of(grid, experience.evidence.table, experience.prior)
+    experience.prior = prior_of(grid, experience.evidence.places, experience.prior)
 
 
 def test_the_places_of_experience_teach_its_prior_where_they_lie_on_a_map() -> None:

@@ -1,0 +1,107 @@
+"""What all places of the world have in common, and how much they differ."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ddqn_planner.experience.places import NOISE, Float64, Places
+
+# The variance of the log slowness of places, assumed from so many places before the
+# first drive, and its limits.
+VARIANCE = 1.0
+ASSUMED_PLACES = 4.0
+LEAST_VARIANCE = 0.05
+MOST_VARIANCE = 2.0
+
+# Neighbours are alike: this many places of a path tell as much of other places as one
+# place alone.
+ALIKE_PLACES = 8.0
+
+# Before the first drive: the mean log slowness is 0 with this inverse variance, and the
+# weight of the prior has this mean and inverse variance.
+INVERSE_VARIANCE_OF_LEVEL = 2.0
+PRIOR_WEIGHT = 0.2
+INVERSE_VARIANCE_OF_PRIOR_WEIGHT = 1.0
+
+FEW_PLACES = 16.0  # so many are assumed to have been driven where nothing was slow
+SMALLEST_WEIGHT = 0.2  # of a place's visits, from which the place counts
+KNOWN_WEIGHT = 0.7  # of a place's visits, from which the place is known
+# Fewer known places say nothing about the robot's speed in the open.
+SURE_PLACES = 20
+OPEN_QUANTILE = 0.25
+FASTEST_QUANTILE = 0.05
+
+ITERATIONS = 3  # of the variance and the level, as each depends on the other
+
+
+class Population(NamedTuple):
+    """The distribution of the log slowness of places."""
+
+    level: float  # the mean where the prior predicts 0
+    prior_weight: float  # how much the prediction of the prior counts
+    variance: float
+    # Added to the log slowness of unknown places: the mean of an exponential is more than
+    # the exponential of the mean, as far as drives have shown that places differ.
+    surplus: float
+    open_log: float  # log slowness in the open
+    fastest_log: float  # log slowness where the robot is fastest
+
+
+def population_of(places: Places) -> Population:
+    """Fit the distribution of the log slowness to places."""
+    counts = places.weight >= SMALLEST_WEIGHT
+    weight = places.weight[counts]  # (M,)
+    log = places.sum_of_log[counts] / weight
+    # (M, 2): what the level and the weight of the prior are multiplied with.
+    design = np.column_stack([np.ones(len(log)), places.predicted[counts]])
+    noise = NOISE / weight  # variance of each mean
+
+    variance = VARIANCE
+    for _ in range(ITERATIONS):
+        level, prior_weight = _regression(log, design, variance + noise)
+        residual = log - design @ (level, prior_weight)
+        squares = residual**2 - noise
+        total = ASSUMED_PLACES * VARIANCE + squares.sum() / ALIKE_PLACES
+        count = ASSUMED_PLACES + len(log) / ALIKE_PLACES
+        variance = float(np.clip(total / count, LEAST_VARIANCE, MOST_VARIANCE))
+
+    surplus = (variance + NOISE) / 2 * len(log) / (FEW_PLACES + len(log))
+    sure = log[weight >= KNOWN_WEIGHT]
+    open_log = 0.0
+    fastest_log = 0.0
+    if len(sure) >= SURE_PLACES:
+        open_log = float(np.quantile(sure, OPEN_QUANTILE))
+        fastest_log = float(np.quantile(sure, FASTEST_QUANTILE))
+    return Population(level, prior_weight, variance, surplus, open_log, fastest_log)
+
+
+def _regression(
+    log: Float64, design: Float64, variances: Float64
+) -> tuple[float, float]:
+    """Return the level and the weight of the prior, by Bayesian linear regression.
+
+    Parameters
+    ----------
+    log, variances : (M,) float64
+        The log slowness of places, and its variances.
+    design : (M, 2) float64
+        Ones, and the prediction of the prior.
+    """
+    weighted = design.T / variances / ALIKE_PLACES  # (2, M)
+    inverse_variances = INVERSE_VARIANCE_OF_LEVEL, INVERSE_VARIANCE_OF_PRIOR_WEIGHT
+    covariance = np.linalg.inv(np.diag(inverse_variances) + weighted @ design)  # (2, 2)
+    # Few places may be slow by chance where the prior says so: its weight is a standard
+    # error less than the places tell, as far as they tell it.
+    variance_of_weight = covariance[1, 1]
+    share_told = 1 - INVERSE_VARIANCE_OF_PRIOR_WEIGHT * variance_of_weight
+    doubt = share_told * math.sqrt(variance_of_weight)
+    assumed = [0, INVERSE_VARIANCE_OF_PRIOR_WEIGHT * PRIOR_WEIGHT]
+    fitted_weight = float(covariance[1] @ (assumed + weighted @ log))
+    prior_weight = max(fitted_weight - doubt, 0)
+
+    remaining = weighted[0] @ (log - prior_weight * design[:, 1])
+    level = float(remaining / (INVERSE_VARIANCE_OF_LEVEL + weighted[0].sum()))
+    return level, prior_weight
