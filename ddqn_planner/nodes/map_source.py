@@ -198,8 +198,8 @@ class MapSource:
     def _no_map(self) -> RequestError:
         refusal = self._diagnostics.refused.get("map")
         if refusal and self._waiting is not None:
-            since = max(self._began, self.directions.awaited_since)
-            return RequestError("NO_MAP", refusal, since)
+            listening_since = max(self._began, self.directions.awaited_since)
+            return RequestError("NO_MAP", refusal, listening_since)
         missing = f"no map was received on {self._topic} yet"
         reason = f"{missing}{self._refusal_in_brackets()}; start a map server"
         return RequestError("NO_MAP", reason, self._began)

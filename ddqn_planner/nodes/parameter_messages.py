@@ -34,17 +34,18 @@ def parameters_from_messages(
         If the node cannot set a parameter; with the remedy.
     """
     names = [message.name for message in messages]
-    if not all(names):
-        raise ValueError("a parameter has no name; give one")
-    repeated = {name for name in names if names.count(name) > 1}
-    if repeated:
-        wrong = f"{', '.join(sorted(repeated))} is set twice in one request"
-        raise ValueError(f"{wrong}; give one value each")
+    _check_names(names)
     unknown = [name for name in names if not has_parameter(name)]
     if unknown:
         raise ValueError(unread_names(unknown, declared, node_name))
     _check_writable(names, declared)
     parameters = [_from_message(message) for message in messages]
+    return _with_declared_types(parameters, declared)
+
+
+def _with_declared_types(
+    parameters: Sequence[Parameter], declared: Parameters
+) -> list[Parameter]:
     values = {
         parameter.name: parameter.value
         for parameter in parameters
@@ -57,6 +58,15 @@ def parameters_from_messages(
         else parameter
         for parameter in parameters
     ]
+
+
+def _check_names(names: Sequence[str]) -> None:
+    if not all(names):
+        raise ValueError("a parameter has no name; give one")
+    repeated = {name for name in names if names.count(name) > 1}
+    if repeated:
+        wrong = f"{', '.join(sorted(repeated))} is set twice in one request"
+        raise ValueError(f"{wrong}; give one value each")
 
 
 def _check_writable(names: Sequence[str], declared: Parameters) -> None:
