@@ -224,7 +224,7 @@ def test_no_lower_bound_is_above_the_true_cost(planner: Planner, shift: int) -> 
     grid = GridMap(occupancy, CELL)
     rows, columns = np.indices(occupancy.shape)
     is_guided = False
-    starts = np.random.default_rng(0).choice(np.argwhere(~occupancy), 10)
+    starts = np.random.default_rng(0).choice(np.argwhere(~occupancy), 5)
     for y, x in starts.tolist():
         every_heading = [(x, y, heading) for heading in range(16)]
         least = true_costs(planner, grid, *every_heading).min(axis=2)
