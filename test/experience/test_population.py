@@ -1,0 +1,35 @@
+"""What places have in common, what they tell of others, and when that changes."""
+
+import numpy as np
+import pytest
+from experience.straight_drives import HALL, at, driven, straight
+
+from ddqn_planner.experience.places import Places
+from ddqn_planner.experience.population import population_of
+
+
+def places_as_predicted(count: int) -> Places:
+    """Places that were visited once, and are as slow as the prior predicted."""
+    places = Places.none()
+    predicted = np.where(np.arange(count) % 2, 0.5, -0.5)
+    places.append(predicted, np.zeros((count, 2)))
+    places.weight += 1
+    places.sum_of_log += predicted
+    return places
+
+
+def test_few_places_trust_the_prior_less_than_before_and_many_trust_it() -> None:
+    weights = [population_of(places_as_predicted(n)).prior_weight for n in (12, 2000)]
+    assert weights[0] < 0.2
+    assert weights[1] == pytest.approx(1, abs=0.15)
+
+
+def test_a_wait_that_is_over_is_forgotten_within_some_passages() -> None:
+    seconds, position = straight((2, 5), (12, 5))
+    waiting = seconds + np.where(position[:, 0] > 7, 30.0, 0.0)
+    experience = driven(*[(waiting, position)] * 60, half_life=1e9)
+    before = at(HALL, experience.slowness(HALL), 7.1, 5)
+    for _ in range(40):
+        experience.record(seconds, position)
+    assert before > 8
+    assert at(HALL, experience.slowness(HALL), 7.1, 5) < 0.35 * before
