@@ -160,7 +160,7 @@ class Evidence:
         return max(from_errors, from_surprises)
 
     def _rows_at(self, position: Float64) -> Int64:
-        """Return the row of each position (N, 2); new places are added in their order."""
+        """Return the row of each position (N, 2), and add places that are new."""
         squares = np.floor(position / self.side).astype(np.int64)
         rows = np.empty(len(squares), np.int64)
         new = []  # indices of the positions

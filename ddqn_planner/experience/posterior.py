@@ -248,7 +248,7 @@ class Posterior:
 
 
 def _places_of(grid: GridMap, size: int) -> tuple[Int64, Int64]:
-    """Return the place of each cell, (H, W), and a cell (x, y) near the middle of each place.
+    """Return each cell's place, (H, W), and a cell (x, y) near each place's middle.
 
     A place is a connected part of a block of `size` x `size` cells.
     """
@@ -341,7 +341,7 @@ def _relax(equations: Equations, residual: Float64, solution: Float64) -> None:
 
 
 def cells_of(position: Float64, grid: GridMap) -> tuple[Int64, NDArray[np.bool_]]:
-    """Return the nearest cells (N, 2) of positions (N, 2), and which lie on the map (N,)."""
+    """Return the nearest cells of positions, (N, 2), and which lie on the map."""
     *corner, yaw = grid.origin
     cos = math.cos(yaw)
     sin = math.sin(yaw)

@@ -167,7 +167,7 @@ def averaged(
 
 
 def ways(position: Float64, metres: float) -> list[int]:
-    """Return the indices of positions that are some metres from the one returned before.
+    """Return the indices of positions that are some metres apart.
 
     The first is that of the first position.
     """
@@ -182,7 +182,7 @@ def ways(position: Float64, metres: float) -> list[int]:
 def _believed_parts(
     time: Float64, position: Float64, max_speed: float, max_pause: float
 ) -> Iterator[slice]:
-    """Yield the parts of a drive without jumps; after a far jump, none until the pose is back."""
+    """Yield the parts of a drive without jumps, and none until the pose is back."""
     elapsed = np.diff(time)
     dx, dy = np.diff(position, axis=0).T
     is_jump = np.hypot(dx, dy) > max_speed * elapsed + CORRECTION
