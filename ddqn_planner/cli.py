@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import ddqn_planner as api
 from ddqn_planner.files import (
@@ -34,8 +34,14 @@ if TYPE_CHECKING:
     from ddqn_planner.training.run import TrainingRun
 
 # Options of `plan` that only one kind of model can follow.
-OF_CELLS: Final = "robot_radius", "move_rule", "mode", "start_clearing_radius", "cells"
-OF_BODIES: Final = "yaws", "yaw_tolerance", "bound"
+CELL_OPTIONS: Final = (
+    "robot_radius",
+    "move_rule",
+    "mode",
+    "start_clearing_radius",
+    "cells",
+)
+BODY_OPTIONS: Final = ("yaws", "yaw_tolerance", "bound")
 MODEL: Final = "name or file (default: %(default)s)"
 
 
@@ -112,7 +118,8 @@ def plan(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     parser.add_argument("--yaws", default=(0, 0), help=words, **pair)
     options = parser.parse_args(arguments)
     for option in ("csv", "picture"):
-        if file := getattr(options, option):
+        file = getattr(options, option)
+        if file:
             check_writable(file, f"--{option}")
     if options.picture:
         picture_format(options.picture, "--picture")
@@ -123,23 +130,38 @@ def plan(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     )
     planner = api.Planner.load(options.model)
     has_body = planner.pose_planner is not None
-    others, kind = (OF_CELLS, "without") if has_body else (OF_BODIES, "with")
-    given = parser.parse_args(arguments, argparse.Namespace(**dict.fromkeys(others)))
-    if wrong := [name for name in others if getattr(given, name) is not None]:
-        problem = f"--{wrong[0].replace('_', '-')} is for models {kind} a body, unlike "
-        raise ValueError(
-            f"{problem}{options.model}; leave it out, or give another --model"
-        )
+    if has_body:
+        _refuse_options(parser, arguments, CELL_OPTIONS, "without", options.model)
+    else:
+        _refuse_options(parser, arguments, BODY_OPTIONS, "with", options.model)
     grid = map_file.grid(
         options.occupied_threshold, options.allow_unknown, options.use_map_costs
     )
     grid = api.inflate(grid, options.robot_radius, options.clearance_weight)
-    next(
-        warm_up(planner)
-    )  # so that the time leaves out how long compiled code takes to load
-    return (_plan_poses if has_body else _plan_cells)(
-        options, planner, grid, start, goal
-    )
+    # So that the time of the plan leaves out how long compiled code takes to load.
+    next(warm_up(planner))
+    if has_body:
+        return _plan_poses(options, planner, grid, start, goal)
+    return _plan_cells(options, planner, grid, start, goal)
+
+
+def _refuse_options(
+    parser: argparse.ArgumentParser,
+    arguments: Sequence[str],
+    names: Sequence[str],
+    kind: str,
+    model: str,
+) -> None:
+    """Raise a ValueError if arguments have an option for models with or without a body."""
+    # Without defaults, an option has a value only where it was in the arguments.
+    no_defaults = argparse.Namespace(**dict.fromkeys(names))
+    values = parser.parse_args(arguments, no_defaults)
+    for name in names:
+        if getattr(values, name) is not None:
+            raise ValueError(
+                f"--{name.replace('_', '-')} is for models {kind} a body, unlike "
+                f"{model}; leave it out, or give another --model"
+            )
 
 
 def _plan_cells(
@@ -147,45 +169,81 @@ def _plan_cells(
 ) -> int:
     import numpy as np
 
-    from ddqn_planner.grid import path_length
     from ddqn_planner.grid.arguments import as_number
-    from ddqn_planner.planning.paths import search
 
-    metres = 0, np.inf, "metres, 0 or more"
+    metres = (0, np.inf, "metres, 0 or more")
     tolerance = as_number("--tolerance", options.tolerance, *metres)
     radius = as_number(
         "--start-clearing-radius", options.start_clearing_radius, *metres
     )
-    asked = options.move_rule, options.mode, tolerance / grid.resolution
-    radius /= grid.resolution
-    plan = planner.plan(grid, start, goal, *asked, start_clearing_radius=radius)
-    rule, optimum, value = plan.move_rule, None, None
-    if plan.cells and grid.is_free(plan.cells[0]):
-        no_costs = api.GridMap(grid.occupancy, forbidden=grid.forbidden)
-        optimum = path_length(search(plan.cells[0], plan.cells[-1], no_costs, rule))
-    if (
-        options.picture
-        and plan.cells
-        and planner.network.supports((grid.height, grid.width))
-    ):
-        value = planner.q_field(grid, plan.cells[-1], rule).value
-    lines = [f"{x} {y}" for x, y in plan.cells if options.cells]
-    if plan.cells:
-        driven = path_length(plan.path) * grid.resolution
-        lines.append(f"start {plan.cells[0]}, goal {plan.cells[-1]}, {driven:.2f} m")
-        known = "" if optimum is None else f"optimum {optimum:.2f} under {rule.value}, "
-        known += "" if plan.cost is None else f"cost {plan.cost:.2f}, "
-        lines.append(f"length {plan.length:.2f} cells, {known}{plan.method.value}")
-    answer: Any = {
+    plan = planner.plan(
+        grid,
+        start,
+        goal,
+        move_rule=options.move_rule,
+        method=options.mode,
+        tolerance=tolerance / grid.resolution,
+        start_clearing_radius=radius / grid.resolution,
+    )
+    optimum = _shortest_length(plan, grid)
+    has_field = planner.network.supports((grid.height, grid.width))
+    value = None
+    if options.picture and plan.cells and has_field:
+        value = planner.q_field(grid, plan.cells[-1], plan.move_rule).value
+    answer = {
         "cells": plan.cells,
         "method": plan.method.value,
         "length": plan.length,
+        "optimum": optimum,
+        "move_rule": plan.move_rule.value,
     }
-    answer |= {"optimum": optimum, "move_rule": rule.value}
+    lines = [f"{x} {y}" for x, y in plan.cells if options.cells]
+    if plan.cells:
+        lines += _lines_of(plan, grid, optimum)
     rows = [(*cell, *np.round(grid.cell_to_world(cell), 6)) for cell in plan.cells]
-    table = ("x", "y", "x_metres", "y_metres"), rows
-    title = f"{plan.length:.2f} cells" if plan.cells else plan.status.value
-    return _show(options, grid, plan, answer, lines, table, title=title, value=value)
+    result = _Result(
+        answer=answer,
+        lines=lines,
+        columns=("x", "y", "x_metres", "y_metres"),
+        rows=rows,
+        picture={
+            "title": f"{plan.length:.2f} cells" if plan.cells else plan.status.value,
+            "value": value,
+        },
+    )
+    return _show(options, grid, plan, result)
+
+
+def _shortest_length(plan: api.Plan, grid: GridMap) -> float | None:
+    """Return the length of the shortest path between a plan's ends, in cells.
+
+    None without a path, and where it begins in an obstacle.
+    """
+    from ddqn_planner.grid import path_length
+    from ddqn_planner.planning.paths import search
+
+    if not plan.cells or not grid.is_free(plan.cells[0]):
+        return None
+    without_costs = api.GridMap(grid.occupancy, forbidden=grid.forbidden)
+    shortest = search(plan.cells[0], plan.cells[-1], without_costs, plan.move_rule)
+    return path_length(shortest)
+
+
+def _lines_of(plan: api.Plan, grid: GridMap, optimum: float | None) -> list[str]:
+    """Return what is printed of a path of cells."""
+    from ddqn_planner.grid import path_length
+
+    metres = path_length(plan.path) * grid.resolution
+    figures = [f"length {plan.length:.2f} cells"]
+    if optimum is not None:
+        figures.append(f"optimum {optimum:.2f} under {plan.move_rule.value}")
+    if plan.cost is not None:
+        figures.append(f"cost {plan.cost:.2f}")
+    figures.append(plan.method.value)
+    return [
+        f"start {plan.cells[0]}, goal {plan.cells[-1]}, {metres:.2f} m",
+        ", ".join(figures),
+    ]
 
 
 def _plan_poses(
@@ -196,61 +254,75 @@ def _plan_poses(
     from ddqn_planner.planning.pose_paths import in_cells
 
     assert planner.pose_planner is not None
-    cells_and_yaws = zip((start, goal), options.yaws, strict=True)
-    first, last = ((*grid.cell_to_world(cell), yaw) for cell, yaw in cells_and_yaws)
+    start_yaw, goal_yaw = options.yaws
+    start_pose = (*grid.cell_to_world(start), start_yaw)
+    goal_pose = (*grid.cell_to_world(goal), goal_yaw)
     tolerance = options.tolerance, options.yaw_tolerance
-    plan = planner.plan_poses(grid, first, last, tolerance, options.bound)
-    metres, bound = plan.length * grid.resolution, plan.bound
+    plan = planner.plan_poses(grid, start_pose, goal_pose, tolerance, options.bound)
+    metres = plan.length * grid.resolution
     title = f"{metres:.2f} m" if plan.cells else plan.status.value
-    known = f"{len(plan.poses)} poses, at most {bound:.3f} times the least cost"
-    poses = plan.poses.tolist()
-    answer = {"poses": poses, "metres": metres, "cost": plan.cost, "bound": bound}
-    ends = plan.poses[[0, -1]] if plan.cells else np.array([first, last])
+    ends = plan.poses[[0, -1]] if plan.cells else np.array([start_pose, goal_pose])
     footprint = planner.pose_planner.footprint / grid.resolution
-    body = footprint, in_cells(plan.poses, grid), in_cells(ends, grid)
-    table = ("x", "y", "yaw"), np.round(plan.poses, 6).tolist()
-    return _show(
-        options,
-        grid,
-        plan,
-        answer,
-        [f"{title}, {known}"],
-        table,
-        title=title,
-        body=body,
+    result = _Result(
+        answer={
+            "poses": plan.poses.tolist(),
+            "metres": metres,
+            "cost": plan.cost,
+            "bound": plan.bound,
+        },
+        lines=[
+            f"{title}, {len(plan.poses)} poses, at most {plan.bound:.3f} times the "
+            "least cost"
+        ],
+        columns=("x", "y", "yaw"),
+        rows=np.round(plan.poses, 6).tolist(),
+        picture={
+            "title": title,
+            "body": (footprint, in_cells(plan.poses, grid), in_cells(ends, grid)),
+        },
     )
+    return _show(options, grid, plan, result)
 
 
-def _show(
-    options: Any,
-    grid: GridMap,
-    plan: Any,
-    answer: Any,
-    lines: list[str],
-    table: Any,
-    **drawn: Any,
-) -> int:
-    """Print JSON, or a map and lines, or why there is no path; write and draw what is asked for."""
+class _Result(NamedTuple):
+    """A plan as it is shown."""
+
+    answer: dict[str, Any]  # for --json
+    lines: list[str]  # of text
+    columns: tuple[str, ...]  # for --csv
+    rows: list[Any]
+    picture: dict[str, Any]  # options of `save_picture`
+
+
+def _show(options: Any, grid: GridMap, plan: Any, result: _Result) -> int:
+    """Print a plan as JSON or text, or why there is none; write the files of options.
+
+    Return the exit code.
+    """
     from ddqn_planner.pictures import MAX_TEXT_WIDTH, draw_text, save_picture
 
-    ms = plan.field_ms + plan.rollout_ms
+    milliseconds = plan.field_ms + plan.rollout_ms
     if options.json:
-        said = {"status": plan.status.name, "reason": plan.reason, **answer}
-        print(json.dumps({**said, "planning_seconds": ms / 1e3}))
+        answer = {
+            "status": plan.status.name,
+            "reason": plan.reason,
+            **result.answer,
+            "planning_seconds": milliseconds / 1e3,
+        }
+        print(json.dumps(answer))
     elif plan.cells:
         if grid.width <= MAX_TEXT_WIDTH or sys.stdout.isatty():
             print(draw_text(grid, plan.cells))
-        print(*lines, sep="\n", end=f", planned in {ms:.1f} ms\n")
+        print(*result.lines, sep="\n", end=f", planned in {milliseconds:.1f} ms\n")
     else:
+        has_body = "body" in result.picture
         is_plain = plan.reason == plan.status.value
-        hint = (
-            " for the body; --picture shows it" if "body" in drawn and is_plain else ""
-        )
+        hint = " for the body; --picture shows it" if has_body and is_plain else ""
         print(f"no path: {plan.reason}{hint}", file=sys.stderr)
     if options.csv:
-        write_csv(options.csv, *table)
+        write_csv(options.csv, result.columns, result.rows)
     if options.picture:
-        save_picture(options.picture, grid, plan.cells, **drawn)
+        save_picture(options.picture, grid, plan.cells, **result.picture)
     return 0 if plan.cells else 1
 
 
@@ -265,17 +337,19 @@ def file_of(argument: str) -> Path:
 def _add_options(
     parser: argparse.ArgumentParser, *options: tuple[str, Any, Any, str]
 ) -> None:
-    """Add options of a name, a type or choices, a default and words; a flag's type is bool."""
+    """Add options: a name, a type or choices, a default, words. A flag is a bool."""
     for name, kind, default, words in options:
-        if kind is Path:
-            kind = file_of
-        how = (
-            {"action": "store_true"} if kind is bool else {"type": kind, "metavar": "X"}
-        )
-        how = {"choices": kind} if isinstance(kind, Sequence) else how
+        settings: dict[str, Any] = {"default": default, "help": words}
+        if kind is bool:
+            settings["action"] = "store_true"
+        elif isinstance(kind, Sequence):
+            settings["choices"] = kind
+        else:
+            settings["type"] = file_of if kind is Path else kind
+            settings["metavar"] = "X"
         if kind is not bool and default not in (None, ""):
-            words += " (default: %(default)s)"
-        parser.add_argument(f"--{name}", default=default, help=words, **how)
+            settings["help"] = f"{words} (default: %(default)s)"
+        parser.add_argument(f"--{name}", **settings)
 
 
 def _add_map_options(parser: argparse.ArgumentParser, move_rule: str | None) -> None:
@@ -305,7 +379,8 @@ def _read_map(options: Any) -> tuple[MapFile, Cell, Cell]:
     from ddqn_planner.grid import read_map_file
 
     map_file = read_map_file(find_map(options.map))
-    start, goal = options.start or map_file.start, options.goal or map_file.goal
+    start = options.start or map_file.start
+    goal = options.goal or map_file.goal
     if start is None or goal is None:
         raise ValueError(
             f"{options.map} names no start and goal; give --start X Y and --goal X Y"
@@ -326,13 +401,11 @@ def train(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     scenario = Scenario(map_file.grid(), start, goal, api.MoveRule(options.move_rule))
     trainer = _run_training(options, lambda: [scenario]).trainer
     field = trainer.planner().q_field(scenario.grid, goal)
-    evaluation, plan = (
-        evaluate(field, scenario.grid, field.move_rule),
-        field.rollout(start),
-    )
+    evaluation = evaluate(field, scenario.grid, field.move_rule)
+    plan = field.rollout(start)
     print(
-        f"the greedy rollout solves {evaluation.solved} of {evaluation.starts} starts, mean length "
-        f"{evaluation.mean_ratio:.4f} of the optimum; from the start "
+        f"the greedy rollout solves {evaluation.solved} of {evaluation.starts} "
+        f"starts, mean length {evaluation.mean_ratio:.4f} of the optimum; from the start "
         + (f"{plan.length:.2f} cells" if plan.cells else "it is trapped")
     )
     return 0
@@ -423,8 +496,9 @@ def _add_training_options(
     _add_options(parser, ("seed", int, 0, "seed of the training"))
     for entry in fields(parameters):
         kind = entry.metadata.get("choices") or type(entry.default)
-        default, words = getattr(parameters, entry.name), entry.metadata["source"]
-        _add_options(parser, (entry.name.replace("_", "-"), kind, default, words))
+        name = entry.name.replace("_", "-")
+        default = getattr(parameters, entry.name)
+        _add_options(parser, (name, kind, default, entry.metadata["source"]))
 
 
 def _run_training(
@@ -488,6 +562,22 @@ def certify(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     return 0 if certificate and certificate.proved else 1
 
 
+def _experience_to_teach(options: Any) -> api.Experience:
+    """Return the experience of ``--experience``, or a new one of the options."""
+    robot = {}
+    for name in ("nominal_speed", "robot_width"):
+        value = getattr(options, name)
+        if value is not None:
+            robot[name] = value
+    if not options.experience:
+        return api.Experience(**{"nominal_speed": 0.5, **robot})
+    experience = api.Experience.load(options.experience)
+    changed = differences(experience.options, robot)
+    if changed:
+        raise ValueError(f"{options.experience} has {changed}; leave those options out")
+    return experience
+
+
 def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     """Learn from a robot's recorded drives how long places take, and what of it the map tells."""
     from ddqn_planner.experience.drives import EXPERIENCE, LOCK, RECORD, Drive
@@ -537,19 +627,7 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     recordings = {f"the recording {path}": path for path in options.drives}
     check_distinct({"--out": out}, {**recordings, **_files_of(map_file)})
     grid = map_file.grid()
-    of_robot = {
-        "nominal_speed": options.nominal_speed,
-        "robot_width": options.robot_width,
-    }
-    given = {name: value for name, value in of_robot.items() if value is not None}
-    if options.experience:
-        experience = api.Experience.load(options.experience)
-        if changed := differences(experience.options, given):
-            raise ValueError(
-                f"{options.experience} has {changed}; leave those options out"
-            )
-    else:
-        experience = api.Experience(**{"nominal_speed": 0.5, **given})
+    experience = _experience_to_teach(options)
     drives: list[Drive] = []
     with ExitStack() as stack:
         for source in options.drives:
@@ -601,10 +679,8 @@ def warm_up(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
     from ddqn_planner.warm_up import warm_up as stages
 
     parser.add_argument("model", nargs="?", default="any_map", help=MODEL)
-    planner, began = (
-        api.Planner.load(parser.parse_args(arguments).model),
-        time.perf_counter(),
-    )
+    planner = api.Planner.load(parser.parse_args(arguments).model)
+    began = time.perf_counter()
     list(stages(planner, learns=True))
     print(f"compiled, or loaded, in {time.perf_counter() - began:.1f} s")
     return 0
@@ -641,5 +717,5 @@ def _run_command(arguments: Sequence[str]) -> int:
         )
     if not arguments or arguments[0] not in COMMANDS:
         parser.parse_args(arguments)  # ends with the help, or an error
-    name, *others = arguments
-    return COMMANDS[name](parsers[name], others)
+    name, *options = arguments
+    return COMMANDS[name](parsers[name], options)
