@@ -27,21 +27,26 @@ def map_features(grid: GridMap) -> Float32:
         np.float32
     )
     metres = np.minimum((cells - 0.5) * np.float32(grid.resolution), REACH)
-    widths = _widths(occupied, grid.resolution), _widths(occupied.T, grid.resolution).T
-    narrow, wide = np.minimum(*widths), np.maximum(*widths)
+    width_of_rows = _widths(occupied, grid.resolution)
+    width_of_columns = _widths(occupied.T, grid.resolution).T
+    narrow = np.minimum(width_of_rows, width_of_columns)
+    wide = np.maximum(width_of_rows, width_of_columns)
     steps = [1 / (1 + np.exp(7 * (narrow / width - 1))) for width in NARROW]
-    near, far = np.exp(-metres / 0.25), np.exp(-metres / 0.75)
-    return np.stack([near, far, metres, *steps, np.log(np.maximum(wide, 0.1))], axis=-1)
+    beside_wall = np.exp(-metres / 0.25)
+    near_wall = np.exp(-metres / 0.75)
+    log_width = np.log(np.maximum(wide, 0.1))
+    return np.stack([beside_wall, near_wall, metres, *steps, log_width], axis=-1)
 
 
 def _widths(occupied: Occupancy, resolution: float) -> Float32:
     """Return how many metres of its row are free around each cell: (H, W)."""
-    at = np.arange(occupied.shape[1], dtype=np.int32)
-    left = np.maximum.accumulate(np.where(occupied, at, -1), axis=1)
-    right = np.minimum.accumulate(np.where(occupied, at, len(at))[:, ::-1], axis=1)[
-        :, ::-1
-    ]
-    cells = np.maximum(right - left - 1, 0).astype(np.float32)
+    column = np.arange(occupied.shape[1], dtype=np.int32)
+    # (H, W): the column of the next occupied cell on each side, or just off the map.
+    walls_before = np.where(occupied, column, -1)
+    before = np.maximum.accumulate(walls_before, axis=1)
+    walls_after = np.where(occupied, column, len(column))
+    after = np.minimum.accumulate(walls_after[:, ::-1], axis=1)[:, ::-1]
+    cells = np.maximum(after - before - 1, 0).astype(np.float32)
     return np.asarray(np.minimum(cells * np.float32(resolution), 2 * REACH))
 
 
