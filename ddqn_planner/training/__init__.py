@@ -1,1 +1,1 @@
-"""The paper's contribution: environment, exploring starts, reward, replay, Double DQN, trainer."""
+"""The paper's contribution: environment, exploring starts, reward and Double DQN."""

@@ -1,4 +1,4 @@
-"""The training of the model for any map: small random maps, both move rules, all costs."""
+"""The training of the model for any map: random maps, both move rules, all costs."""
 
 from typing import Final
 
@@ -36,7 +36,7 @@ MAPS: Final = 512
 
 
 def random_scenarios(seed: int, maps: int = MAPS) -> list[Scenario]:
-    """Draw maps to train on, half for each move rule; a path connects each start with its goal."""
+    """Draw maps to train on, half for each move rule; a path joins start and goal."""
     random = np.random.default_rng(as_seed(seed))
     scenarios = []
     for number in range(maps):

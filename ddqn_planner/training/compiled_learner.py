@@ -445,7 +445,7 @@ def play(
     counters: Counters,
     until: int,
 ) -> Counters:
-    """Make steps until an episode ends, or `until`, or some milliseconds have passed."""
+    """Make steps until an episode ends, until step `until`, or for some milliseconds."""
     game, learning, robots = training
     settings = learning.settings
     steps, updates, replayed = counters
@@ -473,7 +473,7 @@ def play(
 def choose_actions(
     learning: Learning, robots: Robots, exploration: Generator, steps: int
 ) -> None:
-    """Choose the best action by the online network, or with probability ε any action."""
+    """Choose the best action by the online network; with probability ε, any action."""
     settings = learning.settings
     share = min(steps / settings.epsilon_steps, 1.0)
     epsilon = settings.epsilon_start + share * (
@@ -490,7 +490,7 @@ def choose_actions(
 
 @inner_in_place
 def move_robots(game: Game, learning: Learning, robots: Robots, replayed: int) -> bool:
-    """Move each robot once, put it into the replay buffer; return if an episode ended."""
+    """Move each robot once, remember the move, and return if an episode ended."""
     settings = learning.settings
     replay = learning.replay
     has_ended = False
@@ -600,7 +600,7 @@ def differentiate(
 
 @inlined
 def differentiate_last_layer(network: Network, gradient: Network, n: int) -> None:
-    """Compute the gradients by the last layer and by the output before it, of state n."""
+    """Compute the gradients by the last layer and by its input, of state n."""
     add(gradient.q[n], gradient.last_bias)
     for u in range(network.common_output.size):
         activation = relu(network.output[n, u])
@@ -656,7 +656,7 @@ def differentiate_common_windows(network: Network, gradient: Network) -> None:
 def add_kernel_gradient(
     gradient: Network, patch: Floats, patch_count: int, by_convolved: Floats
 ) -> None:
-    """Add the gradients by kernel and bias, given that by the convolution of patches."""
+    """Add the gradients by kernel and bias, from that by the convolution of patches."""
     filters = gradient.kernel_bias.size
     for row in range(patch_count):
         for f in range(filters):

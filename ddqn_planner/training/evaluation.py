@@ -1,4 +1,4 @@
-"""How good a Q field is: its greedy rollout from every free cell, against the exact optimum."""
+"""How good a Q field is: greedy rollouts from all free cells against the optimum."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""Improvement 1 of the paper (section 4.1, "initialisation"): exploring starts, as RRT samples."""
+"""Improvement 1 of the paper (section 4.1, "initialisation"): exploring starts."""
 
 import numpy as np
 from numpy.typing import NDArray

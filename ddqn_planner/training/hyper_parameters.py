@@ -1,4 +1,4 @@
-"""All hyper-parameters of training, defined once for the nodes, the command line and the tests."""
+"""All hyper-parameters of training, once for nodes, command line and tests."""
 
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -16,7 +16,7 @@ def _choice(*choices: str, source: str) -> Any:
 
 @dataclass(frozen=True)
 class HyperParameters:
-    """The paper's Table 1, and our values where it gives none; a ValueError names a wrong one."""
+    """The paper's Table 1, and our values where it gives none."""
 
     # p_r = 0 switches off improvement 1 (initialisation), alpha = beta = 0 improvement 2 (reward).
     network: str = _choice(

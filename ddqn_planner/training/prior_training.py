@@ -137,7 +137,7 @@ def _some_rows(rows: Float32, random: np.random.Generator) -> Float32:
 def _share_to_believe(
     block: NDArray[np.int64], weight: Float32, predicted: Float32, target: Float32
 ) -> Any:
-    """Return by which share of it a prediction is the best one: 0 if that is in doubt."""
+    """Return the share of a prediction that fits best; 0 if that is in doubt."""
     fit = np.bincount(block, weight * predicted * target)  # by block
     size = np.bincount(block, weight * predicted * predicted)
     total_size = max(size.sum(), MIN_SUM)
