@@ -193,14 +193,14 @@ class Evidence:
         self.errors.append(math.log(seconds / expected) / deviation)
 
     def quantiles(self) -> Float64:
-        """Return the lower bound, mean and upper bound of 90 % of drives' errors: (3,)."""
+        """Return the bounds of 90 % of drives' errors, and between them the mean."""
         assumed = NORMAL * np.linspace(-1.05, 1.05, ASSUMED_DRIVES)
         errors = np.concatenate([self.errors, assumed])
         low, high = np.quantile(errors, (TAIL, 1 - TAIL))
         return np.array([low, errors.mean(), high])
 
     def over(self, grid: GridMap) -> Posterior:
-        """Return the posterior over a map, from the last one if the cells are the same."""
+        """Return the posterior over a map."""
         check_grid(grid)
         posterior = self.posterior
         # An exception must not leave a posterior that is half updated.
@@ -234,8 +234,8 @@ class Evidence:
     def use_prior(self, prior: Prior | None) -> None:
         """Predict with another prior.
 
-        The level of a prior was learned from these places. Their predictions move by the
-        difference of the two levels, so that it does not count twice.
+        The level of a prior was learned from these places. Their predictions move by
+        the difference of the two levels, so that it does not count twice.
         """
         self.places.predicted += _level_of(prior) - _level_of(self.prior)
         self.prior = prior

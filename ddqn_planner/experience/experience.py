@@ -219,15 +219,17 @@ class Experience:
         return f"the robot comes no farther than {extent:.2g} m; give a longer drive"
 
     def _too_fast(self, speed: float) -> str:
-        remedy = f"give metres and seconds, or a nominal_speed greater than {self.nominal_speed:g}"
+        nominal = f"{self.nominal_speed:g}"
+        remedy = f"give metres and seconds, or a nominal_speed greater than {nominal}"
         return f"the robot moves at {speed:.3g} m/s; {remedy} m/s"
 
     def _too_slow(self, speed: float) -> str:
-        remedy = f"give metres and seconds, or a nominal_speed less than {self.nominal_speed:g}"
+        nominal = f"{self.nominal_speed:g}"
+        remedy = f"give metres and seconds, or a nominal_speed less than {nominal}"
         return f"the robot moves at most at {speed:.3g} m/s; {remedy} m/s"
 
     def record_failure(self, position: Sequence[float]) -> None:
-        """Learn that the robot failed at a place: it costs as much as a wait of `max_pause`."""
+        """Learn that the robot failed at a place: it costs a wait of `max_pause`."""
         point = numbers(
             "the position",
             position,
@@ -270,7 +272,7 @@ class Experience:
 
     @property
     def max_speed(self) -> float:
-        """Metres per second up to which a robot is believed, unless it usually drives faster."""
+        """The speed up to which a robot is believed, metres per second."""
         return 3 * max(self.nominal_speed, self.learned_speed)
 
     @property
@@ -498,7 +500,7 @@ def _as_option(name: str, value: Any) -> float:
 
 
 def _possible(time: Float64, position: Float64) -> Clip:
-    """Return the poses that are possible, and whose time is not that of the one before."""
+    """Return the possible poses, without those that repeat a time."""
     # Comparisons with NaN are false.
     is_time = np.abs(time) < LATEST
     is_place = (np.abs(position) < FARTHEST).all(axis=1)
@@ -522,8 +524,8 @@ def _arrays_in(data: bytes) -> dict[str, NDArray[Any]]:
 def _converted(table: Float64, driven: Float64 | float, half_life: float) -> Float64:
     """Return the table of a file of version 1 as one of today.
 
-    Its columns are weight, sum of the log slowness, failures, x, y, and the seconds that
-    were driven before the last visit.
+    Its columns are weight, sum of the log slowness, failures, x, y, and the seconds
+    that were driven before the last visit.
     """
     weight_and_sum = table[:, :2]
     position = table[:, 3:5]

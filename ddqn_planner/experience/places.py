@@ -1,4 +1,4 @@
-"""Places of the world, squares half a robot wide, and the sums of what was seen there."""
+"""Places of the world, squares half a robot wide, and what was seen there."""
 
 from __future__ import annotations
 

@@ -43,8 +43,8 @@ class Population(NamedTuple):
     level: float  # the mean where the prior predicts 0
     prior_weight: float  # how much the prediction of the prior counts
     variance: float
-    # Added to the log slowness of unknown places: the mean of an exponential is more than
-    # the exponential of the mean, as far as drives have shown that places differ.
+    # Added to the log slowness of unknown places: the mean of an exponential is more
+    # than the exponential of the mean, as far as drives have shown that places differ.
     surplus: float
     open_log: float  # log slowness in the open
     fastest_log: float  # log slowness where the robot is fastest

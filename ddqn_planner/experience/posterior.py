@@ -164,9 +164,8 @@ class Posterior:
 
     def _solve(self, sums: SumsOnMap, variance: float) -> None:
         """Solve the equations of the field, beginning with the last solution."""
-        # A lattice whose links have strength 1 has about the variance
-        # ln(32 / kappa) / 4 pi; 1 is added for cells of many metres, where that would be
-        # negative.
+        # A lattice whose links have strength 1 has about the variance ln(32 / kappa) /
+        # 4 pi; 1 is added for cells of many metres, where that would be negative.
         kappa = (self.spacing / CORRELATION) ** 2
         scale = variance / (math.log1p(32 / kappa) / (4 * math.pi)) / NOISE
         visits = scale * sums.weight

@@ -1,4 +1,4 @@
-"""What the poses of a drive show of places: how long the robot drove there, and waited."""
+"""What poses of a drive show of places: how long the robot drove and waited."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ WINDOW = 0.15
 LONGEST_WINDOW = 0.3
 # Metres: the deviation of the averaged poses. More would hide slowness.
 AVERAGED_NOISE = 0.015
-# The median length of second differences of normal noise is so many times its deviation.
+# The median length of second differences of normal noise is so many times its
+# deviation.
 BEND_OF_NOISE = 2.88
 
 STAND_DISTANCE = 0.1  # metres within which a robot stands
