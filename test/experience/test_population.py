@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from experience.straight_drives import HALL, at, driven, straight
+from experience.straight_drives import HALL, at, driven, straight, uneven
 
 from ddqn_planner.experience.places import Places
 from ddqn_planner.experience.population import population_of
@@ -33,3 +33,10 @@ def test_a_wait_that_is_over_is_forgotten_within_some_passages() -> None:
         experience.record(seconds, position)
     assert before > 8
     assert at(HALL, experience.slowness(HALL), 7.1, 5) < 0.35 * before
+
+
+def test_a_fast_stretch_does_not_raise_the_speed_in_the_open() -> None:
+    x = np.linspace(2, 12, 201)
+    slowness = np.where((x > 6) & (x < 7.5), 0.25, 1.0)
+    experience = driven(*[uneven(x, slowness)] * 4)
+    assert experience.learned_speed == pytest.approx(0.5, rel=0.1)
