@@ -38,7 +38,7 @@ default_role = "code"
 
 
 def write_command_line() -> None:
-    """Write what `ddqn-planner COMMAND --help` prints, which the page command_line.md includes."""
+    """Write the help of each command to a file that command_line.md includes."""
     folder = DOCS / "_build" / "help"
     folder.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, "COLUMNS": "88", "PYTHONPATH": str(DOCS.parent)}
@@ -46,12 +46,12 @@ def write_command_line() -> None:
 
     command = [sys.executable, "-c", "from ddqn_planner.cli import main; main()"]
     for name in COMMANDS:
-        asked = [*command, name, "--help"]
+        help_command = [*command, name, "--help"]
         text = subprocess.run(
-            asked, env=environment, stdout=subprocess.PIPE, check=True
+            help_command, env=environment, stdout=subprocess.PIPE, check=True
         ).stdout
         if not text:
-            raise RuntimeError(f"{asked} prints nothing")
+            raise RuntimeError(f"{help_command} prints nothing")
         (folder / f"{name}.txt").write_bytes(text)
 
 

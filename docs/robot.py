@@ -33,22 +33,26 @@ class Robot(Node):
         self.poses = [pose.pose.position for pose in plan.poses]
 
     def step(self) -> None:
-        """Drive for one period, and say where the robot is."""
-        way = self.speed * PERIOD
-        while self.poses and way > 0:
-            dx, dy = self.poses[0].x - self.x, self.poses[0].y - self.y
+        """Drive for one period, and publish the robot's pose."""
+        metres = self.speed * PERIOD  # still to drive in this period
+        while self.poses and metres > 0:
+            target = self.poses[0]
+            dx = target.x - self.x
+            dy = target.y - self.y
             distance = math.hypot(dx, dy)
             if distance > 0:
-                share = min(way / distance, 1.0)
-                self.x, self.y = self.x + share * dx, self.y + share * dy
+                share = min(metres / distance, 1.0)
+                self.x += share * dx
+                self.y += share * dy
                 self.yaw = math.atan2(dy, dx)
-            if distance <= way:
+            if distance <= metres:
                 self.poses.pop(0)
-            way -= distance
+            metres -= distance
         message = Odometry(child_frame_id="base_link")
         message.header.frame_id = "map"
         message.header.stamp = self.get_clock().now().to_msg()
-        message.pose.pose.position.x, message.pose.pose.position.y = self.x, self.y
+        message.pose.pose.position.x = self.x
+        message.pose.pose.position.y = self.y
         message.pose.pose.orientation.z = math.sin(self.yaw / 2)
         message.pose.pose.orientation.w = math.cos(self.yaw / 2)
         self.odometry.publish(message)
