@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.planning.paths import obstacles_in_the_way
-from ddqn_planner.planning.pose_paths import Body, Float64, in_cells, touches
+from ddqn_planner.planning.pose_paths import BodyPoints, Float64, in_cells, touches
 from ddqn_planner.planning.pose_world import occupied_for_body
 
 LETHAL: Final = 254  # Nav2's cost of an obstacle
@@ -22,7 +22,7 @@ def invalid_poses(
     grid: GridMap,
     *,
     robot: Any = None,
-    body: Body | None = None,
+    body: BodyPoints | None = None,
     unknown: Occupancy | None = None,
     max_cost: int = LETHAL,
     distance: float = math.inf,

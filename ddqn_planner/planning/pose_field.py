@@ -11,7 +11,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.planning import pose_space, wavefront
-from ddqn_planner.planning.pose_paths import SAME, Way
+from ddqn_planner.planning.pose_paths import SAME, PosePath
 from ddqn_planner.planning.pose_space import Aim, Search
 from ddqn_planner.planning.pose_world import (
     SHIFT,
@@ -63,7 +63,7 @@ class PoseField:
         self.goals = goals  # (N, 3): x, y, heading
         self.grid = grid
         self.world = world
-        self.way: Way | None = None  # the last path that followed it
+        self.path: PosePath | None = None  # the last path that followed it
         self.visits = 0  # for the start of the aim
         self._aim = aim._replace(number=-1)
         self._heap = make_heap(0)
@@ -229,7 +229,7 @@ class PoseField:
         opens = not occupied_for_body(grid)[cells[:, 1], cells[:, 0]].all()
         self.grid = grid
         self.world = world
-        self.way = None
+        self.path = None
         self.visits = 0
         tiles = np.flatnonzero(self._touched)
         is_near = self._tiles_near(cells)

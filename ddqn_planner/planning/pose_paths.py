@@ -1,4 +1,4 @@
-"""Paths of poses: what is left of one, whether a body has room along it, what it costs."""
+"""Paths of poses: their plans, whether a body has room along them, what they cost."""
 
 import math
 from typing import Any, Final, NamedTuple
@@ -16,91 +16,117 @@ from ddqn_planner.robot.footprint import inside, outline
 from ddqn_planner.robot.motions import BEHIND, TURN, turn_between
 
 Float64 = NDArray[np.float64]
-Body = tuple[Float64, Float64]
 
-REACH: Final = 5.0, math.pi / 4  # cells and radians that a robot may be beside its path
-BETWEEN: Final = 0.25  # cells between two points of a body's outline
-WITHIN: Final = 0.7  # and inside: so each cell there, turned as it may be, has a point
+# Cells and radians that a robot may be beside its path.
+REACH: Final = 5.0, math.pi / 4
+OUTLINE_SPACING: Final = 0.25  # cells between two points of a body's outline
+# And inside: so each cell there, turned as it may be, has a point.
+FILL_SPACING: Final = 0.7
 SAME: Final = 1 + 1e-6  # what is rounded in sums of float32 is less
-AHEAD: Final = (
-    0.9  # the cosine above which a robot drives ahead, not behind or sideways
-)
+# The cosine above which a robot drives ahead, not behind or sideways.
+AHEAD: Final = 0.9
+ON_THE_SPOT: Final = 1e-6  # cells: a shorter step is a turn
 
 
-class Way(NamedTuple):
+class PosePath(NamedTuple):
     """A path of N poses."""
 
     poses: Float64  # (N, 3), in metres and radians
     cells: NDArray[np.int32]  # (N, 2)
-    spent: Float64  # (N,) before each pose
-    least: float  # a lower bound of what must be spent
+    costs: Float64  # (N,): from the first pose to each, in cells
+    least_cost: float  # a lower bound of the cost of any path between its ends
 
     def plan(self, first: int, grid: GridMap) -> PosePlan:
         """Return the plan along the poses from one on."""
-        poses, cells = self.poses[first:], self.cells[first:]
+        poses = self.poses[first:]
         poses.flags.writeable = False
-        (x, y, _), (column, line) = poses.T, cells.T
-        is_next = (column[1:] != column[:-1]) | (line[1:] != line[:-1])
-        cost, least = (
-            float(self.spent[-1] - self.spent[first]),
-            self.least - self.spent[first],
-        )
-        bound = max(cost / least, 1.0) if least > 0 else math.inf
+        cells = self.cells[first:]
+        has_left_cell = (cells[1:] != cells[:-1]).any(axis=1)
+        cost = float(self.costs[-1] - self.costs[first])
+        least_cost = self.least_cost - float(self.costs[first])
+        bound = math.inf
+        if cost <= least_cost * SAME:
+            bound = 1.0
+        elif least_cost > 0:
+            bound = max(cost / least_cost, 1.0)
+        steps = np.diff(poses[:, :2], axis=0)  # (N - first - 1, 2), in metres
+        goal_x, goal_y = cells[-1].tolist()
         return PosePlan(
             PlanStatus.SUCCEEDED,
-            cells[np.append(True, is_next)],
+            cells[np.append(True, has_left_cell)],
             cost=cost * (grid.seconds_per_cell or 1.0),
-            goal=(int(cells[-1, 0]), int(cells[-1, 1])),
+            goal=(goal_x, goal_y),
             poses=poses,
-            driven=float(np.hypot(np.diff(x), np.diff(y)).sum()) / grid.resolution,
-            bound=float(bound) if cost > least * SAME else 1.0,
+            driven=float(np.hypot(steps[:, 0], steps[:, 1]).sum()) / grid.resolution,
+            bound=bound,
         )
 
 
-def points_of(corners: Float64, resolution: float) -> Body:
-    """Return points along the sides of a footprint, (M, 2), and inside it, in cells."""
+class BodyPoints(NamedTuple):
+    """Points of a footprint from its origin, in cells."""
+
+    outline: Float64  # (M, 2): along its sides
+    inside: Float64  # (K, 2)
+
+
+def points_of(corners: Float64, resolution: float) -> BodyPoints:
+    """Return points of a footprint whose corners (C, 2) are in metres."""
     body = corners / resolution
-    axes = (np.arange(axis.min(), axis.max(), WITHIN) for axis in body.T)
-    filled = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    return outline(body, BETWEEN), filled[inside(filled, body)]
+    x = np.arange(body[:, 0].min(), body[:, 0].max(), FILL_SPACING)
+    y = np.arange(body[:, 1].min(), body[:, 1].max(), FILL_SPACING)
+    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    return BodyPoints(outline(body, OUTLINE_SPACING), points[inside(points, body)])
 
 
 def in_cells(poses: Float64, grid: GridMap) -> Float64:
-    """Return poses (N, 3) with x and y in cells from the centre of cell (0, 0), turned with it."""
+    """Return poses (N, 3) with x and y in cells from the centre of cell (0, 0).
+
+    They are turned with the map.
+    """
     poses = np.reshape(poses, (-1, 3))
     cells = grid.in_cells(poses[:, :2]) - 0.5
-    return np.column_stack([cells, poses[:, 2] - grid.origin[2]])
+    yaw = poses[:, 2] - grid.origin[2]
+    return np.column_stack([cells, yaw])
 
 
 def nearest_pose(
     poses: Float64, robot: Any, grid: GridMap, reach: tuple[float, float]
 ) -> int:
-    """Return which of some poses (N, 3) is nearest to a robot; -1 if none is within reach."""
-    apart = np.hypot(poses[:, 0] - robot[0], poses[:, 1] - robot[1]) / grid.resolution
-    near = np.flatnonzero(apart <= reach[0])
-    turn = np.abs(turn_between(poses[near, 2], robot[2]))
-    near, turn = near[turn <= reach[1]], turn[turn <= reach[1]]
-    far = apart[near] / REACH[0] + turn / REACH[1]
-    return int(near[far.argmin()]) if len(near) else -1
+    """Return which of some poses (N, 3) is nearest to a robot's pose.
+
+    It is -1 if none is within reach: so many cells and radians.
+    """
+    x, y, yaw = robot
+    max_distance, max_turn = reach
+    distance = np.hypot(poses[:, 0] - x, poses[:, 1] - y) / grid.resolution  # (N,)
+    turn = np.abs(turn_between(poses[:, 2], yaw))  # (N,)
+    candidates = np.flatnonzero((distance <= max_distance) & (turn <= max_turn))
+    if not len(candidates):
+        return -1
+    apartness = distance[candidates] / REACH[0] + turn[candidates] / REACH[1]
+    return int(candidates[apartness.argmin()])
 
 
-def is_free(poses: Float64, grid: GridMap, body: Body) -> bool:
+def is_free(poses: Float64, grid: GridMap, body: BodyPoints) -> bool:
     """Return whether a body has room along a path, and leaves no cell as it forbids."""
     path = in_cells(poses, grid)
-    occupied, (outline, within) = occupied_for_body(grid).view(np.uint8), body
+    occupied = occupied_for_body(grid).view(np.uint8)
+    height, width = occupied.shape
     cells = cells_of(path)
-    if not ((cells >= 0) & (cells < occupied.shape[::-1])).all():
+    if not ((cells >= 0) & (cells < (width, height))).all():
         return False  # an origin outside of the body leaves the map
+    if touches(path, body.outline, occupied):
+        return False
     # What is inside the body at a later pose has come through its outline.
-    if touches(path, outline, occupied) or touches(path[:1], within, occupied):
+    if touches(path[:1], body.inside, occupied):
         return False
     if grid.forbidden is None:
         return True
-    x, y = cells.T
-    leaves = ACTION_OF_STEP[
-        np.clip(np.diff(y), -1, 1) + 1, np.clip(np.diff(x), -1, 1) + 1
-    ]
-    return not (grid.forbidden[y[:-1], x[:-1]] >> leaves & 1).any()
+    x, y = cells[:-1].T
+    steps = np.clip(np.diff(cells, axis=0), -1, 1)  # (N - 1, 2)
+    actions = ACTION_OF_STEP[steps[:, 1] + 1, steps[:, 0] + 1]
+    is_forbidden = grid.forbidden[y, x] >> actions & 1
+    return not is_forbidden.any()
 
 
 def cells_of(path: Float64) -> NDArray[np.int32]:
@@ -111,33 +137,42 @@ def cells_of(path: Float64) -> NDArray[np.int32]:
 def cost_of_poses(poses: Float64, grid: GridMap) -> float:
     """Return nearly what the primitives of a free path cost."""
     path = in_cells(poses, grid)
-    steps = np.diff(path[:, :2], axis=0)
-    length, turn = np.hypot(*steps.T), np.abs(turn_between(path[:-1, 2], path[1:, 2]))
-    yaw = path[:-1, 2] + turn_between(path[:-1, 2], path[1:, 2]) / 2
-    ahead = steps[:, 0] * np.cos(yaw) + steps[:, 1] * np.sin(yaw) > AHEAD * length
-    spent = np.where(ahead, 1.0, BEHIND) * length
-    spent[length < 1e-6] = (turn * TURN / grid.resolution)[length < 1e-6]
+    dx, dy = np.diff(path[:, :2], axis=0).T  # (N - 1,) each, as all below
+    length = np.hypot(dx, dy)
+    yaw = path[:-1, 2]
+    turn = turn_between(yaw, path[1:, 2])
+    yaw_between = yaw + turn / 2
+    length_ahead = dx * np.cos(yaw_between) + dy * np.sin(yaw_between)
+    cost = np.where(length_ahead > AHEAD * length, length, BEHIND * length)
+    turn_cost = np.abs(turn) * TURN / grid.resolution
+    cost = np.where(length < ON_THE_SPOT, turn_cost, cost)
     x, y = cells_of(path[:-1]).T
-    if (cost := body_costs(grid)) is not None:
-        spent *= multipliers_of(cost[y, x])
+    cell_costs = body_costs(grid)
+    if cell_costs is not None:
+        cost *= multipliers_of(cell_costs[y, x])
     if grid.slowness is not None:
-        spent *= grid.slowness[y, x]
-    return float(spent.sum())
+        cost *= grid.slowness[y, x]
+    return float(cost.sum())
 
 
 @in_place
 def touches(path: Float64, points: Float64, occupied: NDArray[np.uint8]) -> bool:
     """Return whether points of a body touch an occupied cell at a pose, or leave the map."""
+    height, width = occupied.shape
     for number in range(len(path)):
-        x, y, yaw = path[number, 0] + 0.5, path[number, 1] + 0.5, path[number, 2]
-        cos, sin = math.cos(yaw), math.sin(yaw)
+        # From the corner of cell (0, 0), so that rounding down gives the cell.
+        x = path[number, 0] + 0.5
+        y = path[number, 1] + 0.5
+        yaw = path[number, 2]
+        cos = math.cos(yaw)
+        sin = math.sin(yaw)
         for point in range(len(points)):
-            over, up = points[point, 0], points[point, 1]
-            column = math.floor(x + cos * over - sin * up)
-            line = math.floor(y + sin * over + cos * up)
-            is_inside = (
-                0 <= column < occupied.shape[1] and 0 <= line < occupied.shape[0]
-            )
-            if not is_inside or occupied[line, column]:
+            ahead = points[point, 0]
+            left = points[point, 1]
+            column = math.floor(x + cos * ahead - sin * left)
+            row = math.floor(y + sin * ahead + cos * left)
+            if not (0 <= column < width and 0 <= row < height):
+                return True
+            if occupied[row, column]:
                 return True
     return False

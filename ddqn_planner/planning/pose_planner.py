@@ -304,9 +304,9 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
             cost = ratio * cost_of_plan
             least_cost = cost_of_plan / plan.bound
         cells = paths.cells_of(paths.in_cells(rest, grid))
-        spent = np.linspace(0, cost, len(rest))
+        costs = np.linspace(0, cost, len(rest))
         return replace(
-            paths.Way(rest, cells, spent, least_cost).plan(0, grid),
+            paths.PosePath(rest, cells, costs, least_cost).plan(0, grid),
             extra_cost=ratio - 1,
             field_ms=plan.field_ms,
             rollout_ms=plan.rollout_ms,
@@ -384,7 +384,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         for (goals, tolerance, _), field in self._fields.items():
             if goals != request.goals or tolerance != request.tolerance:
                 continue
-            path = field.way
+            path = field.path
             if path is None:
                 continue
             changed = self._differences(field.grid, request.grid)
@@ -450,16 +450,16 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
             rows = field.rollout(start)
             if rows is None:
                 return PosePlan(PlanStatus.NO_PATH, field_ms=clock.field_ms)
-            x, y, yaw, spent = rows
+            x, y, yaw, costs = rows
             in_cells = np.column_stack([x, y])
             yaw_on_map = turn_between(0, yaw + grid.origin[2])
-            field.way = paths.Way(
+            field.path = paths.PosePath(
                 poses=np.column_stack([grid.centres(in_cells), yaw_on_map]),
                 cells=paths.cells_of(in_cells),
-                spent=spent.copy(),
-                least=float(spent[-1]) / bound,
+                costs=costs.copy(),
+                least_cost=float(costs[-1]) / bound,
             )
-            plan = field.way.plan(0, grid)
+            plan = field.path.plan(0, grid)
         return replace(plan, field_ms=clock.field_ms, rollout_ms=clock.rollout_ms)
 
 
