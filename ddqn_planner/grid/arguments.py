@@ -58,6 +58,10 @@ def is_flag(value: Any) -> bool:
 
 def as_cell(cell: Any, name: str = "the cell") -> Cell:
     """Return a pair of whole numbers, as a list or an array, as Python ints."""
+    if type(cell) is tuple and len(cell) == 2:  # at once, as most cells are such pairs
+        x, y = cell
+        if type(x) is int and type(y) is int:
+            return x, y
     try:
         if len(cell) == 2 and not any(map(is_flag, cell)):
             x = int(cell[0])

@@ -248,7 +248,8 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
         else:
             capacity *= 4
     is_known = progress.reason == DONE or not opened.size
-    return known._replace(opened=opened), is_known
+    grown = Known(known.distance, known.mark, opened, known.closed_is_final)
+    return grown, is_known
 
 
 def _space_toward(start: int, costs: MoveCosts) -> CellSpace:

@@ -141,17 +141,16 @@ class Planner:
             If the tolerance or the radius is negative or NaN, the start or a goal is no
             pair of whole numbers, or there is no goal or no such move rule or method.
         """
-        request = PlanRequest(
+        return self._answer(
             grid,
             start,
             goals=(as_cell(goal, "the goal"),),
-            move_rule=self._rule(move_rule),
-            method=PlanMethod(method),
+            move_rule=move_rule,
+            method=method,
             tolerance=tolerance,
             simplified=simplified,
             start_clearing_radius=start_clearing_radius,
         )
-        return self._answer(request)
 
     def plan_nearest(
         self,
@@ -175,16 +174,16 @@ class Planner:
         goals : sequence of (x, y)
             At least one, in any order. No goal moves: there is no tolerance.
         """
-        request = PlanRequest(
+        return self._answer(
             grid,
             start,
             goals=_cells_of_goals(goals),
-            move_rule=self._rule(move_rule),
-            method=PlanMethod(method),
+            move_rule=move_rule,
+            method=method,
+            tolerance=0.0,
             simplified=simplified,
             start_clearing_radius=start_clearing_radius,
         )
-        return self._answer(request)
 
     def plan_through(
         self,
@@ -298,23 +297,37 @@ class Planner:
         """
         return self._finder.rest_of_path(request)
 
-    def _answer(self, request: PlanRequest) -> Plan:
-        """Return the plan of a request whose arguments are checked now."""
-        check_grid(request.grid)
+    def _answer(
+        self,
+        grid: GridMap,
+        start: Cell,
+        *,
+        goals: tuple[Cell, ...],
+        move_rule: MoveRule | str | None,
+        method: PlanMethod | str,
+        tolerance: float,
+        simplified: bool,
+        start_clearing_radius: float,
+    ) -> Plan:
+        """Check the arguments but the goals, which are checked; return the plan."""
+        rule = self._rule(move_rule)
+        check_grid(grid)
         if self.pose_planner is not None:
             raise ValueError(f"{HAS_BODY}; use plan_poses, or a planner_node")
         limits = 0, math.inf, "0 cells or more"
-        checked = replace(
-            request,
-            start=as_cell(request.start, "the start"),
-            method=PlanMethod(request.method),
-            tolerance=as_number("the tolerance", request.tolerance, *limits),
-            simplified=as_flag("simplified", request.simplified),
+        request = PlanRequest(
+            grid,
+            as_cell(start, "the start"),
+            goals,
+            move_rule=rule,
+            method=PlanMethod(method),
+            tolerance=as_number("the tolerance", tolerance, *limits),
+            simplified=as_flag("simplified", simplified),
             start_clearing_radius=as_number(
-                "start_clearing_radius", request.start_clearing_radius, *limits
+                "start_clearing_radius", start_clearing_radius, *limits
             ),
         )
-        return last_step(self.cell_planner.steps(checked))
+        return last_step(self.cell_planner.steps(request))
 
 
 def _tolerance_of_poses(tolerance: Any) -> tuple[float, float]:
