@@ -1,4 +1,4 @@
-"""Parts of paths: searches, the way out of a start, what is left of a path under way."""
+"""Parts of paths: searches, the way out of a start, the rest of a path under way."""
 
 import heapq
 from collections.abc import Iterator
@@ -152,7 +152,7 @@ def _way_and_reached(
 def obstacles_in_the_way(
     grid: GridMap, start: Cell, clearing_radius: float
 ) -> Occupancy:
-    """Return (H, W) bool: the obstacles that count for a start, which may be one itself."""
+    """Return the obstacles that count for a start, which may be one itself: (H, W)."""
     # The robot stands there, so it and those within the radius are none.
     obstacles = grid.occupancy if grid.obstacles is None else grid.obstacles
     if clearing_radius > 0 and grid.is_obstacle(start):
@@ -182,7 +182,7 @@ def find_way_out(request: PlanRequest, ends: NDArray[np.bool_]) -> tuple[Cell, .
 def _cells_within(
     mask: NDArray[np.bool_], centre: Cell, radius: float
 ) -> NDArray[np.int64]:
-    """Return the cells of a mask within a radius of a cell: (N, 2), the nearest first."""
+    """Return the cells (N, 2) of a mask within a radius of a cell, nearest first."""
     x, y = centre
     side = int(min(radius, max(mask.shape)))
     first_column = max(x - side, 0)
@@ -227,11 +227,12 @@ def rest_of_path(
     order = np.lexsort((-candidates, distance[candidates]))
     for index in candidates[order].tolist():
         for way in _ways_to(passed_cells[index], robot):
-            path = np.concatenate([way, cells[following[index] :]], dtype=np.int32)
-            segments_to_check = path[: len(way) + 1]
+            onward = cells[following[index] :]
+            joined = np.concatenate([way, onward], dtype=np.int32)
+            new_part = joined[: len(way) + 1]
             is_short = len(way) <= REACH + 1
-            if is_short and legal_segments(segments_to_check, grid, move_rule).all():
-                return path
+            if is_short and legal_segments(new_part, grid, move_rule).all():
+                return joined
     return cells[:0]
 
 

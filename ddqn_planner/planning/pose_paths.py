@@ -157,7 +157,7 @@ def cost_of_poses(poses: Float64, grid: GridMap) -> float:
 
 @in_place
 def touches(path: Float64, points: Float64, occupied: NDArray[np.uint8]) -> bool:
-    """Return whether points of a body touch an occupied cell at a pose, or leave the map."""
+    """Return whether points of a body touch an occupied cell, or leave the map."""
     height, width = occupied.shape
     for number in range(len(path)):
         # From the corner of cell (0, 0), so that rounding down gives the cell.

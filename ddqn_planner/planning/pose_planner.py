@@ -1,4 +1,4 @@
-"""Plans for a robot with a body and a heading: from poses to states, fields, and poses again."""
+"""Plans for a robot with a body: from poses to states, fields, and poses again."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         self._lock = threading.Lock()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy has, also in another process: no fields, and a lock of its own."""
+        """Return what a copy has, also in another process: no fields, and no lock."""
         return {
             name: value
             for name, value in vars(self).items()
@@ -169,23 +169,21 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         free_grid = with_unknown_free(request.grid)
         possible = world_of(free_grid, self.body)
         starts = self._at(free_grid, request.start, possible)
+        has_start = len(starts) > 0
+        has_several_goals = len(request.goals) > 1
         if plan.status is PlanStatus.START_OCCUPIED:
-            if not len(starts):
+            if not has_start:
                 return status
             place = self._place(request, start_cell)
             return f"the start {place}; {unknown_space.REMEDY}"
-        has_several_goals = len(request.goals) > 1
-        if not len(starts) and not has_several_goals:
+        if not has_start and not has_several_goals:
             return status
         places = [
             self._goal_in_words(request, goal, possible) for goal in request.goals
         ]
-        if has_several_goals:
-            has_unknown_cells = request.grid.unknown is not None
-            if all(places) or not has_unknown_cells or not len(starts):
-                return unknown_space.reason_of_goals(places, "")
-        elif unknown_space.UNKNOWN_SPACE in places[0]:
-            return f"the goal {places[0]}; {unknown_space.REMEDY}"
+        reason_of_places = _reason_of_places(places, request.grid, has_start)
+        if reason_of_places:
+            return reason_of_places
         start: State = tuple(starts[0].tolist())
         states = self._ends_with_room(request, places, start, free_grid, possible)
         if not len(states):
@@ -220,7 +218,10 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         return np.concatenate([self._at(free_grid, goal, possible) for goal in goals])
 
     def _through_unknown_space(self, field: PoseField, start: State) -> Finding[str]:
-        """Return words if a path leads through unknown space, or may; empty if none does."""
+        """Return words if a path leads through unknown space, or may.
+
+        They are empty if none does.
+        """
         for _ in range(MOST_STEPS_OF_REASON):
             bound = field.reach(start, BOUND_OF_REASON, VISITS)
             if bound == math.inf:
@@ -261,16 +262,20 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
 
     def rest_of(
         self,
-        way: Any,
+        path: Any,
         robot: Any,
         grid: GridMap,
         reach: tuple[float, float] = paths.REACH,
     ) -> NDArray[np.float64]:
-        """Return a path from the pose nearest to a robot on; empty if it is far, or has no room."""
-        poses: NDArray[np.float64] = np.asarray(way, dtype=np.float64).reshape(-1, 3)
+        """Return a path from the pose nearest to a robot on, (N, 3).
+
+        It is empty if the robot is too far from it, or the body has no room along it.
+        """
+        poses: NDArray[np.float64] = np.asarray(path, dtype=np.float64).reshape(-1, 3)
         first = paths.nearest_pose(poses, robot, grid, reach)
-        rest = poses[first:] if first >= 0 else poses[:0]
-        return rest if paths.is_free(rest, grid, self.points) else poses[:0]
+        if first < 0 or not paths.is_free(poses[first:], grid, self.points):
+            return poses[:0]
+        return poses[first:]
 
     def _keep_or_switch(self, request: PoseRequest, plan: PosePlan) -> PosePlan:
         """Return the rest of the path under way if it hardly costs more than a plan.
@@ -313,7 +318,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         )
 
     def _check(self, grid: GridMap) -> None:
-        """Raise a ValueError if the map's cells are not of the size that the robot learned."""
+        """Raise a ValueError if the robot learned cells of another size."""
         learned = self.motions.resolution
         resolution = grid.resolution
         if not math.isclose(resolution, learned, rel_tol=1e-3):
@@ -324,7 +329,10 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
             )
 
     def _at(self, grid: GridMap, pose: Pose, world: World) -> NDArray[np.int64]:
-        """Return the state (1, 3) of a pose, of the nearer of two headings with room, or none."""
+        """Return the state (1, 3) of a pose; (0, 3) if the body has no room.
+
+        Of the two nearest headings, it is the nearer one with room.
+        """
         x, y, yaw = pose
         turn = np.abs(turn_between(self.motions.angles, yaw - grid.origin[2]))
         nearest_headings = np.argsort(turn, kind="stable")[:2]
@@ -336,7 +344,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
     def _around(
         self, request: PoseRequest, start: State, world: World
     ) -> NDArray[np.int64]:
-        """Return the states (N, 3) within the tolerance of the goal at which a path may end."""
+        """Return the states (N, 3) within the goal's tolerance where a path may end."""
         grid = request.grid
         metres, radians = request.tolerance
         x, y, yaw = request.goals[0]
@@ -380,7 +388,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         return least_distance
 
     def _from_last_path(self, request: PoseRequest) -> PosePlan | None:
-        """Return the rest of the path that was planned last, if the start lies on it."""
+        """Return the rest of a path that was planned before, with the start on it."""
         for (goals, tolerance, _), field in self._fields.items():
             if goals != request.goals or tolerance != request.tolerance:
                 continue
@@ -421,7 +429,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
     def _field_on(
         self, grid: GridMap, states: NDArray[np.int64], older: PoseField | None
     ) -> PoseField:
-        """Return a field on a map, from an older one toward the same states if possible."""
+        """Return a field on a map, from an older one to the same states if possible."""
         if older is None:
             return PoseField(states, grid, self._world(grid))
         if older.grid is grid:
@@ -439,7 +447,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         start: State,
         clock: Clock,
     ) -> PosePlan | None:
-        """Grow the field by a step; return the path from the start if it is known then."""
+        """Grow the field by a step; return the plan if it is known then."""
         grid = request.grid
         with self._lock:  # between two steps another request may use the field
             field = self._field(request, states)
@@ -472,3 +480,17 @@ def _with_expected_cost(
     planned_cost = paths.cost_of_poses(plan.poses, planned)
     planned_seconds = planned_cost * (planned.seconds_per_cell or 1.0)
     return replace(plan, cost=(plan.cost or 0.0) * expected_seconds / planned_seconds)
+
+
+def _reason_of_places(places: Sequence[str], grid: GridMap, has_start: bool) -> str:
+    """Return why there is no path, if the places of the goals tell.
+
+    It is empty if a search has to tell whether a path leads through unknown space.
+    """
+    if len(places) == 1:
+        place = places[0]
+        is_goal_unknown = unknown_space.UNKNOWN_SPACE in place
+        return f"the goal {place}; {unknown_space.REMEDY}" if is_goal_unknown else ""
+    if all(places) or grid.unknown is None or not has_start:
+        return unknown_space.reason_of_goals(places, "")
+    return ""

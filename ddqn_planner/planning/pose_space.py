@@ -1,4 +1,4 @@
-"""The space of poses: how values spread over it, are repaired and followed; compiled."""
+"""The space of poses: how costs spread over it, are repaired and followed."""
 
 import math
 from typing import Any, Final, NamedTuple
@@ -404,6 +404,19 @@ def steps_to_box(x: int, y: int, box: NDArray[np.int64]) -> int:
     return steps(columns, rows)
 
 
+@inlined
+def _push_start(search: Any, box: Any) -> None:
+    """Queue the corners of the start's tile, from which `look` counts steps."""
+    aim = search.aim
+    row = aim.y >> aim.shift
+    column = aim.x >> aim.shift
+    for y in range(row, row + 2):
+        for x in range(column, column + 2):
+            aim.remaining[y, x] = 0
+            corner = y * aim.remaining.shape[1] + x
+            push_to_heap(steps_to_box(x, y, box), corner, search.heap)
+
+
 @in_place
 def look(
     search: Search,
@@ -433,10 +446,7 @@ def look(
     count = aim.remaining  # steps from the start's corners, at first
     rows, columns = room.shape
     count[:] = np.inf
-    for y in range(aim.y >> aim.shift, (aim.y >> aim.shift) + 2):
-        for x in range(aim.x >> aim.shift, (aim.x >> aim.shift) + 2):
-            count[y, x] = 0
-            push_to_heap(steps_to_box(x, y, box), y * (columns + 1) + x, heap)
+    _push_start(search, box)
     last_key = np.float32(0)
     limit = np.inf
     while heap.size[0] > 0 and heap.keys[0] <= limit:
@@ -467,7 +477,7 @@ def look(
 
 @inlined
 def _turn_into_cost(search: Any, last_key: Any, box: Any) -> None:
-    """Make costs in cells, which are lower bounds, of the steps from corner to corner."""
+    """Turn steps from corner to corner into costs in cells, which are lower bounds."""
     aim = search.aim
     was_stopped = search.heap.size[0] > 0
     for y in range(aim.remaining.shape[0]):

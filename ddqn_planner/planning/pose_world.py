@@ -106,7 +106,7 @@ class Masks(NamedTuple):
 
 
 def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
-    """Return what kernels need of primitives and the cells (P, S, S) that they sweep."""
+    """Return what kernels need of primitives and the cells (P, S, S) they sweep."""
     passed = [_passed(poses) for poses in motions.poses]
     masks = _masks_of(motions, swept, passed)
     lowest = np.array([cells.min(axis=0) for cells, _, _ in passed])
@@ -119,7 +119,7 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
         rows_of(swept),
         rows_of(masks.standing),
         rows_of(masks.core),
-        rows_of(masks.core.all(axis=0)[None]),
+        rows_of(np.array([masks.core.all(axis=0)])),
         rows_of(np.ones((1, side, side), dtype=np.bool_)),
     ]
     row_counts = np.concatenate([part.counts for part in rows])
@@ -400,7 +400,7 @@ def is_possible(x: int, y: int, mask: int, world: Any) -> bool:
 
 @in_place
 def standing(states: NDArray[np.int64], world: World) -> int:
-    """Move the states (N, 3) at which the body has room to the front; return how many."""
+    """Move states (N, 3) at which the body has room to the front; return how many."""
     count = 0
     for place in range(len(states)):
         x = states[place, 0]
