@@ -87,6 +87,8 @@ class Declared(NamedTuple):
         choice = value.strip().lower()
         if choice in choices:
             return choice
+        if choice in self.replaced:
+            raise ValueError(f"{name} {choice} is gone; give {self.replaced[choice]}")
         names = ", ".join(choice or "''" for choice in choices)
         raise ValueError(f"{name} is {value!r}; give one of {names}")
 
