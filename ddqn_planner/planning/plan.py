@@ -91,13 +91,6 @@ class PlanRequest(PathRequest[Cell]):
         """The cells of the start and of the goals."""
         return self.start, *self.goals
 
-    def to_nearest(self, goals: Sequence[Cell]) -> PlanRequest:
-        """Return the request for a path to the nearest goal, also of more goals.
-
-        None of them moves.
-        """
-        return replace(self, tolerance=0.0, goals=(*self.goals, *goals))
-
     def after(self, leg: Plan, goal: Cell) -> PlanRequest:
         """Return the request for the next leg."""
         return replace(self, start=leg.cells[-1], goals=(goal,))
@@ -115,13 +108,6 @@ class PoseRequest(PathRequest[Pose]):
         """The cells of the start and of the goals."""
         poses = self.start, *self.goals
         return tuple(self.grid.world_to_cell(x, y) for x, y, _ in poses)
-
-    def to_nearest(self, goals: Sequence[Pose]) -> PoseRequest:
-        """Return the request for a path to the nearest goal, also of more goals.
-
-        None of them moves.
-        """
-        return replace(self, tolerance=(0.0, 0.0), goals=(*self.goals, *goals))
 
     def after(self, leg: PosePlan, goal: Pose) -> PoseRequest:
         """Return the request for the next leg."""
@@ -265,7 +251,8 @@ class PosePlan(Plan):
 def joined(plans: Sequence[Plan]) -> Plan:
     """Return the plan through several goals, made of the plans of its legs.
 
-    Each leg except the last succeeded, and ends where the next leg begins.
+    Each leg except the last succeeded, and ends where the next leg begins. If the last
+    leg has no path, its plan is returned, and the legs before it do not count.
     """
     last = plans[-1]
     if not last.path.size:

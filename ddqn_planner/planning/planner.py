@@ -272,7 +272,11 @@ class Planner:
         goals = _poses_of_goals(goal)
         pose = as_pose("the start", start)
         request = PoseRequest(grid, pose, goals, tolerance=limits, bound=ratio)
-        return last_step(self.pose_steps(request))
+        if self.pose_planner is None:
+            raise ValueError(
+                "the model knows no body; give one of ddqn-planner train-robot"
+            )
+        return last_step(self.pose_planner.steps(request))
 
     def steps(self, request: PlanRequest | PoseRequest) -> Iterator[Plan | None]:
         """Yield None before each slow step (a part of a field, a search).
@@ -281,14 +285,6 @@ class Planner:
         or the poses of a body.
         """
         return self._finder.steps(request)
-
-    def pose_steps(self, request: PoseRequest) -> Iterator[PosePlan | None]:
-        """Yield as `steps` does, for a model that knows a body."""
-        if self.pose_planner is None:
-            raise ValueError(
-                "the model knows no body; give one of ddqn-planner train-robot"
-            )
-        return self.pose_planner.steps(request)
 
     def rest_of_path(self, request: PlanRequest | PoseRequest) -> NDArray[Any]:
         """Return the rest of the path under way, cells (N, 2) or poses (N, 3).

@@ -30,9 +30,7 @@ def planner(tmp_path_factory: pytest.TempPathFactory) -> Planner:
 
 
 def plan(planner: Planner, grid: GridMap, start: Any, **how: Any) -> Any:
-    return last_step(
-        planner.pose_steps(PoseRequest(grid, tuple(start), (GOAL,), **how))
-    )
+    return last_step(planner.steps(PoseRequest(grid, tuple(start), (GOAL,), **how)))
 
 
 @pytest.fixture
