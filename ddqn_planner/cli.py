@@ -515,9 +515,8 @@ def _run_training(
     from ddqn_planner.training.hyper_parameters import HyperParameters
     from ddqn_planner.training.run import TrainingRun
 
-    torch.set_num_threads(
-        1
-    )  # as fast as two for such small networks, and always the same result
+    # As fast as two for such small networks, and always the same result.
+    torch.set_num_threads(1)
     values = {
         entry.name: getattr(options, entry.name) for entry in fields(HyperParameters)
     }
@@ -662,9 +661,8 @@ def learn(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> int:
             )
         except ImportError as error:
             print(f"the map's prior is not trained: {with_remedy(error)}")
-        write_atomically(
-            out, experience.to_bytes()
-        )  # not `save`, which adds to an older file
+        # Not `save`, which adds to an older file.
+        write_atomically(out, experience.to_bytes())
     minutes = sum(drive.seconds[-1] - drive.seconds[0] for drive in drives) / 60
     print(
         f"{len(drives)} drives, {sum(d.metres for d in drives):.0f} m, {minutes:.1f} min"

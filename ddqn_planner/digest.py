@@ -29,9 +29,8 @@ class _Describer:
     """Turns values into plain ones whose texts differ, the same in each process."""
 
     def __init__(self) -> None:
-        self._functions: set[FunctionType] = (
-            set()
-        )  # that were described: they may call each other
+        # Those that were described: functions may call each other.
+        self._functions: set[FunctionType] = set()
 
     def of(self, value: Any, names: frozenset[str] = frozenset()) -> object:
         """Return the description of a value; of a module or a class, the attributes in `names`."""

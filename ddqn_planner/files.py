@@ -19,16 +19,14 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
-TEMPORARY = re.compile(
-    r"\..+\.[0-9a-f]{16}"
-)  # the name of a file that is being written
+# The name of a file that is being written.
+TEMPORARY = re.compile(r"\..+\.[0-9a-f]{16}")
 URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
 # $HOME, ${HOME}, and $(find-pkg-share ...) of launch files.
 VARIABLE = re.compile(r"(?P<name>\$(?:[A-Za-z_]\w*|\{[^/}]*\}|\([^)]*\)))[^/]*")
 MAX_NAME, MAX_PATH = 255, 4095  # bytes that Linux allows for a name, and for a path
-MAX_REST = (
-    2**24
-)  # bytes of records that are kept while a disk is full; those beyond are left out
+# Bytes of records that are kept while a disk is full; those beyond are left out.
+MAX_REST = 2**24
 MAX_RECORD_BYTES = 2**30  # of an ``episodes.csv``: 20,000 of the longest drives
 MAX_ROW = 2**20  # bytes of a row there
 
@@ -316,9 +314,8 @@ class WorkFolder(ExitStack):
         super().__init__()
         self.folder, self._after = folder, after
         self.save_error = ""  # why the last save failed; empty if it did not
-        self.on_saved: Callable[[Any], None] = lambda _: (
-            None
-        )  # hears of each save, whatever came
+        # Called after each save, whether it succeeded or not.
+        self.on_saved: Callable[[Any], None] = lambda _: None
         with self.opening():
             # The system closes the file, and so unlocks it, when the process ends.
             file = self.enter_context(open_to_append(folder / marks[0]))
@@ -349,9 +346,8 @@ class WorkFolder(ExitStack):
             yield
             self.save_error = ""
         except OSError as error:
-            reason = (
-                error.strerror or error
-            )  # no file name: it is often that of a temporary file
+            # Without the file's name, which is often that of a temporary file.
+            reason = error.strerror or error
             remedy = f"make room or allow writing there: {self._after}"
             self.save_error = f"cannot save to {self.folder} ({reason}); {remedy}"
         self.on_saved(self)

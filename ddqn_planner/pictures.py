@@ -21,9 +21,8 @@ VALUE_COLOURS = ("#f4f1de", "#cfe8dc", "#93cfc8", "#4fa3b5")
 
 SIGNS = ".>^<v#*SG"  # of a map as text: where one has to stand for several, it is the last of them
 MAX_TEXT_WIDTH = 64  # signs in a row, two characters for each
-MAX_SIDE_WITH_LINES = (
-    64  # cells of the longest side of a map with lines between its cells
-)
+# Cells of the longest side of a map with lines between its cells.
+MAX_SIDE_WITH_LINES = 64
 MAX_ARROWS = 48  # arrows of one-way zones along the longest side of a map
 OUTLINES = 30  # of a body along its path
 ONE_WAY = 1e-9  # the mean direction of a cell that is not one-way is shorter
@@ -103,9 +102,8 @@ def save_picture(
             axes.scatter(x[end], y[end], size, label=label, marker=marker, **style)
     if cells or body is not None:
         figure.legend(loc="outside lower center", ncols=4, frameon=False)
-    content = (
-        io.BytesIO()
-    )  # so that an old file stays complete, and no pipe is waited for
+    # In memory first, so that an old file stays complete, and no pipe is waited for.
+    content = io.BytesIO()
     figure.savefig(content, format=picture_format(file))
     write_atomically(file, content.getvalue())
 

@@ -1,4 +1,4 @@
-"""All that is compiled for a planner: by a node before it is active, or at an installation."""
+"""Compile all code of a planner, before a node is active or at an installation."""
 
 import math
 from collections.abc import Iterator
@@ -14,29 +14,36 @@ from ddqn_planner.planning.paths import rest_of_path
 
 
 def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
-    """Plan on small maps in all ways; yield between what many requests need and the rest."""
+    """Plan on small maps in all ways.
+
+    Yield once after what most requests need, and once after the rest.
+    """
     sizes = planner.metadata.sizes
     free = np.zeros((sizes.get("height", 8), sizes.get("width", 8)), np.bool_)
-    start, goal = (0, 0), (free.shape[1] - 1, free.shape[0] - 1)
+    height, width = free.shape
+    start = (0, 0)
+    goal = (width - 1, height - 1)
     # Unit costs and expected times have the same code as costs.
     grid = GridMap(free, cost=free.astype(np.int8))
     if learns:
         experience = Experience(nominal_speed=1.0)
-        experience.record(
-            np.arange(9.0), np.full((9, 2), 4.5) + np.arange(9.0)[:, None] / 3
-        )
+        seconds = np.arange(9.0)
+        positions = 4.5 + np.column_stack([seconds, seconds]) / 3
+        experience.record(seconds, positions)
         experience.apply(grid)
     if planner.pose_planner is not None:
         _plan_poses(planner)
         yield from (None, None)  # there is no rest
         return
     planner.plan(grid, start, goal, simplified=True)
-    leg, rule = np.array([start, goal], np.int32), planner.metadata.move_rule
+    rule = planner.metadata.move_rule
+    leg = np.array([start, goal], np.int32)
     exact_path([leg], grid, rule, [(0.6, 0.7), grid.cell_to_world(goal)])
     planner.plan(grid.with_patch([[True]], 1, 1), start, goal)
     rest_of_path([start, goal], start, grid, rule)
     yield
-    # From an obstacle there is a way out, to where a path begins, perhaps in one direction only.
+    # From an obstacle an escape path leads to where a path begins. Cells may be left in
+    # some directions only.
     obstacle = free.copy()
     obstacle[0, 0] = True
     for forbidden in (None, 16 + free.astype(np.uint8)):
@@ -50,24 +57,21 @@ def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
 
 
 def _plan_poses(planner: Planner) -> None:
-    """Plan where a wall divides a map, through it, and past a far box, and look what is left."""
+    """Plan where a wall divides a map, where it is open, and past an obstacle.
+
+    Then take the rest of the path.
+    """
     assert planner.pose_planner is not None
-    reach, cell = (
-        planner.pose_planner.body.reach,
-        planner.pose_planner.motions.resolution,
-    )
-    room = (
-        2 * reach + 48
-    )  # cells; a field visits more of its states before it looks at the map
-    walled = np.zeros((room, 2 * room), np.bool_)
-    walled[:, room] = True
-    grid, ends = (
-        GridMap(walled, cell),
-        np.array([[room / 2, room / 2], [1.5 * room, room / 2]]),
-    )
-    start, goal = ((*end, 0.0) for end in (ends * cell).tolist())
+    resolution = planner.pose_planner.motions.resolution
+    # Cells of each room: so many that a field looks at the map before it is complete.
+    side = 2 * planner.pose_planner.body.reach + 48
+    walled = np.zeros((side, 2 * side), np.bool_)
+    walled[:, side] = True
+    grid = GridMap(walled, resolution)
+    start = (0.5 * side * resolution, 0.5 * side * resolution, 0.0)
+    goal = (1.5 * side * resolution, 0.5 * side * resolution, 0.0)
     planner.plan_poses(grid, start, goal)
-    opened = grid.with_patch(np.zeros((room, 1), np.bool_), room, 0)
+    opened = grid.with_patch(np.zeros((side, 1), np.bool_), side, 0)
     planner.plan_poses(opened, start, goal)
-    plan = planner.plan_poses(opened.with_patch([[True]], room, 0), start, goal)
+    plan = planner.plan_poses(opened.with_patch([[True]], side, 0), start, goal)
     planner.pose_planner.rest_of(plan.poses, start, grid)

@@ -179,16 +179,21 @@ class Evidence:
         return rows
 
     def _compare(self, visits: Visits) -> None:
-        """Compare the time of a drive with the time expected on the last map."""
+        """Compare the time of a drive with the time expected on the last map.
+
+        The difference of their logarithms, in standard deviations, joins `errors`.
+        """
         if self.posterior is None:
             return
-        places = self.posterior.places_at(visits.position)
+        places = self.posterior.places_at(visits.position)  # (V,): -1 where occupied
         is_free = places >= 0
         if is_free.sum() < SHORTEST:
             return
-        nominal = visits.metres[is_free] / self.nominal_speed
-        seconds_of_places = nominal * self.posterior.slowness[places[is_free]]
-        expected, deviation = self.posterior.time(seconds_of_places, places[is_free])
+        free_places = places[is_free]
+        nominal_seconds = visits.metres[is_free] / self.nominal_speed
+        driving_seconds = nominal_seconds * self.posterior.slowness[free_places]
+        # With the waits that are expected in these places.
+        expected, deviation = self.posterior.time(driving_seconds, free_places)
         seconds = visits.seconds[is_free].sum() + visits.waits.seconds.sum()
         self.errors.append(math.log(seconds / expected) / deviation)
 
@@ -213,7 +218,11 @@ class Evidence:
         return posterior
 
     def merge(self, other: Evidence) -> None:
-        """Add other evidence, whose predictions change to the prior of both."""
+        """Add other evidence.
+
+        Afterwards the places of both are predicted by one prior: this evidence's, or the
+        other's if this one has none. The other evidence changes, too.
+        """
         prior = other.prior if self.prior is None else self.prior
         self.use_prior(prior)
         other.use_prior(prior)

@@ -242,8 +242,8 @@ class Posterior:
     def over(self, values: NDArray[Any], occupied: int) -> NDArray[Any]:
         """Return the value of each cell's place, or that of occupied cells: (H, W)."""
         # The place of an occupied cell is -1: the last value.
-        of_places = np.append(values, values.dtype.type(occupied))
-        return of_places.take(self.place, mode="wrap")
+        values_with_occupied = np.append(values, values.dtype.type(occupied))
+        return values_with_occupied.take(self.place, mode="wrap")
 
 
 def _places_of(grid: GridMap, size: int) -> tuple[Int64, Int64]:
@@ -257,15 +257,16 @@ def _places_of(grid: GridMap, size: int) -> tuple[Int64, Int64]:
     height, width = grid.occupancy.shape
     rows = np.arange(height) + np.arange(height) // size
     columns = np.arange(width) + np.arange(width) // size
-    apart = np.zeros((rows[-1] + 1, columns[-1] + 1), dtype=np.bool_)
-    apart[np.ix_(rows, columns)] = ~grid.occupancy
-    labels: Int64 = label(apart, output=np.int64)[0]
+    is_free = np.zeros((rows[-1] + 1, columns[-1] + 1), dtype=np.bool_)
+    is_free[np.ix_(rows, columns)] = ~grid.occupancy
+    labels: Int64 = label(is_free, output=np.int64)[0]
     place = labels[np.ix_(rows, columns)] - 1
     y, x = np.nonzero(place >= 0)
     middle = (size - 1) / 2
-    away = np.hypot(x % size - middle, y % size - middle)
-    order = np.argsort(away, kind="stable")
+    distance_to_middle = np.hypot(x % size - middle, y % size - middle)
+    order = np.argsort(distance_to_middle, kind="stable")
     cells = np.column_stack([x, y])[order]
+    # Of each place the first cell in this order.
     _, first = np.unique(place[y, x][order], return_index=True)
     return place, cells[first]
 

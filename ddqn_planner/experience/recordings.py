@@ -323,7 +323,13 @@ class _Bag:
         self.poses[PoseSource(topic)].append(sample)
 
     def _add_transforms(self, topic: str, message: Any) -> None:
+        """Add a message's transforms to the tree of its topic, and the poses they give.
+
+        A robot has a pose by each transform between it and the map frame, at the times of
+        that transform.
+        """
         tree = self._trees[topic]
+        # First all names, so that they are known also if a transform cannot be used.
         for stamped in message.transforms:
             self._frames[topic].add(stamped.child_frame_id)
         for stamped in message.transforms:
@@ -334,7 +340,7 @@ class _Bag:
             tree[child] = transform
             for robot in self._robots_in(tree):
                 position = _position_of(robot, tree, self.frame, child)
-                if position is None:
+                if position is None:  # the transform does not lead to the map frame
                     continue
                 sample = Sample(_seconds(stamped), *position)
                 self.poses[PoseSource(topic, robot, child)].append(sample)

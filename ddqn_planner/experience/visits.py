@@ -100,9 +100,9 @@ def visits_of(time: Float64, position: Float64, side: float, limits: Limits) -> 
         waits.append(Waits(means[moves[1:]][is_wait], stood[is_wait]))
         driving = np.diff(began) - stood
         steps.append(_steps(driving, means[moves], step))
-    of_steps = _joined_steps(steps)
-    is_possible = step <= limits.max_speed * of_steps.seconds
-    believed = _Steps(of_steps.middle[is_possible], of_steps.seconds[is_possible])
+    all_steps = _joined_steps(steps)
+    is_possible = step <= limits.max_speed * all_steps.seconds
+    believed = _Steps(all_steps.middle[is_possible], all_steps.seconds[is_possible])
     joined_waits = Waits(
         np.concatenate([stops.position for stops in waits]),
         np.concatenate([stops.seconds for stops in waits]),

@@ -16,9 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 Cell: TypeAlias = tuple[int, int]
 """(x, y): x is the column, y is the row of ``occupancy[y, x]``."""
 
-Cells: TypeAlias = (
-    Sequence[Cell] | NDArray[np.integer[Any]]
-)  # of a path: pairs, or (N, 2)
+# The cells of a path: pairs, or (N, 2).
+Cells: TypeAlias = Sequence[Cell] | NDArray[np.integer[Any]]
 Occupancy: TypeAlias = NDArray[np.bool_]  # (H, W): True where a cell is occupied
 
 # Values of ``nav_msgs/OccupancyGrid``.

@@ -48,9 +48,8 @@ LAYOUTS |= {"RGB", "RGBA", "BGR", "BGRA", "CMYK;I"}
 """Pillow's names of the pixel layouts in files that it reads as map_server does."""
 
 _shortener = reprlib.Repr()
-_shortener.maxlevel = (
-    2  # YAML aliases can nest lists that are huge when they are printed
-)
+# YAML aliases can nest lists that are huge when they are printed.
+_shortener.maxlevel = 2
 _short = _shortener.repr
 
 

@@ -302,14 +302,15 @@ def _error_of_pairs(
     Parameters
     ----------
     cost_2 : (2,)
-        The weights of the costs, 0 to 0.99, of the cells before and after a move.
+        The weights of the inputs for the costs of the cell before a move and of the cell
+        after it. These inputs are 0 to 0.99.
     unknown_2 : (2,)
-        The weights of unknown cells there.
+        The weights of the inputs that say that the cell before, or after, is unknown.
     other_inputs : _OtherInputs
+        The least and the greatest sum of all other inputs, and of their sizes.
     """
-    share_V = np.append(
-        np.arange(OCCUPIED) / OCCUPIED, 1.0
-    )  # an unknown cell costs most
+    # (V,), V values of a cell: the costs 0 to 0.99, and last unknown, which costs most.
+    share_V = np.append(np.arange(OCCUPIED) / OCCUPIED, 1.0)
     before_V = np.append(cost_2[0] * share_V[:-1], unknown_2[0])
     after_V = np.append(cost_2[1] * share_V[:-1], unknown_2[1])
     sum_VV = before_V[:, None] + after_V

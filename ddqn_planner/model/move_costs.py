@@ -218,7 +218,13 @@ class MoveCosts(NamedTuple):
         )
 
     def _without_forbidden(self, forbidden: NDArray[np.uint8]) -> MoveCosts:
-        """Return the costs without the moves that a map's cells forbid, (H, W)."""
+        """Return the costs without the moves that a map's cells forbid.
+
+        Parameters
+        ----------
+        forbidden : (H, W) uint8
+            The moves that must not leave each cell: the bit of action a is 2**a.
+        """
         forbidden_C = _with_border(forbidden, 0).ravel()
         table_PA = self.table.reshape(-1, ACTIONS)
         occurs = np.zeros(2**ACTIONS, np.bool_)
@@ -229,6 +235,7 @@ class MoveCosts(NamedTuple):
         infinite = np.float32(np.inf)
         tables_SPA = np.where(is_forbidden_SA[:, None], infinite, table_PA)
         is_small = len(sets_S) * len(table_PA) <= 2**16
+        # (256,): of each set that occurs, its row in `sets_S`; the others are not read.
         number_of_set = np.cumsum(occurs) - 1
         first_patch = (number_of_set * len(table_PA)).astype(
             np.uint16 if is_small else np.int32

@@ -318,10 +318,8 @@ class PropagationQNetwork(QNetwork):
             return None
         term_9AL = self._price_terms(move_rule)
         action_A = np.arange(len(MOVES))
-        target_A = CENTRE + MOVES @ [
-            1,
-            3,
-        ]  # the cell of the patch to which a move leads
+        # (A,): the cell of the patch of 3 x 3 to which each move leads.
+        target_A = CENTRE + MOVES @ [1, 3]
         term_2AL = np.stack([term_9AL[CENTRE], term_9AL[target_A, action_A]])
         # No move leads to an occupied cell: its term has no meaning.
         term_2AL[..., -1] = term_2AL[..., -2]
@@ -358,14 +356,15 @@ class PropagationQNetwork(QNetwork):
         return term_9AL
 
     def believed_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts:
-        """Return the costs of a map's moves, right or not.
+        """Return the costs that the network gives a map's moves, right or not.
 
-        Q is minus the cost of the cheapest path.
+        Q is minus the cost of the cheapest path. The network predicts for each patch the
+        probability p that a move succeeds: a move counts as possible where p > 1/2, and
+        is tried until it succeeds. The progress and detour terms of the paper's reward
+        (section 4.2) do not count, as they add up to a constant along a path.
         """
-        # A move counts as possible where p > 1/2, and is tried until it succeeds. The
-        # progress and detour terms of the paper's reward (section 4.2) add up to a
-        # constant along a path.
         timed = grid.slowness is not None
+        # Without costs, each patch that can occur has its number; no cell names it.
         patch_C = None
         patch_P9 = every_patch()
         if self.uses_costs and grid.cost is not None and not timed:

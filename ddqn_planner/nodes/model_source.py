@@ -14,9 +14,8 @@ from ddqn_planner.nodes.worker import Worker
 from ddqn_planner.planning import Planner
 from ddqn_planner.warm_up import warm_up
 
-REST_AFTER = (
-    1.0  # seconds until the rest is compiled: what waits for the model is planned first
-)
+# Seconds until the rest is compiled: what waits for the model is planned first.
+REST_AFTER = 1.0
 
 
 def read_model(model: str) -> tuple[Planner, str]:
@@ -45,9 +44,8 @@ class ModelSource:
             try:
                 planner, file = read_model(self._node.value("model"))
                 compiling = warm_up(planner, self._node.value("follow_trainer"))
-                gc.set_threshold(
-                    20_000
-                )  # to compile and to plan makes hardly any garbage
+                # To compile and to plan makes hardly any garbage.
+                gc.set_threshold(20_000)
                 next(compiling)
             except Exception as error:
                 return (

@@ -20,12 +20,10 @@ GivenUp = Callable[[], Outcome | None]  # returns why a request is given up now,
 ACTIONS = "compute_path_to_pose", "compute_path_through_poses"
 SERVER_WAIT = 1.0  # seconds until a server that was just started is discovered
 ACCEPT_WAIT = 5.0  # seconds in which a server says whether it takes a goal
-ASK_PERIOD = (
-    2.0  # seconds until it is asked for the result again: a new server lacks the goal
-)
-TICK = (
-    0.05  # seconds between two looks whether a goal is given up, or its server is gone
-)
+# Seconds until a server is asked for the result again: a new server lacks the goal.
+ASK_PERIOD = 2.0
+# Seconds between two looks whether a goal is given up, or its server is gone.
+TICK = 0.05
 
 # Of an action's services: without these queues, goals are lost like requests.
 QUEUES: dict[str, Any] = {

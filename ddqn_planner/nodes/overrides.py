@@ -64,18 +64,33 @@ def unread_names(names: Iterable[str], known: Collection[str], node: str) -> str
 
 
 def unread_qualities(
-    names: Iterable[str], known: Collection[str], node: str
+    names: Iterable[str], names_read: Collection[str], node: str
 ) -> list[str]:
-    """Return which qualities of service are for topics that a node does not read."""
-    told = []
+    """Return a sentence for each quality of service of a topic that a node does not read.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Parameters that a user set.
+    names_read : collection of str
+        Parameters that the node reads.
+    node : str
+        The node's name.
+    """
+    qualities = [name for name in names_read if name.startswith(QOS)]
+    problems = []
     for name in names:
-        topic = name.removeprefix(QOS).partition(".")[0]
-        if not name.startswith(QOS) or name in known or topic in TOPICS_OF_ROS:
+        if not name.startswith(QOS) or name in names_read:
             continue
-        other = nearest(name, [each for each in known if each.startswith(QOS)])
-        remedy = f"the nearest is {other}" if other else "it reads no such topic"
-        told.append(f"{node} has no subscription for {name} now; {remedy}")
-    return told
+        topic = name.removeprefix(QOS).partition(".")[0]
+        if topic in TOPICS_OF_ROS:
+            continue
+        nearest_name = nearest(name, qualities)
+        remedy = "it reads no such topic"
+        if nearest_name:
+            remedy = f"the nearest is {nearest_name}"
+        problems.append(f"{node} has no subscription for {name} now; {remedy}")
+    return problems
 
 
 def unread_sections(

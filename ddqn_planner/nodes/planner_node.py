@@ -159,7 +159,7 @@ class PlannerNode(ManagedNode):
         self._diagnostics.change()
 
     def cleanup(self) -> None:
-        """Free the map, the model and its fields."""
+        """Free the map and the model's fields, and forget refusals and the last plan."""
         super().cleanup()
         self.deactivate()
         self._diagnostics.refused.clear()
@@ -278,6 +278,10 @@ class PlannerNode(ManagedNode):
         return response
 
     async def _plan_for_active_goal(self) -> None:
+        """Plan for the active goal, publish the path if it is news, and log the outcome.
+
+        The node becomes active with its first model.
+        """
         await self._model.first()
         if self._refusal is None and self.state == "inactive":
             self.change("activate")

@@ -79,9 +79,10 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
         """
         grid = request.grid
         rule = request.move_rule
-        hopes = grid.exploration
-        assert hopes is not None
-        plan = yield from self._find_on_map(replace(request, grid=hopes.bold), clock)
+        exploration = grid.exploration
+        assert exploration is not None
+        bold_request = replace(request, grid=exploration.bold)
+        plan = yield from self._find_on_map(bold_request, clock)
         if not plan.path.size:
             return plan
         # A path under way was judged when it was new.
@@ -89,9 +90,9 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
             best_request = replace(request, under_way=())
             best = yield from self._find_on_map(best_request, clock)
             best_cost = best.cost or math.inf
-            greatest_cost = (1 + hopes.share) * best_cost * SAME_COST
+            greatest_cost = (1 + exploration.share) * best_cost * SAME_COST
             if _cost(plan.path, grid, rule) > greatest_cost:
-                safe_request = replace(request, grid=hopes.safe)
+                safe_request = replace(request, grid=exploration.safe)
                 plan = yield from self._find_on_map(safe_request, clock)
         if not plan.path.size:
             return plan
@@ -171,10 +172,10 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
         request = task.request
         if task.failed is not None and request.reach >= 1:
             yield
-        found = way_and_ends(request, task.goals)
-        if isinstance(found, PlanStatus):
-            return Plan(found, move_rule=request.move_rule)
-        task.escape_path, task.goals = found
+        escape = way_and_ends(request, task.goals)
+        if isinstance(escape, PlanStatus):
+            return Plan(escape, move_rule=request.move_rule)
+        task.escape_path, task.goals = escape
         task.field = self.fields.get(
             request.grid,
             task.goals,
@@ -230,12 +231,11 @@ def _roll_out(task: _Task, field: QField) -> Plan | None:
     return None
 
 
-def _finished(task: _Task, found: Path, method: PlanMethod) -> Plan:
-    """Return the plan by a path that was found: straight, or by the path under way."""
+def _finished(task: _Task, path: Path, method: PlanMethod) -> Plan:
+    """Return the plan of a path, which is straightened or gives way to the path under way."""
     request = task.request
     grid = request.grid
     rule = request.move_rule
-    path = found
     extra_cost = None
     if request.simplified:
         path = straightened(path, grid, rule)

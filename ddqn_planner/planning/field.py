@@ -19,20 +19,17 @@ from ddqn_planner.planning import cell_space, wavefront
 from ddqn_planner.planning.cell_space import Known, step_costs
 from ddqn_planner.planning.plan import Plan, PlanStatus
 
-Goals: TypeAlias = tuple[
-    Cell, ...
-]  # different free cells, sorted: a path may end in any of them
+# Different free cells, sorted: a path may end in any of them.
+Goals: TypeAlias = tuple[Cell, ...]
 REPAIRED = 100  # cells that a repair may take back before a new field is begun
 # Visits of a new field per cell that a repair may take back, while both take turns: to
 # take a cell back takes longer, and it is visited again. See docs/benchmarks.md.
 VISITS = 8
 REPAIRED_SHARE = 0.02  # of the map's cells that a repair may take back
-CACHE_BYTES = (
-    2**23
-)  # for a planner's Q fields: 3 of 500 x 500 cells, at 9 bytes per cell
-ALWAYS_KEPT = (
-    3  # fields, whatever their size: to and fro, or the three of `Exploration`
-)
+# For a planner's Q fields: 3 of 500 x 500 cells, at 9 bytes per cell.
+CACHE_BYTES = 2**23
+# Fields, whatever their size: to and fro, or the three of `Exploration`.
+ALWAYS_KEPT = 3
 MOST_KEPT = 64  # fields, however small: a request's map is compared with that of each
 OBJECTS = 4_000  # bytes of a field, its costs and its map beside their arrays
 
@@ -85,9 +82,9 @@ class QField:
     @cached_property
     def policy(self) -> NDArray[np.int8]:
         """(H, W) int8: the legal action of the greatest Q; -1 where that is -inf."""
-        legal_q = np.where(
-            self.legal & (self.q > -np.inf), self.q, np.float32(-np.inf)
-        )  # no NaN
+        # False where Q is NaN.
+        has_value = self.legal & (self.q > -np.inf)
+        legal_q = np.where(has_value, self.q, np.float32(-np.inf))
         best = np.where(legal_q.max(axis=0) > -np.inf, legal_q.argmax(axis=0), -1)
         return best.astype(np.int8)
 
@@ -359,19 +356,21 @@ class FieldCache:
         return [field for field in fields if field.move_rule is rule]
 
     def find(self, grid: GridMap, goals: Goals, rule: MoveRule) -> QField | None:
-        """Return the field of a map toward the nearest of some goals if it is kept, else None."""
+        """Return the kept field of a map toward the nearest of some goals, or None.
+
+        The field is then the one used last, and lies where this map does.
+        """
         for field in self._kept:
             if (
                 field.goals == goals
                 and field.move_rule is rule
                 and grid.same_cells(field.grid)
             ):
-                field.grid = grid  # it may lie elsewhere
+                # A map with the same cells may have another origin and other arrays.
+                field.grid = grid
                 field.shared = _shared_arrays(field)
-                self._kept = [
-                    *(other for other in self._kept if other is not field),
-                    field,
-                ]
+                others = [other for other in self._kept if other is not field]
+                self._kept = [*others, field]
                 return field
         return None
 
@@ -434,9 +433,10 @@ class FieldCache:
 
 def _shared_arrays(field: QField) -> list[tuple[int, int]]:
     """Return what `QField.shared` holds."""
-    maps, hopes = [field.grid], field.grid.exploration
-    if hopes is not None:
-        maps += [hopes.bold, hopes.safe]
+    maps = [field.grid]
+    exploration = field.grid.exploration
+    if exploration is not None:
+        maps += [exploration.bold, exploration.safe]
     values: list[Any] = [*(field.costs or ())]
     for grid in maps:
         values += vars(grid).copy().values()  # other threads add to it

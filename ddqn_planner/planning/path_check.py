@@ -67,9 +67,8 @@ def invalid_poses(
             if touches(path[number : number + 1], points, bits)
         ]
         return np.array(invalid, np.int64)
-    cells = np.floor(
-        grid.in_cells(poses[first:end, :2])
-    )  # float64: they may be far away
+    # float64: the poses may lie far away.
+    cells = np.floor(grid.in_cells(poses[first:end, :2]))
     is_invalid = _is_closed(cells, closed)
     cell = None if robot is None else grid.world_to_cell(*robot)
     if cell is not None and grid.contains(cell) and not grid.is_free(cell):

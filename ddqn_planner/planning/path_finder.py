@@ -16,7 +16,8 @@ from ddqn_planner.planning.plan import PathRequest, Plan
 AnyPlan = TypeVar("AnyPlan", bound=Plan)
 Request = TypeVar("Request", bound="PathRequest[Any]")
 Result = TypeVar("Result")
-# A part of the flow: it yields before each slow step, and returns its result.
+# A part of the flow, a generator: it yields before each slow step, so that whoever runs it
+# may do other work first, and returns its result.
 Finding = Generator[None, None, Result]
 
 

@@ -152,8 +152,11 @@ def _way_and_reached(
 def obstacles_in_the_way(
     grid: GridMap, start: Cell, clearing_radius: float
 ) -> Occupancy:
-    """Return the obstacles that count for a start, which may be one itself: (H, W)."""
-    # The robot stands there, so it and those within the radius are none.
+    """Return the obstacles that count for a start, which may be one itself: (H, W).
+
+    They are those before inflation. Where the robot stands on one, the obstacles within
+    the clearing radius, in cells, do not count.
+    """
     obstacles = grid.occupancy if grid.obstacles is None else grid.obstacles
     if clearing_radius > 0 and grid.is_obstacle(start):
         x, y = _cells_within(obstacles, start, clearing_radius * ROUNDING).T

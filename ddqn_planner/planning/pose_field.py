@@ -25,15 +25,13 @@ from ddqn_planner.planning.wavefront import DONE, Progress, Target
 
 NO_RESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)  # not in all versions of Python
 HEAP = 2**18  # entries that a heap has room for, at least
-LOST = (
-    1 / 2
-)  # of the cost of the last start; if a repair takes more back, a new field is quicker
+# Of the cost of the last start: if a repair takes more back, a new field is quicker.
+LOST = 1 / 2
 UNGUIDED = 2**14  # states that are visited before a look at the map pays
 FINEST = 1  # the shift of the smallest tiles that it looks at
 NOWHERE = Aim(0, 0, -1, 1.0, np.empty((0, 0), np.float32), SHIFT + 1)
-ANY_PATH = (
-    1e6  # a bound that each path keeps: a greater one would make the weight infinite
-)
+# A bound that each path keeps: a greater one would make the weight infinite.
+ANY_PATH = 1e6
 GREEDY = 1.5  # the first round's weight is the bound to the power of this: mostly that will do
 
 
@@ -190,7 +188,11 @@ class PoseField:
         return bool(count == queue.size)
 
     def _look_at_map(self, shift: int) -> None:
-        """Look at tiles of 2**shift cells of a side for what is left to the start."""
+        """Write to `_aim` what remains to the start, a lower bound, by corners of tiles.
+
+        A tile has a side of 2**shift cells. R rows of C tiles have (R + 1) x (C + 1)
+        corners.
+        """
         world = self.world
         rows = -(-world.height >> shift)
         columns = -(-world.width >> shift)

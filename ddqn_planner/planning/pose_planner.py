@@ -41,18 +41,14 @@ VISITS = 2**16  # states that a field visits in one step of a plan: some 30 ms
 # 0.5 s, within a bound that hardly takes longer than any path.
 MOST_STEPS_OF_REASON, BOUND_OF_REASON = 16, 10.0
 KEPT: Final = 3  # fields, those used last
-SAME_END = (
-    1.0,
-    0.5,
-)  # cells and radians: no yaw is farther from the two headings nearest to it
+# Cells and radians: no yaw is farther from the two headings nearest to it.
+SAME_END = 1.0, 0.5
 # So near to its path, a robot keeps it even if there is none from the state nearest to
 # its pose: a controller has driven it a little aside, where the body of that state has
 # no room.
 BESIDE_PATH = 1.0, 2 * math.pi / HEADINGS
-ON_PATH = (
-    0.5,
-    math.pi / HEADINGS,
-)  # a start so near to a pose, in cells and radians, lies on it
+# A start so near to a pose of a path, in cells and radians, lies on that path.
+ON_PATH = 0.5, math.pi / HEADINGS
 
 
 class PosePlanner(PathFinder[PoseRequest, PosePlan]):
@@ -429,7 +425,10 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
     def _field_on(
         self, grid: GridMap, states: NDArray[np.int64], older: PoseField | None
     ) -> PoseField:
-        """Return a field on a map, from an older one to the same states if possible."""
+        """Return a field on a map: an older one toward the same states, repaired, or new.
+
+        It is new where there is no older one, or where its map cannot be compared.
+        """
         if older is None:
             return PoseField(states, grid, self._world(grid))
         if older.grid is grid:

@@ -358,9 +358,12 @@ UNSEEN, ROOM, NO_ROOM = 0, 1, 2  # what is known of a tile
 def may_pass(x: int, y: int, world: Any) -> bool:
     """Return whether the body stands in a cell, or moves its origin through it."""
     body = world.body
-    standing = body.start.size  # the first mask of a body that stands
-    core = standing + HEADINGS  # and the first of those that all primitives sweep
-    if not is_possible(x, y, core + HEADINGS, world):
+    # The masks stand one after another: one for each primitive, for each heading in which
+    # the body stands, for the core of each heading, and for the core of all (see `Body`).
+    standing = body.start.size
+    core = standing + HEADINGS
+    core_of_all = core + HEADINGS
+    if not is_possible(x, y, core_of_all, world):
         return False
     for heading in range(HEADINGS):
         if is_possible(x, y, standing + heading, world):

@@ -116,7 +116,10 @@ class _Pulled(NamedTuple):
 def _pulled(
     path: CellArray, spent: Float64, layers: Layers, is_backward: bool
 ) -> _Pulled:
-    """Return a path of segments beside a path, pulled from its start or from its end.
+    """Return a path of straight segments in place of a path of cells, pulled taut.
+
+    It is pulled from the start or, backward, from the end; what it keeps is in the order
+    of the path in both cases.
 
     Parameters
     ----------
@@ -128,6 +131,7 @@ def _pulled(
     costs = np.zeros(len(path))  # of the segment that ends in each cell
     if is_backward:
         cells = path[::-1].copy()
+        # Differences of this are the costs between two cells, as those of `spent` are.
         spent = -spent[::-1]
     count = _pull(cells, costs, spent, is_backward, layers)
     if is_backward:
@@ -249,9 +253,17 @@ def _write_costs(
 def _is_right_angle(
     path: CellArray, first: int, corner: int, last: int, layers: Layers
 ) -> bool:
-    """Return whether a corner is a right angle around an occupied cell, without costs.
+    """Return whether a corner of a path turns at a right angle around an occupied cell.
 
-    Then no other way is shorter, as corners of obstacles must not be cut.
+    Where corners of obstacles must not be cut, no straight line then leads past the
+    corner on that side. On a map with costs, or where corners may be cut, it is False.
+
+    Parameters
+    ----------
+    path : (N, 2)
+    first, corner, last : int
+        Rows of the path: where the side before the corner begins, the corner, and
+        where the side after it ends.
     """
     if has_costs(layers) or layers.cuts_corners:
         return False
@@ -396,7 +408,10 @@ def _move_corners(
 
 @inlined
 def _move_to_next(path: CellArray, costs: Float64, corner: int, layers: Layers) -> bool:
-    """Move a corner onto the next one if that costs no more; return if it moved."""
+    """Move a corner onto the next one if that costs no more; return if it moved.
+
+    Both corners are then the same point, and the segment between them costs nothing.
+    """
     highest_cost = (costs[corner] + costs[corner + 1]) * SAME_COST
     x = path[corner - 1, 0]
     y = path[corner - 1, 1]
@@ -406,7 +421,8 @@ def _move_to_next(path: CellArray, costs: Float64, corner: int, layers: Layers) 
         return False
     if not _is_free(next_x, next_y, layers):
         return False
-    cost = segment_cost(x, y, next_x, next_y, 0.0, layers)
+    legal_from = 0.0  # the segment has to be legal from its first point on
+    cost = segment_cost(x, y, next_x, next_y, legal_from, layers)
     if cost >= highest_cost:
         return False
     path[corner, 0] = next_x

@@ -113,9 +113,8 @@ def place_in_words(grid: GridMap, cell: Cell) -> str:
     box = wider(box_of_cell, int(cells) + 1, grid.occupancy.shape)
     is_obstacle = grid.obstacles[box] & ~grid.unknown[box]
     rows, columns = is_obstacle.nonzero()
-    distances = np.hypot(
-        rows + box.rows.start - y, columns + box.columns.start - x
-    )  # to each obstacle in the box
+    # To each obstacle in the box, in cells.
+    distances = np.hypot(rows + box.rows.start - y, columns + box.columns.start - x)
     if (distances < cells).any():
         return ""
     return "is nearer to unknown space than the robot's body allows"
