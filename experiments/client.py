@@ -1,5 +1,6 @@
 """A client of the nodes, the messages to them, and the check of a planner's answers."""
 
+import math
 import queue
 import threading
 import time
@@ -34,6 +35,7 @@ from ddqn_planner.nodes.conversions import occupancy_message, quaternion
 from ddqn_planner.nodes.diagnostics import seconds
 from ddqn_planner.resources import find_map
 
+SAME_CROSSING = 1e-9  # of a segment: two crossings so near to each other are one
 RULE = MoveRule.ROBOT_SAFE  # of the planner's default model
 TIMEOUT = 120.0  # seconds that anything may take on a loaded machine
 # With Fast DDS each client of a service hears the answers to all clients. One that is slow to read
@@ -395,16 +397,36 @@ def point_of(stamped: PoseStamped) -> tuple[float, float]:
 
 
 def cells_passed(grid: GridMap, points: NDArray[np.float64]) -> list[Cell]:
-    """Return the cells at points of a path, each a twentieth of a cell from the next."""
-    spacing = grid.resolution / 20
+    """Return the cells through which a path leads, also those of which it cuts a corner.
+
+    A cell follows another diagonally only where the path passes their common corner.
+    """
+    corners = grid.in_cells(points)
     cells: list[Cell] = []
-    for begin, end in pairwise([*points, points[-1]]):
-        count = int(np.hypot(*(end - begin)) / spacing) + 2
-        for x, y in np.linspace(begin, end, count).tolist():
-            cell = grid.world_to_cell(x, y)
+    for begin, end in pairwise([*corners, corners[-1]]):
+        for x, y in _points_between_borders(begin, end):
+            cell = (math.floor(x), math.floor(y))
             if cells[-1:] != [cell]:
                 cells.append(cell)
     return cells
+
+
+def _points_between_borders(
+    begin: NDArray[np.float64], end: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return a point (x, y) of each stretch of a segment that lies in one cell: (N, 2)."""
+    shares = [0.0, 1.0]  # of the segment where it crosses a border of cells
+    for first, last in zip(begin.tolist(), end.tolist(), strict=True):
+        low, high = sorted((first, last))
+        borders = np.arange(math.floor(low) + 1, math.ceil(high))
+        shares += ((borders - first) / (last - first)).tolist()
+    crossings = np.sort(shares)
+    # Where it crosses two borders at once, at a corner, there is no stretch between.
+    is_stretch = np.diff(crossings) > SAME_CROSSING
+    middle = ((crossings[1:] + crossings[:-1]) / 2)[is_stretch]
+    if not middle.size:  # the segment is a point
+        middle = np.array([0.5])
+    return begin + middle[:, None] * (end - begin)
 
 
 def generated_map(
