@@ -98,6 +98,27 @@ def test_no_path_depends_on_the_past(place: Place, rule: MoveRule, data: Data) -
     assert_same(grown, whole)
 
 
+def test_paths_that_are_as_good_do_not_depend_on_how_far_a_field_has_grown(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # Buckets that are soon full: the field grows in many parts. Without costs there are
+    # many paths that are as good as each other.
+    monkeypatch.setattr(cell_space, "CAPACITY", 0.0)
+    random = np.random.default_rng(0)
+    for _ in range(100):
+        occupancy = random.random((6, 8)) < 0.05
+        grid = GridMap(occupancy, cost=np.zeros((6, 8), np.int8))
+        cells = grid.free_cells()
+        goal, *starts = (cells[index] for index in random.integers(len(cells), size=6))
+        whole = fresh_field(grid, goal, MoveRule.ROBOT_SAFE)
+        _ = whole.value
+        grown = fresh_field(grid, goal, MoveRule.ROBOT_SAFE)
+        for start in starts:
+            while not grown.grow(start, 9):
+                pass
+            assert grown.rollout(start) == whole.rollout(start)
+
+
 @given(GRIDS, RULES)
 def test_the_whole_field_is_that_of_the_network(place: Place, rule: MoveRule) -> None:
     grid, goal = place
