@@ -426,7 +426,8 @@ def _points_between_borders(
     middle = ((crossings[1:] + crossings[:-1]) / 2)[is_stretch]
     if not middle.size:  # the segment is a point
         middle = np.array([0.5])
-    return begin + middle[:, None] * (end - begin)
+    points: NDArray[np.float64] = begin + middle[:, None] * (end - begin)
+    return points
 
 
 def generated_map(
