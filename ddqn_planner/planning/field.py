@@ -340,13 +340,20 @@ class FieldCache:
     def __init__(self, network: QNetwork) -> None:
         self.network = network
         self.nbytes = CACHE_BYTES  # the bound; the fields used last are kept
-        # Used last at the end. Threads need no lock, as the list is replaced and never
-        # changed: one may at worst forget what another has just kept.
+        # Used last at the end. The list is replaced and never changed, so that a thread
+        # may read it without the lock.
         self._kept: list[QField] = []
+        self._lock = threading.Lock()
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy has, also in another process: no fields."""
-        return {**vars(self), "_kept": []}
+        return {"network": self.network, "nbytes": self.nbytes}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Begin without fields."""
+        vars(self).update(state)
+        self._kept = []
+        self._lock = threading.Lock()
 
     def _of_rule(self, rule: MoveRule) -> list[DistanceField]:
         """Return the fields of distances that are kept for a move rule, used last first."""
@@ -369,8 +376,9 @@ class FieldCache:
                 # A map with the same cells may have another origin and other arrays.
                 field.grid = grid
                 field.shared = _shared_arrays(field)
-                others = [other for other in self._kept if other is not field]
-                self._kept = [*others, field]
+                with self._lock:
+                    others = [other for other in self._kept if other is not field]
+                    self._kept = [*others, field]
                 return field
         return None
 
@@ -413,8 +421,10 @@ class FieldCache:
                     replaced = old
                     break
         field.shared = _shared_arrays(field)
-        kept = [*(other for other in self._kept if other is not replaced), field]
-        self._kept = kept[-self._most(kept) :]
+        with self._lock:
+            others = [other for other in self._kept if other is not replaced]
+            kept = [*others, field]
+            self._kept = kept[-self._most(kept) :]
         return field
 
     def _most(self, kept: list[QField]) -> int:
