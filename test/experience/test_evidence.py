@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import copy
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from experience.straight_drives import HALL, SPEED, Poses, at, driven, straight, uneven
-from hypothesis import assume, example, given
+from hypothesis import given
 from hypothesis import strategies as st
 
 from ddqn_planner import Experience, GridMap, Planner
 from ddqn_planner.experience import posterior as posterior_module
-from ddqn_planner.experience.posterior import NOISE
 
 WALL = np.zeros((40, 60), dtype=bool)
 WALL[21, 10:30] = True
@@ -48,52 +48,6 @@ def test_what_is_kept_gives_what_is_computed_anew(
         np.testing.assert_allclose(
             kept.slowness(grid), Experience.load(file).slowness(grid), rtol=CLOSE
         )
-
-
-@given(st.integers(0, 2**32 - 1))
-@example(seed=8894)  # a place has no neighbours
-def test_the_posterior_is_that_of_a_gaussian_markov_random_field(seed: int) -> None:
-    random, drives = np.random.default_rng(seed), []
-    for _ in range(3):
-        drives.append(straight(*random.uniform(0.5, 9.5, (2, 2)), random.uniform(1, 6)))
-    occupancy = random.random((40, 60)) < 0.2
-    x, y = np.floor(driven(*drives).evidence.places.position / 0.25).astype(int).T
-    occupancy[y, x] = False
-    grid, experience = GridMap(occupancy, 0.25), Experience(SPEED)
-    for drive in drives:  # solved again where evidence changed
-        experience.record(*drive)
-        posterior = experience.evidence.over(grid)
-    # What a robot expects decides what is a wait, and so where it sees places.
-    places = experience.evidence.places
-    x, y = np.floor(places.position / 0.25).astype(int).T
-    assume(not occupancy[y, x].any())
-    population = experience.evidence.population
-    variance, surplus = population.variance, population.surplus
-    common = posterior.expected[0]
-    # The same from its definition, with one equation per free cell.
-    free = ~grid.occupancy
-    number = np.where(free, np.cumsum(free).reshape(free.shape) - 1, -1)
-    precision = np.zeros((free.sum(), free.sum()))
-    for one, other in ((number[:, 1:], number[:, :-1]), (number[1:], number[:-1])):
-        beside = (one >= 0) & (other >= 0)
-        for i, j in zip(one[beside], other[beside], strict=True):
-            precision[[i, j], [i, j]] += 1
-            precision[[i, j], [j, i]] -= 1
-    precision += np.eye(len(precision)) * 0.25**2
-    precision *= np.log1p(32 / 0.25**2) / (4 * np.pi) / variance
-    seen, visits = np.zeros((2, len(precision)))
-    cells = np.floor(places.position / 0.25).astype(int)
-    for (x, y), weight, log in zip(
-        cells, places.weight, places.sum_of_log, strict=True
-    ):
-        precision[number[y, x], number[y, x]] += weight / NOISE
-        visits[number[y, x]] += weight / NOISE
-        seen[number[y, x]] += (log + weight * (NOISE / 2 - common)) / NOISE
-    mean = common + np.linalg.solve(precision, seen) + surplus * (1 - posterior.known)
-    np.testing.assert_allclose(posterior.mean, mean, atol=0.02)
-    np.testing.assert_allclose(
-        posterior.known, np.linalg.solve(precision, visits), atol=0.01
-    )
 
 
 def test_without_memory_for_a_map_nothing_is_lost(
@@ -234,22 +188,28 @@ def waited(seconds: float, x: float = 7.0) -> Poses:
     )
 
 
+@pytest.fixture(scope="module")
+def often_driven() -> Experience:
+    """What ten drives without a wait teach. It is copied, not changed."""
+    return driven(*[straight((2, 5), (12, 5))] * 10)
+
+
 @given(st.floats(6, 80), st.integers(1, 4))
 def test_a_wait_is_added_to_each_passage_as_the_mean_of_its_seconds(
-    seconds: float, others: int
+    often_driven: Experience, seconds: float, passages_without_wait: int
 ) -> None:
-    planner, ends = Planner.load("any_map"), ((8, 20), (48, 20))
-    experience = driven(*[straight((2, 5), (12, 5))] * 10)
     wall = HALL.occupancy.copy()
     wall[:, 28] = True
     wall[19:22, 28] = False  # a door, where the robot waits
     grid = GridMap(wall, 0.25)
+    ends = (8, 20), (48, 20)
+    planner = Planner.load("any_map")
+    experience = copy.deepcopy(often_driven)
     usual = planner.plan(experience.apply(grid), *ends).cost
     for number in range(10):
-        experience.record(
-            *(waited(seconds) if number % (others + 1) == 0 else waited(0))
-        )
-    waits = len(range(0, 10, others + 1))
+        has_wait = number % (passages_without_wait + 1) == 0
+        experience.record(*waited(seconds if has_wait else 0))
+    waits = len(range(0, 10, passages_without_wait + 1))
     cost = planner.plan(experience.apply(grid), *ends).cost
     assert cost - usual == pytest.approx(seconds * waits / 10, rel=0.15)
 

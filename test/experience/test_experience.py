@@ -19,6 +19,8 @@ from ddqn_planner.experience import ExperienceFileError
 from ddqn_planner.grid import MoveRule, shortest_distances
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
 
+PLANNER = Planner.load("any_map")
+
 
 def test_without_drives_every_place_takes_its_nominal_time() -> None:
     forgotten = driven(straight((2, 5), (12, 5), 3))
@@ -86,7 +88,7 @@ def test_the_speed_in_the_open_is_learned(guess: float, slowness: float) -> None
     experience.record(*straight((2, 8), (12, 8), slowness))
     assert experience.learned_speed == pytest.approx(SPEED, rel=0.1)
     grid = experience.apply(HALL)
-    plan = Planner.load("any_map").plan(grid, (8, 20), (48, 20))
+    plan = PLANNER.plan(grid, (8, 20), (48, 20))
     assert plan.cost == pytest.approx(10 / SPEED, rel=0.15)
 
 
@@ -101,8 +103,8 @@ def test_what_is_explored_is_expected_to_take_no_longer_than_the_share(
         straight(*random.uniform(0.5, 9.5, (2, 2)), random.uniform(1, 4))
         for _ in range(4)
     )
-    experience, planner = driven(*drives), Planner.load("any_map")
-    best, tried = (planner.plan(experience.apply(grid, e), *ends) for e in (0.0, share))
+    experience = driven(*drives)
+    best, tried = (PLANNER.plan(experience.apply(grid, e), *ends) for e in (0.0, share))
     if best.cells:
         expected = experience.expected_time(grid, tried.path).seconds
         assert (
@@ -198,6 +200,19 @@ def test_what_cannot_be_true_is_not_believed(fault: str) -> None:
     assert visited[20, 10:22].all()
 
 
+def test_a_move_faster_than_the_robot_tells_nothing_of_the_places_on_its_way() -> None:
+    # Twice a second a pose, and one correction ahead so small that it is no jump.
+    seconds, positions = straight((2, 5), (11.4, 5), rate=2.0)
+    positions[positions[:, 0] > 7, 0] += 0.6
+    experience = driven(*[(seconds, positions)] * 4)
+    slowness = experience.slowness(HALL)
+    uncertainty = experience.uncertainty(HALL)
+    for x in (7.1, 7.3):
+        assert at(HALL, slowness, x, 5) == pytest.approx(1, rel=0.1)
+        assert at(HALL, uncertainty, x, 5) > 0.4 * uncertainty.max()
+    assert at(HALL, uncertainty, 6, 5) < 0.2 * uncertainty.max()
+
+
 @given(st.lists(st.tuples(st.floats(), st.floats(), st.floats()), max_size=30))
 def test_no_drive_breaks_it(poses: list[tuple[float, float, float]]) -> None:
     array = np.array(poses).reshape(-1, 3)
@@ -208,36 +223,42 @@ def test_no_drive_breaks_it(poses: list[tuple[float, float, float]]) -> None:
     assert (slowness > 0).all()
 
 
+@pytest.fixture(scope="module")
+def three_lines() -> Experience:
+    """What drives along three lines of the hall teach."""
+    return driven(
+        straight((1, 5), (14, 5), 4),
+        straight((5, 1), (5, 9), 2),
+        straight((1, 1), (14, 9), 3),
+    )
+
+
 @given(st.integers(0, 2**32 - 1))
 def test_the_cost_of_a_plan_is_its_expected_time_and_no_path_is_faster(
-    seed: int,
+    three_lines: Experience, seed: int
 ) -> None:
     random = np.random.default_rng(seed)
     occupancy = random.random((40, 60)) < 0.15
     grid = GridMap(
         occupancy, 0.25, cost=random.integers(0, 99, (40, 60)) if seed % 2 else None
     )
-    experience = driven(
-        straight((1, 5), (14, 5), 4),
-        straight((5, 1), (5, 9), 2),
-        straight((1, 1), (14, 9), 3),
-    )
-    applied = experience.apply(grid)
-    goal, planner = grid.free_cells()[5], Planner.load("any_map")
+    applied = three_lines.apply(grid)
+    free_cells = grid.free_cells()
+    goal = free_cells[5]
     seconds = shortest_distances(applied, goal, MoveRule.ROBOT_SAFE) * 0.25 / SPEED
-    for start in grid.free_cells()[::211]:
-        plan = planner.plan(applied, start, goal, MoveRule.ROBOT_SAFE)
+    for start in free_cells[::211]:
+        plan = PLANNER.plan(applied, start, goal, MoveRule.ROBOT_SAFE)
         if plan.cells:
             assert plan.cost == pytest.approx(
                 seconds[start[1], start[0]], rel=1e-6, abs=1e-6
             )
             if grid.cost is None:
-                told = experience.expected_time(grid, plan.path)
+                told = three_lines.expected_time(grid, plan.path)
                 assert told.seconds == pytest.approx(
                     plan.cost, rel=0.03
                 )  # in steps of 2 %
-                straight_plan = planner.plan(applied, start, goal, simplified=True)
-                told = experience.expected_time(grid, straight_plan.path)
+                straight_plan = PLANNER.plan(applied, start, goal, simplified=True)
+                told = three_lines.expected_time(grid, straight_plan.path)
                 # It looks at one cell of each column or row that a segment passes.
                 assert told.seconds == pytest.approx(straight_plan.cost, rel=0.1)
         else:

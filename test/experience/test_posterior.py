@@ -1,0 +1,76 @@
+"""The posterior of a map's places, against the definition of its random field."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from ddqn_planner import GridMap
+from ddqn_planner.experience.places import NOISE, Places
+from ddqn_planner.experience.population import Population
+from ddqn_planner.experience.posterior import Posterior
+
+SIDE = 0.25
+"""Metres of a cell, and of a place."""
+
+
+def random_places(random: np.random.Generator, free_cells: np.ndarray) -> Places:
+    """Visits to some of the free cells, (N, 2) of x and y; some of the weights are 0."""
+    count = random.integers(0, len(free_cells) + 1)
+    cells = random.permutation(free_cells)[:count]
+    places = Places.none()
+    places.append(np.zeros(count), (cells + 0.5) * SIDE)
+    places.weight += random.exponential(3, count) * random.integers(0, 2, count)
+    places.sum_of_log += places.weight * random.normal(1, 1, count)
+    return places
+
+
+def precision_of_map(free: np.ndarray, variance: float) -> np.ndarray:
+    """The inverse covariance of the F free cells of a map, (F, F), before any visit."""
+    count = np.count_nonzero(free)
+    number = np.full(free.shape, -1)
+    number[free] = np.arange(count)
+    cell = np.concatenate([number[:, :-1].ravel(), number[:-1].ravel()])
+    neighbour = np.concatenate([number[:, 1:].ravel(), number[1:].ravel()])
+    are_free = (cell >= 0) & (neighbour >= 0)
+    adjacency = np.zeros((count, count))
+    adjacency[cell[are_free], neighbour[are_free]] = 1
+    adjacency += adjacency.T
+    precision = np.diag(adjacency.sum(axis=1) + SIDE**2) - adjacency
+    return precision * np.log1p(32 / SIDE**2) / (4 * np.pi) / variance
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0, 0.6))
+@example(seed=0, share_occupied=0.6)  # some places have no neighbours
+def test_the_posterior_is_that_of_a_gaussian_markov_random_field(
+    seed: int, share_occupied: float
+) -> None:
+    random = np.random.default_rng(seed)
+    occupancy = random.random((10, 14)) < share_occupied
+    free = ~occupancy
+    y, x = np.nonzero(free)
+    free_cells = np.column_stack([x, y])
+    posterior = Posterior(GridMap(occupancy, SIDE), SIDE, nominal_speed=0.5)
+    for _ in range(2):  # the second time beginning with the first solution
+        places = random_places(random, free_cells)
+        level, variance, surplus = random.uniform([-1, 0.05, 0], [1, 2, 0.5])
+        population = Population(level, 0, variance, surplus, 0, 0)
+        posterior.update(places, population, prior=None)
+
+    weight = np.zeros(occupancy.shape)
+    sum_of_log = np.zeros(occupancy.shape)
+    column, row = np.floor(places.position / SIDE).astype(int).T
+    weight[row, column] = places.weight
+    sum_of_log[row, column] = places.sum_of_log
+    visits = weight[free]  # (F,), as the following arrays
+    # Half of the noise is added, as the mean of its exponential is more than 1.
+    seen = sum_of_log[free] + visits * (NOISE / 2 - level)
+    precision = precision_of_map(free, variance) + np.diag(visits / NOISE)
+    expected_known = np.linalg.solve(precision, visits / NOISE)
+    beyond_level = np.linalg.solve(precision, seen / NOISE)
+    expected_mean = level + beyond_level + surplus * (1 - expected_known)
+
+    place = posterior.place[free]  # of each free cell
+    np.testing.assert_allclose(posterior.known[place], expected_known, atol=0.01)
+    np.testing.assert_allclose(posterior.mean[place], expected_mean, atol=0.02)
