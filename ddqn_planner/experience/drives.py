@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ddqn_planner.experience.experience import (
     EXPERIENCE,
@@ -17,7 +16,13 @@ from ddqn_planner.experience.experience import (
     Experience,
     Learned,
 )
-from ddqn_planner.experience.visits import STAND_DISTANCE, averaged, ways
+from ddqn_planner.experience.places import Float64
+from ddqn_planner.experience.visits import (
+    STAND_DISTANCE,
+    Poses,
+    averaged,
+    indices_apart,
+)
 from ddqn_planner.files import (
     MAX_RECORD_BYTES,
     Appender,
@@ -28,8 +33,6 @@ from ddqn_planner.files import (
     read_rows,
 )
 from ddqn_planner.grid import GridMap
-
-Float64 = NDArray[np.float64]
 
 RECORD = "episodes.csv"
 LOCK = "driving.lock"  # a folder with this file belongs to a robot's drives
@@ -91,9 +94,9 @@ class Drive(NamedTuple):
     @property
     def metres(self) -> float:
         """How far the robot drove, without the noise of its poses."""
-        _, means = averaged(self.seconds, self.positions, WINDOW)
-        apart = means[ways(means, STEP)]
-        path = np.concatenate([self.positions[:1], apart, self.positions[-1:]])
+        means = averaged(Poses(self.seconds, self.positions), WINDOW).position
+        corners = means[indices_apart(means, STEP)]
+        path = np.concatenate([self.positions[:1], corners, self.positions[-1:]])
         dx, dy = np.diff(path, axis=0).T
         return float(np.hypot(dx, dy).sum())
 

@@ -20,6 +20,7 @@ from ddqn_planner.experience.posterior import Posterior
 from ddqn_planner.experience.prior import Prior
 from ddqn_planner.experience.visits import (
     Limits,
+    Poses,
     Visits,
     speeds_of,
     visits_of,
@@ -87,13 +88,6 @@ class Learned(NamedTuple):
 
     def __bool__(self) -> bool:
         return self.places > 0
-
-
-class Clip(NamedTuple):
-    """N poses of a drive that are possible."""
-
-    time: Float64  # (N,): seconds
-    position: Float64  # (N, 2): metres
 
 
 class Experience:
@@ -172,8 +166,8 @@ class Experience:
         poses = _possible(time, position)
         if len(poses.time) < 2:
             return Learned(0, 0.0, self._why_nothing(poses, count))
-        window = window_of(poses.time, poses.position, self.learned_speed)
-        speeds = speeds_of(poses.time, poses.position, window)
+        window = window_of(poses, self.learned_speed)
+        speeds = speeds_of(poses, window)
         usual_speed = float(np.median(speeds)) if len(speeds) else 0.0
         if usual_speed > self.nominal_speed * MOST_SPEED:
             return Learned(0, 0.0, self._too_fast(usual_speed), is_possible=False)
@@ -183,7 +177,7 @@ class Experience:
             max_speed=max(self.max_speed, MOST_OF_USUAL_SPEED * usual_speed),
             max_pause=self.max_pause,
         )
-        visits = visits_of(poses.time, poses.position, self.evidence.side, limits)
+        visits = visits_of(poses, self.evidence.side, limits)
         places = len(visits.seconds) + len(visits.waits.seconds)
         fastest = float(speeds.max(initial=0))
         if places and fastest < self.nominal_speed / MAX_SLOWNESS:
@@ -193,7 +187,7 @@ class Experience:
             return Learned(0, 0.0, self._why_nothing(poses, count))
         return Learned(places, visits.total_seconds)
 
-    def _why_nothing(self, poses: Clip, count: int) -> str:
+    def _why_nothing(self, poses: Poses, count: int) -> str:
         """Return why the possible ones among `count` poses are no drive."""
         if len(poses.time) < 2:
             return (
@@ -499,7 +493,7 @@ def _as_option(name: str, value: Any) -> float:
     return as_number(name, value, lowest, highest, f"{unit}, {lowest:g} to {highest:g}")
 
 
-def _possible(time: Float64, position: Float64) -> Clip:
+def _possible(time: Float64, position: Float64) -> Poses:
     """Return the possible poses, without those that repeat a time."""
     # Comparisons with NaN are false.
     is_time = np.abs(time) < LATEST
@@ -508,7 +502,7 @@ def _possible(time: Float64, position: Float64) -> Clip:
     time = time[is_possible]
     position = position[is_possible]
     is_new = np.diff(time, prepend=np.nan) != 0
-    return Clip(time[is_new], position[is_new])
+    return Poses(time[is_new], position[is_new])
 
 
 def _arrays_in(data: bytes) -> dict[str, NDArray[Any]]:
