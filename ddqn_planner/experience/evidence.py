@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.experience.places import COLUMNS, NOISE, Float64, Int64, Places
 from ddqn_planner.experience.population import KNOWN_WEIGHT, population_of
-from ddqn_planner.experience.posterior import Posterior
+from ddqn_planner.experience.posterior import NO_PLACE, Posterior
 from ddqn_planner.experience.prior import Prior
 from ddqn_planner.experience.visits import Visits
 from ddqn_planner.grid import GridMap
@@ -22,7 +23,7 @@ FARTHEST = 1e7
 
 # A drive has found a change if the mean log slowness of so many known places in a row
 # is off by more than so many standard deviations.
-PART = 8
+PLACES_OF_PART = 8
 SURPRISE = 3.5
 # The standard deviation of that mean, as each path through a place is another.
 PART_NOISE = 0.12
@@ -40,8 +41,8 @@ MOST_PASSAGES = 20.0  # a wait is the mean over about so many passages
 NEAR_WAIT = 4
 
 # A drive through fewer places says little about how sure expected times are.
-SHORTEST = 8
-# So many drives' errors count, and so many normal errors are assumed before them.
+FEWEST_VISITS = 8
+# The errors of so many drives count, and so many normal errors are assumed before them.
 LAST_DRIVES = 64
 ASSUMED_DRIVES = 8
 # 90 % of a normal distribution lie within so many standard deviations.
@@ -51,10 +52,33 @@ NORMAL = 1.645
 TAIL = 0.025
 
 Square = tuple[int, int]
+"""The x and y of a place, in sides of a place."""
+
+
+class ErrorRange(NamedTuple):
+    """The mean error of drives, and the bounds between which 90 % of errors lie.
+
+    The error of a drive is the difference between the logarithms of its time and of the
+    expected time, in the standard deviations that were expected.
+    """
+
+    low: float
+    mean: float
+    high: float
 
 
 class Evidence:
-    """What was seen at each place. It fades with the time that is driven."""
+    """What was seen at each place. It fades with the time that is driven.
+
+    Parameters
+    ----------
+    nominal_speed : float
+        Metres per second.
+    robot_width : float
+        Metres.
+    half_life : float
+        Seconds of driving, after which evidence counts half.
+    """
 
     def __init__(
         self, nominal_speed: float, robot_width: float, half_life: float
@@ -66,11 +90,11 @@ class Evidence:
 
     def forget(self) -> None:
         """Forget all."""
-        self.prior: Prior | None = None
+        self.prior: Prior | None = None  # predicts the slowness of places from the map
         self.driven = 0.0  # seconds
         self.places = Places.none()
-        self._rows: dict[Square, int] = {}  # of the places
-        # Of the last drives: the error of the log time, and the largest surprise, both
+        self._row_of_square: dict[Square, int] = {}  # of `places`
+        # Of the last drives: the error, see `ErrorRange`, and the largest surprise, also
         # in standard deviations.
         self.errors = deque[float](maxlen=LAST_DRIVES)
         self.surprises = deque[float](maxlen=LAST_DRIVES)
@@ -78,15 +102,16 @@ class Evidence:
         self._fit()
 
     def _fit(self) -> None:
+        """Fit the distribution of slowness to what was seen at all places."""
         self.population = population_of(self.places)
 
     def add(self, visits: Visits) -> None:
         """Learn from a drive."""
-        self._compare(visits)
+        self._add_error(visits)
         slowness = visits.seconds / visits.metres * self.nominal_speed  # (V,)
-        log = np.log(np.clip(slowness, 1 / MAX_SLOWNESS, MAX_SLOWNESS))
-        rows = self._rows_at(visits.position)
-        rows_of_waits = self._rows_at(visits.waits.position)
+        log = np.log(np.clip(slowness, 1 / MAX_SLOWNESS, MAX_SLOWNESS))  # (V,)
+        rows = self._find_or_add_rows(visits.position)  # (V,)
+        rows_of_waits = self._find_or_add_rows(visits.waits.position)  # (W,)
         surprises = self._surprises_of(rows, log)
         if surprises:
             largest = max(surprises)
@@ -94,118 +119,142 @@ class Evidence:
             self.surprises.append(largest)
             if has_changed:
                 self.places.fade(SHARE_AFTER_CHANGE)
-        self._add_visits(visits, rows, log, rows_of_waits)
+        np.add.at(self.places.waited, rows_of_waits, visits.waits.seconds)
+        self._add_visits(visits, rows, log)
+        self._limit_passages(rows_of_waits)
         self.driven += visits.total_seconds
         self.places.fade(0.5 ** (visits.total_seconds / self.half_life))
         self._fit()
 
-    def _add_visits(
-        self, visits: Visits, rows: Int64, log: Float64, rows_of_waits: Int64
-    ) -> None:
-        """Add the visits and waits of a drive to the sums of their places.
+    def _add_visits(self, visits: Visits, rows: Int64, log: Float64) -> None:
+        """Add the visits of a drive to the sums of their places.
 
         Parameters
         ----------
         visits : Visits
-            V visits and W waits.
+            V visits; the waits of the drive have been added before.
         rows, log : (V,) int64, (V,) float64
-            The place of each visit, and its log slowness.
-        rows_of_waits : (W,) int64
-            The place of each wait.
+            The row in `places` of each visit, and its log slowness.
         """
         places = self.places
-        np.add.at(places.waited, rows_of_waits, visits.waits.seconds)
         # Only passages from the first wait on tell how long a wait is.
-        position_of_waits = places.position[places.waited > 0]
-        away = visits.position[:, None] - position_of_waits  # (V, all waits, 2)
-        distance = np.hypot(away[..., 0], away[..., 1])
-        nearest = distance.min(axis=1, initial=np.inf)
-        passes_wait = nearest <= NEAR_WAIT * self.side
-        weight = visits.metres / self.side
+        position_of_waits = places.position[places.waited > 0]  # (P, 2)
+        away = visits.position[:, None] - position_of_waits  # (V, P, 2)
+        distance = np.hypot(away[..., 0], away[..., 1])  # (V, P): metres
+        distance_to_wait = distance.min(axis=1, initial=np.inf)  # (V,)
+        passes_wait = distance_to_wait <= NEAR_WAIT * self.side
+        weight = visits.metres / self.side  # (V,)
+        # A drive may visit a place several times.
         np.add.at(places.weight, rows, weight)
         np.add.at(places.sum_of_log, rows, weight * log)
         np.add.at(places.passages, rows, weight * passes_wait)
+
+    def _limit_passages(self, rows_of_waits: Int64) -> None:
+        """Let each place have at most MOST_PASSAGES, so that the last ones count most.
+
+        Where the robot has just waited, in the rows `rows_of_waits` (W,) of `places`, it
+        has passed at least once.
+        """
+        places = self.places
         places.passages[rows_of_waits] = np.maximum(places.passages[rows_of_waits], 1)
         excess = np.maximum(places.passages / MOST_PASSAGES, 1)
+        # Both become less by the same factor: the mean wait stays.
         places.passages /= excess
         places.waited /= excess
 
     def _surprises_of(self, rows: Int64, log: Float64) -> list[float]:
-        """Return how far the known parts of a drive are from what was seen before.
+        """Return by how much the parts of a drive differ from what was seen before.
 
-        Each surprise is in standard deviations.
+        A part has about PLACES_OF_PART visits of known places, one after another. The
+        difference of its mean log slowness is in standard deviations.
+
+        Parameters
+        ----------
+        rows, log : (V,) int64, (V,) float64
+            The row in `places` of each visit, and its log slowness.
         """
         weight = self.places.weight[rows]  # (V,)
-        known = np.flatnonzero(weight >= KNOWN_WEIGHT)
-        mean = self.places.sum_of_log[rows[known]] / weight[known]
-        differences = log[known] - mean
-        visits = 1 + 1 / weight[known]  # the variance of each difference, in NOISE
-        count = max(1, len(known) // PART)
+        visits = np.flatnonzero(weight >= KNOWN_WEIGHT)  # (K,): those of known places
+        known_rows = rows[visits]
+        known_weight = weight[visits]
+        difference = log[visits] - self.places.sum_of_log[known_rows] / known_weight
+        # Of each difference, in NOISE: of this visit, and of the mean of those before.
+        variance = 1 + 1 / known_weight
+        part_count = max(1, len(visits) // PLACES_OF_PART)
         surprises = []
-        for part in np.array_split(np.arange(len(known)), count):
-            if len(part) < PART / 2:
+        for part in np.array_split(np.arange(len(visits)), part_count):
+            if len(part) < PLACES_OF_PART / 2:
                 continue
-            variance = NOISE * visits[part].mean() / len(part) + PART_NOISE**2
-            difference = abs(float(differences[part].mean()))
-            surprises.append(difference / math.sqrt(variance))
+            variance_of_mean = NOISE * variance[part].mean() / len(part)
+            deviation = math.sqrt(variance_of_mean + PART_NOISE**2)
+            mean_difference = abs(float(difference[part].mean()))
+            surprises.append(mean_difference / deviation)
         return surprises
 
     def _usual_surprise(self) -> float:
-        """Return up to which surprise nothing has changed."""
+        """Return up to which surprise nothing has changed, in standard deviations."""
         # What is often slower in one direction has not changed.
-        low, _, high = self.quantiles()
-        from_errors = SURPRISE * max(float(high - low) / USUAL_RANGE, 1)
+        error_range = self.error_range()
+        excess = max((error_range.high - error_range.low) / USUAL_RANGE, 1)
         surprises = [*self.surprises, *[1.0] * ASSUMED_DRIVES]
-        from_surprises = UNUSUAL * float(np.quantile(surprises, SURPRISE_QUANTILE))
-        return max(from_errors, from_surprises)
+        large_surprise = float(np.quantile(surprises, SURPRISE_QUANTILE))
+        return max(SURPRISE * excess, UNUSUAL * large_surprise)
 
-    def _rows_at(self, position: Float64) -> Int64:
-        """Return the row of each position (N, 2), and add places that are new."""
+    def _find_or_add_rows(self, position: Float64) -> Int64:
+        """Return the row in `places` of each position, and add places that are new.
+
+        `position` is (N, 2), metres; the rows are (N,).
+        """
         squares = np.floor(position / self.side).astype(np.int64)
         rows = np.empty(len(squares), np.int64)
-        new = []  # indices of the positions
+        first_in_new = []  # the index of the first position in each new place
         for index, (x, y) in enumerate(squares.tolist()):
             square = x, y
-            if square not in self._rows:
-                self._rows[square] = len(self._rows)
-                new.append(index)
-            rows[index] = self._rows[square]
-        predicted = np.zeros(len(new))
+            if square not in self._row_of_square:
+                self._row_of_square[square] = len(self._row_of_square)
+                first_in_new.append(index)
+            rows[index] = self._row_of_square[square]
+        new_position = position[first_in_new]
+        predicted = np.zeros(len(new_position))
         if self.posterior is not None:
-            # The place of a position off the map is -1: the last value.
-            of_places = np.append(self.posterior.predicted, 0)
-            predicted = of_places[self.posterior.places_at(position[new])]
-        self.places.append(predicted, position[new])
+            predicted = self.posterior.predicted_at(new_position)
+        self.places.append(predicted, new_position)
         return rows
 
-    def _compare(self, visits: Visits) -> None:
-        """Compare the time of a drive with the time expected on the last map.
+    def _add_error(self, visits: Visits) -> None:
+        """Append the error of the time expected for a drive to `errors`.
 
-        The difference of their logarithms, in standard deviations, joins `errors`.
+        The time is expected on the last map; without a map, or on a drive mostly off
+        the map, nothing is appended. See `ErrorRange`.
         """
-        if self.posterior is None:
+        posterior = self.posterior
+        if posterior is None:
             return
-        places = self.posterior.places_at(visits.position)  # (V,): -1 where occupied
-        is_free = places >= 0
-        if is_free.sum() < SHORTEST:
+        places = posterior.places_at(visits.position)  # (V,)
+        is_on_map = places != NO_PLACE
+        if np.count_nonzero(is_on_map) < FEWEST_VISITS:
             return
-        free_places = places[is_free]
-        nominal_seconds = visits.metres[is_free] / self.nominal_speed
-        driving_seconds = nominal_seconds * self.posterior.slowness[free_places]
-        # With the waits that are expected in these places.
-        expected, deviation = self.posterior.time(driving_seconds, free_places)
-        seconds = visits.seconds[is_free].sum() + visits.waits.seconds.sum()
-        self.errors.append(math.log(seconds / expected) / deviation)
+        places = places[is_on_map]  # (K,)
+        nominal_seconds = visits.metres[is_on_map] / self.nominal_speed
+        # The slowness of a place includes the waits that are expected there.
+        expected_seconds = nominal_seconds * posterior.slowness[places]  # (K,)
+        deviation = posterior.deviation_of(expected_seconds, places)
+        seconds = visits.seconds[is_on_map].sum() + visits.waits.seconds.sum()
+        log_of_ratio = math.log(seconds / float(expected_seconds.sum()))
+        self.errors.append(log_of_ratio / deviation)
 
-    def quantiles(self) -> Float64:
-        """Return the bounds of 90 % of drives' errors, and between them the mean."""
+    def error_range(self) -> ErrorRange:
+        """Return the range of the errors of the last drives, and of some assumed ones."""
         assumed = NORMAL * np.linspace(-1.05, 1.05, ASSUMED_DRIVES)
         errors = np.concatenate([self.errors, assumed])
-        low, high = np.quantile(errors, (TAIL, 1 - TAIL))
-        return np.array([low, errors.mean(), high])
+        low, high = np.quantile(errors, (TAIL, 1 - TAIL)).tolist()
+        return ErrorRange(low, float(errors.mean()), high)
 
-    def over(self, grid: GridMap) -> Posterior:
-        """Return the posterior over a map."""
+    def posterior_over(self, grid: GridMap) -> Posterior:
+        """Return the posterior over a map, solved with all that was seen until now.
+
+        If the last map had the same cells, its posterior is updated and returned.
+        """
         check_grid(grid)
         posterior = self.posterior
         # An exception must not leave a posterior that is half updated.
@@ -218,33 +267,35 @@ class Evidence:
         return posterior
 
     def merge(self, other: Evidence) -> None:
-        """Add other evidence.
+        """Add all that other evidence has seen to this evidence.
 
-        Afterwards the places of both are predicted by one prior: this evidence's, or the
-        other's if this one has none. The other evidence changes, too.
+        If this evidence has no prior, it takes that of the other evidence. Predictions
+        of the other prior move by the difference of the levels of both priors, see
+        `use_prior`.
         """
-        prior = other.prior if self.prior is None else self.prior
-        self.use_prior(prior)
-        other.use_prior(prior)
-        count = len(self.places)
-        rows = self._rows_at(other.places.position)
+        self.use_prior(other.prior if self.prior is None else self.prior)
+        shift = _level_of(self.prior) - _level_of(other.prior)
+        count_before = len(self.places)
+        rows = self._find_or_add_rows(other.places.position)  # of each place of `other`
+        # All rows differ, as a place of one evidence is a place of the other.
         places = self.places
         places.weight[rows] += other.places.weight
         places.sum_of_log[rows] += other.places.sum_of_log
         places.passages[rows] += other.places.passages
         places.waited[rows] += other.places.waited
-        is_new = rows >= count
-        places.predicted[rows[is_new]] = other.places.predicted[is_new]
+        is_new = rows >= count_before
+        places.predicted[rows[is_new]] = other.places.predicted[is_new] + shift
         self.errors += other.errors
         self.surprises += other.surprises
         self.driven += other.driven
         self._fit()
 
     def use_prior(self, prior: Prior | None) -> None:
-        """Predict with another prior.
+        """Predict with another prior, or with none.
 
-        The level of a prior was learned from these places. Their predictions move by
-        the difference of the two levels, so that it does not count twice.
+        The level of a prior is the mean log slowness of places, which these places have
+        taught it. So that it does not count twice, their predictions move by the
+        difference of both levels.
         """
         self.places.predicted += _level_of(prior) - _level_of(self.prior)
         self.prior = prior
@@ -257,7 +308,7 @@ class Evidence:
         errors: NDArray[np.float64],
         surprises: NDArray[np.float64],
     ) -> None:
-        """Restore from arrays; a ValueError if they are inconsistent.
+        """Restore new evidence from the arrays of a file.
 
         Parameters
         ----------
@@ -266,15 +317,20 @@ class Evidence:
         driven : () float64
             Seconds.
         errors, surprises : (D,) float64
-            Of the last drives.
+            Of the last D drives, in standard deviations.
+
+        Raises
+        ------
+        ValueError
+            If the arrays are inconsistent.
         """
         if not _is_consistent(table, driven, errors, surprises):
             raise ValueError("its evidence cannot be true")
         places = Places.from_table(table)
-        rows = self._rows_at(places.position)
+        rows = self._find_or_add_rows(places.position)
         if len(np.unique(rows)) < len(places):
             raise ValueError("its evidence cannot be true")
-        self.places = places
+        self.places = places  # with the sums, which the rows just added do not have
         self.driven = float(driven)
         self.errors = deque(errors.tolist(), LAST_DRIVES)
         self.surprises = deque(surprises.tolist(), LAST_DRIVES)
@@ -291,24 +347,22 @@ def _has_cells_of(grid: GridMap, other: GridMap) -> bool:
 
 
 def _level_of(prior: Prior | None) -> float:
+    """Return the mean log slowness that a prior has learned; 0 without a prior."""
     return 0.0 if prior is None else float(prior.level)
 
 
 def _is_consistent(
     table: Float64, driven: Float64, errors: Float64, surprises: Float64
 ) -> bool:
-    """Return whether arrays can be those of evidence."""
-    if table.ndim != 2 or table.shape[1] != COLUMNS or driven.shape != ():
+    """Return whether arrays can be those of evidence; see `Evidence.restore`."""
+    if table.ndim != 2 or table.shape[1] != COLUMNS:
         return False
-    if errors.ndim != 1 or surprises.ndim != 1:
+    if (driven.ndim, errors.ndim, surprises.ndim) != (0, 1, 1):
         return False
     if not all(np.isfinite(a).all() for a in (table, driven, errors, surprises)):
         return False
     places = Places.from_table(table)
-    lowest = min(
-        places.weight.min(initial=0),
-        places.passages.min(initial=0),
-        places.waited.min(initial=0),
-        driven,
-    )
-    return bool(lowest >= 0 and np.abs(places.position).max(initial=0) <= FARTHEST)
+    positive = places.weight, places.passages, places.waited, driven
+    if any((values < 0).any() for values in positive):
+        return False
+    return bool((np.abs(places.position) <= FARTHEST).all())

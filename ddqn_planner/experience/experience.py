@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.experience.evidence import FARTHEST, Evidence
+from ddqn_planner.experience.places import Float32, Float64
 from ddqn_planner.experience.posterior import Posterior
 from ddqn_planner.experience.prior import Prior
 from ddqn_planner.experience.visits import (
@@ -37,9 +38,6 @@ from ddqn_planner.grid.arguments import (
 )
 from ddqn_planner.grid.grid_map import Exploration
 from ddqn_planner.grid.moves import cells_along
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 MAX_FILE_BYTES = 2**27  # a larger file is refused before it is read
 VERSION = 3  # 2 was never released
@@ -307,7 +305,7 @@ class Experience:
         """
         share = as_number("exploration", exploration, 0, 10, "0 to 10")
         population = self.evidence.population
-        posterior = self.evidence.over(grid)
+        posterior = self.evidence.posterior_over(grid)
         steps = math.floor(population.fastest_log / FAST_STEP + 0.5)
         fastest = FAST_STEP * min(0, steps)
         expected = self._timed(grid, posterior, "expected", 0.0, fastest)
@@ -337,13 +335,13 @@ class Experience:
 
     def slowness(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: seconds, with waits, over those at nominal speed."""
-        posterior = self.evidence.over(grid)
-        return posterior.over(posterior.slowness.astype(np.float32), 1)
+        posterior = self.evidence.posterior_over(grid)
+        return posterior.to_cells(posterior.slowness.astype(np.float32), 1)
 
     def uncertainty(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: the standard deviation of the log slowness, most if unknown."""
-        posterior = self.evidence.over(grid)
-        unknown: Float32 = posterior.over(posterior.unknown.astype(np.float32), 1)
+        posterior = self.evidence.posterior_over(grid)
+        unknown = posterior.to_cells(posterior.unknown.astype(np.float32), 1)
         return math.sqrt(self.evidence.population.variance) * unknown
 
     def expected_time(self, grid: GridMap, cells: Cells) -> ExpectedTime:
@@ -357,7 +355,7 @@ class Experience:
         ValueError
             If a cell is no cell of the map.
         """
-        posterior = self.evidence.over(grid)
+        posterior = self.evidence.posterior_over(grid)
         corners = cells_inside(cells, grid.occupancy.shape)
         if len(corners) < 2:
             return ExpectedTime(0.0, 0.0, 0.0)
@@ -367,14 +365,15 @@ class Experience:
         segment = position[:-1].astype(np.int64)
         metres = np.diff(position) * metres_of_segments[segment]  # (N - 1,)
         x, y = path.T
-        places = posterior.place[y, x]
+        places = posterior.place[y, x]  # (N,)
         slowness = posterior.slowness[places]
-        expected = metres / self.nominal_speed * (slowness[1:] + slowness[:-1]) / 2
-        seconds, deviation = posterior.time(expected, places[1:])
-        low, middle, high = (
-            seconds * np.exp(self.evidence.quantiles() * deviation)
-        ).tolist()
-        return ExpectedTime(middle, low, high)
+        mean_slowness = (slowness[1:] + slowness[:-1]) / 2  # (N - 1,): of each move
+        seconds_of_moves = metres / self.nominal_speed * mean_slowness
+        deviation = posterior.deviation_of(seconds_of_moves, places[1:])
+        errors = np.array(self.evidence.error_range())  # (3,): low, mean, high
+        seconds = float(seconds_of_moves.sum())
+        low, mean, high = (seconds * np.exp(errors * deviation)).tolist()
+        return ExpectedTime(mean, low, high)
 
     def save(self, path: str | Path) -> None:
         """Save to a file, atomically; an OSError leaves an old file unchanged.

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place
-from ddqn_planner.experience.places import NOISE, Float64, Int64, Places
+from ddqn_planner.experience.places import NOISE, Float32, Float64, Int64, Places
 from ddqn_planner.experience.population import FEW_PLACES, Population
 from ddqn_planner.experience.prior import Prior, map_features
 from ddqn_planner.grid import GridMap
@@ -20,32 +20,35 @@ CORRELATION = 1.0  # metres: how far the slowness of a place tells of that of ot
 STEP = 0.02
 STEPS = (1 + STEP) ** np.arange(1 + round(math.log(MAX_SLOWNESS) / math.log(1 + STEP)))
 STEPS = np.minimum(STEPS, MAX_SLOWNESS).astype(np.float32)
-# Of the log slowness: no place is farther from the solution of its equations.
+# Of the log slowness: no place is farther from the solution of the equations.
 ACCURACY = 0.01
 OVER_RELAXATION = 1.4  # of the solver: neighbours agree sooner
-# Around each place, so many places are assumed to be driven without a wait.
+# Around each place, so many passages without a wait are assumed.
 WAIT_PLACES = 0.1
 # Standard deviations of the log time of a drive: on known places, and what is added on
 # places that nobody drove.
 DRIVE_NOISE = 0.05
 UNKNOWN_NOISE = 0.42
+NO_PLACE = (
+    -1
+)  # in arrays of places' numbers: an occupied cell, or a position off the map
 
 
 class Painted(NamedTuple):
-    """A layer of the map, and the values of the places from which it was made."""
+    """A layer of the map, and the values of the P places from which it was made."""
 
-    values: NDArray[Any]  # (P,)
-    layer: NDArray[Any]  # (H, W)
+    values: Float32  # (P,)
+    layer: Float32  # (H, W)
 
 
 class Equations(NamedTuple):
     """The linear equations (diagonal - links) x = right of P places, with L links."""
 
-    begins: NDArray[np.int32]  # (P + 1,): the first link of each place
-    neighbours: NDArray[np.int32]  # (L,): the other place of each link
-    strengths: Float64  # (L,)
+    first_link: NDArray[np.int32]  # (P + 1,): of each place; at last L
+    neighbour: NDArray[np.int32]  # (L,): the place to which each link leads
+    strength: Float64  # (L,)
     diagonal: Float64  # (P,)
-    tolerance: Float64  # (P,): of the square of a residual
+    tolerance: Float64  # (P,): up to which the square of a residual counts as 0
 
 
 class SumsOnMap(NamedTuple):
@@ -63,8 +66,19 @@ class Posterior:
     The log slowness of a place is normal around what the map lets expect. Neighbours
     are alike, but not through walls.
 
+    Parameters
+    ----------
+    grid : GridMap
+        The map, of H x W cells.
+    side : float
+        Of a place, which is a square; metres.
+    nominal_speed : float
+        Metres per second.
+
     Attributes
     ----------
+    place : (H, W) int64
+        The number of each cell's place; NO_PLACE where the cell is occupied.
     known, unknown : (P,) float64
         The share of each place's log slowness that was seen, and the share of its
         standard deviation that remains.
@@ -80,55 +94,78 @@ class Posterior:
         self.grid = grid
         self.side = side
         self.nominal_speed = nominal_speed
-        self.size = max(1, round(side / grid.resolution))  # cells of a block's side
-        self.spacing = self.size * grid.resolution  # metres
-        # (H, W), -1 where occupied; and (P, 2).
-        self.place, self.middle = _places_of(grid, self.size)
-        away, (y, x) = distance_transform_edt(self.place < 0, return_indices=True)
-        self.nearest = np.where(away <= 1.5 * self.size, self.place[y, x], -1)
-        count = len(self.middle)
-        self.links = _links_of(self.place, self.size, count)
-        self.linked: Float64 = self.links.sum(axis=1)
-        # (P, 2), the solutions of two systems of equations: what was seen beyond what
-        # is expected, and the share that is known.
-        self.solution = np.zeros((count, 2))
-        self.prior: Prior | None = None
-        self.predicted = np.zeros(count)  # log slowness, by the prior
-        self.painted: dict[str, Painted] = {}
+        block = max(1, round(side / grid.resolution))  # cells of a block's side
+        self._spacing = block * grid.resolution  # metres from a place to the next
+        self.place = _places_of(grid, block)
+        self._middle_cells = _middle_cells_of(self.place, block)
+        # Each cell's place, and that of the nearest free cell for an occupied one.
+        cells_away, (y, x) = distance_transform_edt(
+            self.place == NO_PLACE, return_indices=True
+        )
+        is_near = cells_away <= 1.5 * block
+        self._nearest_place = np.where(is_near, self.place[y, x], NO_PLACE)  # (H, W)
+        count = len(self._middle_cells)
+        self._links = _links_of(self.place, block, count)
+        self._strength_of_links: Float64 = self._links.sum(axis=1)  # (P,): of all
+        # (P, 2), the solutions of two systems of equations: the log slowness that was
+        # seen beyond the expected one, and the share that is known.
+        self._solution = np.zeros((count, 2))
+        self._prior: Prior | None = None
+        self._predicted = np.zeros(count)  # log slowness, by the prior
+        self._painted: dict[str, Painted] = {}
 
-    def time(self, seconds: Float64, places: Int64) -> tuple[float, float]:
-        """Return the seconds of a path and the standard deviation of their logarithm.
+    def deviation_of(self, seconds: Float64, places: Int64) -> float:
+        """Return the standard deviation of the logarithm of a path's time.
 
         Parameters
         ----------
         seconds, places : (N,) float64, (N,) int64
-            The expected seconds of each part of the path, and its place.
+            The expected seconds of each part of the path, and the number of its place.
         """
-        total = float(seconds.sum())
-        unknown = float(seconds @ self.unknown[places] / total)
-        return total, math.hypot(DRIVE_NOISE, UNKNOWN_NOISE * unknown)
+        unknown = float(seconds @ self.unknown[places] / seconds.sum())
+        return math.hypot(DRIVE_NOISE, UNKNOWN_NOISE * unknown)
 
     def places_at(self, position: Float64) -> Int64:
         """Return the place of each position (N, 2), the nearest within a place's side.
 
-        It is -1 where no place is so near.
+        The place is NO_PLACE where no place is so near.
         """
         cells, is_inside = cells_of(position, self.grid)
         x, y = cells.T
-        return np.where(is_inside, self.nearest[y, x], -1)
+        return np.where(is_inside, self._nearest_place[y, x], NO_PLACE)
+
+    def predicted_at(self, position: Float64) -> Float64:
+        """Return the log slowness that the prior predicts at each position, (N, 2).
+
+        It is 0 without a prior, and off the map.
+        """
+        # NO_PLACE is the index of the last value.
+        predicted = np.append(self._predicted, 0.0)
+        return predicted[self.places_at(position)]
 
     def update(
         self, places: Places, population: Population, prior: Prior | None
     ) -> None:
-        """Solve again with what was seen at places of the world."""
+        """Compute `known`, `unknown`, `mean` and `slowness` from what was seen.
+
+        Parameters
+        ----------
+        places : Places
+            What was seen at places of the world.
+        population : Population
+            The distribution of the log slowness of places.
+        prior : Prior or None
+            Predicts the log slowness of places from the map.
+        """
         self._predict(prior)
-        self.expected = population.level + population.prior_weight * self.predicted
+        expected = population.level + population.prior_weight * self._predicted  # (P,)
         sums = self._sums_of(places)
-        self._solve(sums, population.variance)
-        seen = self.solution[:, 0]
-        self.known: Float64 = np.clip(self.solution[:, 1], 0, 1)
+        self._solve(sums, expected, population.variance)
+        seen_beyond_expected = self._solution[:, 0]
+        self.known: Float64 = np.clip(self._solution[:, 1], 0, 1)
         self.unknown = np.sqrt(1 - self.known)
-        self.mean = self.expected + seen + population.surplus * (1 - self.known)
+        surplus = population.surplus * (1 - self.known)
+        self.mean = expected + seen_beyond_expected + surplus
         self.slowness = np.exp(self.mean)
         if sums.waited.any():
             waits = self._waits(sums.passages, sums.waited)
@@ -136,23 +173,28 @@ class Posterior:
 
     def _predict(self, prior: Prior | None) -> None:
         """Predict the log slowness of each place, if the prior is another."""
-        if prior is self.prior:
+        if prior is self._prior:
             return
-        self.prior = prior
+        self._prior = prior
         if prior is None:
-            self.predicted[:] = 0
+            self._predicted[:] = 0
         else:
-            x, y = self.middle.T
-            self.predicted[:] = prior.log_slowness(map_features(self.grid)[y, x])
+            x, y = self._middle_cells.T
+            self._predicted[:] = prior.log_slowness(map_features(self.grid)[y, x])
 
     def _sums_of(self, places: Places) -> SumsOnMap:
-        """Return what was seen at each place of the map."""
-        numbers = self.places_at(places.position)
-        is_on_map = numbers >= 0
-        numbers = numbers[is_on_map]
+        """Return the sums of all places of the world that lie in each place of the map.
+
+        A place of the world has the size of a place of the map, but lies elsewhere.
+        """
+        place_on_map = self.places_at(places.position)
+        is_on_map = place_on_map != NO_PLACE
+        place_on_map = place_on_map[is_on_map]
 
         def summed(values: Float64) -> Float64:
-            sums = np.bincount(numbers, values[is_on_map], len(self.middle))
+            count = len(self._middle_cells)
+            sums = np.bincount(place_on_map, values[is_on_map], count)
+            # Without any place, the sums are integers.
             return sums.astype(np.float64)
 
         return SumsOnMap(
@@ -162,157 +204,215 @@ class Posterior:
             waited=summed(places.waited),
         )
 
-    def _solve(self, sums: SumsOnMap, variance: float) -> None:
-        """Solve the equations of the field, beginning with the last solution."""
+    def _solve(self, sums: SumsOnMap, expected: Float64, variance: float) -> None:
+        """Solve the equations of the field, beginning with the last solution.
+
+        Parameters
+        ----------
+        sums : SumsOnMap
+            What was seen at each place of the map.
+        expected : (P,) float64
+            The log slowness of each place that is expected without any visit.
+        variance : float
+            Of the log slowness of places.
+        """
         # A lattice whose links have strength 1 has about the variance ln(32 / kappa) /
         # 4 pi; 1 is added for cells of many metres, where that would be negative.
-        kappa = (self.spacing / CORRELATION) ** 2
-        scale = variance / (math.log1p(32 / kappa) / (4 * math.pi)) / NOISE
-        visits = scale * sums.weight
+        kappa = (self._spacing / CORRELATION) ** 2
+        variance_of_lattice = math.log1p(32 / kappa) / (4 * math.pi)
+        scale = variance / variance_of_lattice / NOISE
+        visits = scale * sums.weight  # (P,), as the following arrays
         # Half of the noise is added, as the mean of its exponential is more than 1.
         seen = scale * (sums.sum_of_log + sums.weight * NOISE / 2)
-        right = np.column_stack([seen - visits * self.expected, visits])  # (P, 2)
+        right = np.column_stack([seen - visits * expected, visits])  # (P, 2)
         # The equations map the same error everywhere to its product with `kappa +
         # visits`, and greater errors to greater residuals: residuals up to that product
         # prove that no error is greater.
-        tolerance = (ACCURACY * (kappa + visits)) ** 2
+        largest_residual = ACCURACY * (kappa + visits)
         equations = Equations(
-            begins=self.links.indptr,
-            neighbours=self.links.indices,
-            strengths=self.links.data,
-            diagonal=kappa + self.linked + visits,
-            tolerance=tolerance,
+            first_link=self._links.indptr,
+            neighbour=self._links.indices,
+            strength=self._links.data,
+            diagonal=kappa + self._strength_of_links + visits,
+            tolerance=largest_residual**2,
         )
-        _relax(equations, right, self.solution)
+        _relax(equations, right, self._solution)
 
     def _waits(self, passages: Float64, waited: Float64) -> Float64:
-        """Return the seconds that a robot waits per metre through each place.
+        """Return the seconds that a robot waits per metre through each place: (P,).
 
         They are the seconds waited around the place, over the metres driven around it.
         So each path through costs what a passage did, also beside the place where
         robots stood.
+
+        Parameters
+        ----------
+        passages, waited : (P,) float64
+            How often a robot passed each place, and how many seconds it waited there.
         """
-        reach = round(2 * self.side / self.spacing)
-        seconds_around = self._around(waited, reach)
-        passages_around = self._around(passages, reach)
+        reach = round(2 * self.side / self._spacing)  # links
+        seconds_around = self._mean_around(waited, reach)
+        passages_around = self._mean_around(passages, reach)
         waits = seconds_around / (passages_around + WAIT_PLACES) / self.side
         # Robots wait where nobody drove, too. But one place of waits says nothing of
         # others, so the surroundings of the longest wait do not count.
-        longest = np.zeros(len(waits))
-        longest[waited.argmax()] = 1
-        is_elsewhere = self._around(longest, 2 * reach) == 0
-        known_elsewhere = self.known * is_elsewhere
-        mean = float(waits @ known_elsewhere) / (FEW_PLACES + float(self.known.sum()))
-        waits_in_unknown: Float64 = mean * (1 - self.known)
+        is_longest_wait = np.zeros(len(waits))
+        is_longest_wait[waited.argmax()] = 1
+        is_elsewhere = self._mean_around(is_longest_wait, 2 * reach) == 0
+        waits_elsewhere = float(waits @ (self.known * is_elsewhere))
+        mean_wait = waits_elsewhere / (FEW_PLACES + float(self.known.sum()))
+        waits_in_unknown: Float64 = mean_wait * (1 - self.known)
         return waits + waits_in_unknown
 
-    def _around(self, values: Float64, reach: int) -> Float64:
-        """Return a weighted mean over the places around each, none behind a wall."""
+    def _mean_around(self, values: Float64, reach: int) -> Float64:
+        """Return weighted means of the values (P,) of places, for each place.
+
+        They are over the places up to `reach` links away, none behind a wall. A place
+        in the open has four links.
+        """
         for _ in range(reach):
-            neighbours: Float64 = self.links @ values
-            mean: Float64 = (values + neighbours) / 5
-            values = mean
+            sum_of_neighbours: Float64 = self._links @ values
+            values = (values + sum_of_neighbours) / 5
         return values
 
-    def paint(
-        self, name: str, optimism: Float64 | float, fastest: float
-    ) -> NDArray[np.float32]:
+    def paint(self, name: str, optimism: Float64 | float, fastest: float) -> Float32:
         """Return (H, W) float32: the slowness over that of the fastest place.
 
-        The array is the same as before while no value changes.
+        The array is the same as before while no value changes, so that fields need no
+        repair.
 
         Parameters
         ----------
         name : str
-            Which of the layers.
+            Of the layer, under which the array is kept for the next call.
         optimism : (P,) float64, or float
             The logarithm by which each place is assumed to be faster than expected.
         fastest : float
             The log slowness of the fastest place.
         """
-        log = np.log(self.slowness) - optimism - fastest
-        steps = np.rint(np.clip(log, 0, math.log(MAX_SLOWNESS)) / math.log(1 + STEP))
-        values = STEPS.take(steps.astype(np.int64))
-        painted = self.painted.get(name)
+        log = np.log(self.slowness) - optimism - fastest  # (P,)
+        possible_log = np.clip(log, 0, math.log(MAX_SLOWNESS))
+        steps = np.rint(possible_log / math.log(1 + STEP)).astype(np.int64)
+        values = STEPS[steps]
+        painted = self._painted.get(name)
         if painted is None or not np.array_equal(values, painted.values):
-            painted = Painted(values, self.over(values, 1))
-            self.painted[name] = painted
+            painted = Painted(values, self.to_cells(values, 1))
+            self._painted[name] = painted
         return painted.layer
 
-    def over(self, values: NDArray[Any], occupied: int) -> NDArray[Any]:
-        """Return the value of each cell's place, or that of occupied cells: (H, W)."""
-        # The place of an occupied cell is -1: the last value.
-        values_with_occupied = np.append(values, values.dtype.type(occupied))
-        return values_with_occupied.take(self.place, mode="wrap")
+    def to_cells(self, values: Float32, occupied: float) -> Float32:
+        """Return the value of each cell's place, `occupied` for occupied cells: (H, W).
+
+        `values` are those of places, (P,).
+        """
+        # NO_PLACE is the index of the last value.
+        values_with_occupied = np.append(values, np.float32(occupied))
+        return values_with_occupied[self.place]
 
 
-def _places_of(grid: GridMap, size: int) -> tuple[Int64, Int64]:
-    """Return each cell's place, (H, W), and a cell (x, y) near each place's middle.
+def _places_of(grid: GridMap, block: int) -> Int64:
+    """Return the number of each cell's place, (H, W); NO_PLACE for occupied cells.
 
-    A place is a connected part of a block of `size` x `size` cells.
+    A place is a connected part of a block of `block` x `block` cells.
     """
     from scipy.ndimage import label
 
-    # Between the blocks are rows and columns that connect nothing.
+    # A copy of the map with an occupied row and column after each block, so that no
+    # part connects two blocks.
     height, width = grid.occupancy.shape
-    rows = np.arange(height) + np.arange(height) // size
-    columns = np.arange(width) + np.arange(width) // size
-    is_free = np.zeros((rows[-1] + 1, columns[-1] + 1), dtype=np.bool_)
-    is_free[np.ix_(rows, columns)] = ~grid.occupancy
+    row = np.arange(height)
+    column = np.arange(width)
+    row_in_copy = row + row // block
+    column_in_copy = column + column // block
+    cells_in_copy = np.ix_(row_in_copy, column_in_copy)
+    shape_of_copy = row_in_copy[-1] + 1, column_in_copy[-1] + 1
+    is_free = np.zeros(shape_of_copy, dtype=np.bool_)
+    is_free[cells_in_copy] = ~grid.occupancy
+    # Free parts have labels from 1 on, and occupied cells 0.
     labels: Int64 = label(is_free, output=np.int64)[0]
-    place = labels[np.ix_(rows, columns)] - 1
-    y, x = np.nonzero(place >= 0)
-    middle = (size - 1) / 2
-    distance_to_middle = np.hypot(x % size - middle, y % size - middle)
-    order = np.argsort(distance_to_middle, kind="stable")
-    cells = np.column_stack([x, y])[order]
-    # Of each place the first cell in this order.
-    _, first = np.unique(place[y, x][order], return_index=True)
-    return place, cells[first]
+    return labels[cells_in_copy] - 1
 
 
-def _links_of(place: Int64, size: int, count: int) -> Any:
-    """Return the links of places, a sparse (P, P) array.
+def _middle_cells_of(place: Int64, block: int) -> Int64:
+    """Return the cell of each place that is nearest to the middle of its block.
+
+    Parameters
+    ----------
+    place : (H, W) int64
+        The number of each cell's place, or NO_PLACE.
+    block : int
+        The cells of a block's side.
+
+    Returns
+    -------
+    (P, 2) int64
+        The x and y of a cell for each place.
+    """
+    y, x = np.nonzero(place != NO_PLACE)  # (N,) each, for N free cells
+    middle = (block - 1) / 2
+    distance_to_middle = np.hypot(x % block - middle, y % block - middle)
+    nearest_first = np.argsort(distance_to_middle, kind="stable")
+    x = x[nearest_first]
+    y = y[nearest_first]
+    # `unique` returns the first index of each place, in the order of their numbers.
+    _, first = np.unique(place[y, x], return_index=True)
+    return np.column_stack([x[first], y[first]])
+
+
+def _links_of(place: Int64, block: int, count: int) -> Any:
+    """Return the links between neighbour places, a sparse (P, P) array of strengths.
 
     A link's strength is the share of a block's side along which two places touch.
+
+    Parameters
+    ----------
+    place : (H, W) int64
+        The number of each cell's place, or NO_PLACE.
+    block, count : int
+        The cells of a block's side, and the number P of places.
     """
     from scipy.sparse import csr_array
 
-    left_of = place[:, :-1].ravel()
-    right_of = place[:, 1:].ravel()
-    below = place[:-1].ravel()
-    above = place[1:].ravel()
-    first = np.concatenate([left_of, below])
-    second = np.concatenate([right_of, above])
-    is_linked = (first != second) & (first >= 0) & (second >= 0)
-    ends = first[is_linked], second[is_linked]
-    strength = np.full(np.count_nonzero(is_linked), 1 / size)
-    links = csr_array((strength, ends), shape=(count, count))
+    # The places of all pairs of cells that lie side by side, or one above the other.
+    first = np.concatenate([place[:, :-1].ravel(), place[:-1].ravel()])
+    second = np.concatenate([place[:, 1:].ravel(), place[1:].ravel()])
+    are_free = (first != NO_PLACE) & (second != NO_PLACE)
+    is_link = are_free & (first != second)
+    strength = np.full(np.count_nonzero(is_link), 1 / block)
+    # The strengths of the same two places are added up.
+    links = csr_array(
+        (strength, (first[is_link], second[is_link])), shape=(count, count)
+    )
     return (links + links.T).tocsr()
 
 
 @in_place
 def _relax(equations: Equations, residual: Float64, solution: Float64) -> None:
-    """Solve two systems of equations by residuals, until none is above its tolerance.
+    """Solve two systems of equations by relaxation: one place after another.
+
+    It ends when no residual is above the tolerance of its place.
 
     Parameters
     ----------
     equations : Equations
-        The equations of both systems.
+        The equations (diagonal - links) x = right of P places. Both systems have them,
+        with different right sides.
     residual : (P, 2) float64
-        The right sides of the systems; it becomes their residuals.
+        The right side of each system. It is changed to the residuals, which are the
+        right sides less the left sides.
     solution : (P, 2) float64
-        An estimate; it becomes the solution.
+        An estimate of x for each system. It is changed to the solutions.
     """
-    begins = equations.begins
-    neighbours = equations.neighbours
-    strengths = equations.strengths
+    first_link = equations.first_link
+    neighbours = equations.neighbour
+    strengths = equations.strength
     diagonal = equations.diagonal
     count = diagonal.size
+    # Subtract the left sides.
     for place in range(count):
         residual[place, 0] -= diagonal[place] * solution[place, 0]
         residual[place, 1] -= diagonal[place] * solution[place, 1]
-        for link in range(begins[place], begins[place + 1]):
+        for link in range(first_link[place], first_link[place + 1]):
             neighbour = neighbours[link]
             residual[place, 0] += strengths[link] * solution[neighbour, 0]
             residual[place, 1] += strengths[link] * solution[neighbour, 1]
@@ -320,32 +420,52 @@ def _relax(equations: Equations, residual: Float64, solution: Float64) -> None:
     while not is_solved:
         is_solved = True
         for place in range(count):
-            excess = residual[place, 0]
-            excess_known = residual[place, 1]
-            square = excess * excess + excess_known * excess_known
+            # One residual for each of the two systems.
+            residual_0 = residual[place, 0]
+            residual_1 = residual[place, 1]
+            square = residual_0 * residual_0 + residual_1 * residual_1
             is_off = square > equations.tolerance[place]
             if not is_off:
                 continue
             is_solved = False
-            # The change that makes this place's residual 0, and a little more.
-            change = OVER_RELAXATION * excess / diagonal[place]
-            change_known = OVER_RELAXATION * excess_known / diagonal[place]
-            solution[place, 0] += change
-            solution[place, 1] += change_known
-            residual[place, 0] -= change * diagonal[place]
-            residual[place, 1] -= change_known * diagonal[place]
-            for link in range(begins[place], begins[place + 1]):
+            # The change of the solution that makes these residuals 0, and a little
+            # more, with which fewer rounds are needed.
+            change_0 = OVER_RELAXATION * residual_0 / diagonal[place]
+            change_1 = OVER_RELAXATION * residual_1 / diagonal[place]
+            solution[place, 0] += change_0
+            solution[place, 1] += change_1
+            residual[place, 0] -= change_0 * diagonal[place]
+            residual[place, 1] -= change_1 * diagonal[place]
+            for link in range(first_link[place], first_link[place + 1]):
                 neighbour = neighbours[link]
-                residual[neighbour, 0] += strengths[link] * change
-                residual[neighbour, 1] += strengths[link] * change_known
+                residual[neighbour, 0] += strengths[link] * change_0
+                residual[neighbour, 1] += strengths[link] * change_1
 
 
 def cells_of(position: Float64, grid: GridMap) -> tuple[Int64, NDArray[np.bool_]]:
-    """Return the nearest cells of positions, (N, 2), and which lie on the map."""
-    *corner, yaw = grid.origin
+    """Return the cell of each position, and whether the position is on the map.
+
+    Parameters
+    ----------
+    position : (N, 2) float64
+        The x and y of each position, metres in the frame of the map.
+    grid : GridMap
+        The map.
+
+    Returns
+    -------
+    cells : (N, 2) int64
+        The column and row of each cell; off the map, those of the nearest cell.
+    is_inside : (N,) bool
+        Whether the position is on the map.
+    """
+    origin_x, origin_y, yaw = grid.origin
     cos = math.cos(yaw)
     sin = math.sin(yaw)
-    along = (position - corner) @ [[cos, -sin], [sin, cos]]
-    cells = np.floor(along / grid.resolution).astype(np.int64)
+    # From the axes of the frame to those of the map, still in metres.
+    rotation = [[cos, -sin], [sin, cos]]
+    on_axes_of_map = (position - (origin_x, origin_y)) @ rotation
+    cells = np.floor(on_axes_of_map / grid.resolution).astype(np.int64)
     nearest = np.clip(cells, 0, [grid.width - 1, grid.height - 1])
-    return nearest, (cells == nearest).all(axis=1)
+    is_inside = (cells == nearest).all(axis=1)
+    return nearest, is_inside
