@@ -330,7 +330,8 @@ def _places_of(grid: GridMap, block: int) -> Int64:
     is_free[cells_in_copy] = ~grid.occupancy
     # Free parts have labels from 1 on, and occupied cells 0.
     labels: Int64 = label(is_free, output=np.int64)[0]
-    return labels[cells_in_copy] - 1
+    place: Int64 = labels[cells_in_copy] - 1
+    return place
 
 
 def _middle_cells_of(place: Int64, block: int) -> Int64:
