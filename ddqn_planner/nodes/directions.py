@@ -1,9 +1,9 @@
-"""The one-way zones that a map server publishes: they hold on the maps of their frame."""
+"""The one-way zones of a map server, which hold on every map of the frame of the zones."""
 
 import math
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from nav_msgs.msg import OccupancyGrid
@@ -17,16 +17,34 @@ from ddqn_planner.nodes.diagnostics import PlannerDiagnostics
 from ddqn_planner.nodes.quality import LATCHED
 
 DIRECTIONS = "map_directions"
-PUBLISHER_WAIT = 1.0  # seconds for the first message of a publisher that was discovered
+# Seconds for the first message of a publisher, from the publisher's discovery on.
+PUBLISHER_WAIT = 1.0
 LATE = "the map's directions were not received on {} yet"
-Forbidden = NDArray[np.uint8]
-Place = tuple[Any, ...]  # shape, resolution and origin of a map
+Forbidden = NDArray[np.uint8]  # (H, W), bit k set: action k is forbidden in the cell
+
+
+class Place(NamedTuple):
+    """Where the cells of a map lie in the map's frame."""
+
+    shape: tuple[int, ...]  # rows and columns
+    resolution: float  # metres per cell
+    origin: tuple[float, float, float]  # metres, metres, radians
 
 
 class Directions:
-    """The last message on `map_directions`, whatever its stamp and whoever sent it.
+    """The last message on `map_directions`, whatever its stamp and its publisher.
 
-    They stay in effect when their publisher ends, until others come.
+    The zones of the message stay in effect when the publisher ends, until the next
+    message.
+
+    Parameters
+    ----------
+    node
+        The planner's node, with its parameters.
+    diagnostics
+        Where refused messages are reported.
+    on_change
+        Called after each message that is not refused.
     """
 
     def __init__(
@@ -35,88 +53,105 @@ class Directions:
         diagnostics: PlannerDiagnostics,
         on_change: Callable[[], None],
     ) -> None:
-        self._node, self._diagnostics, self._on_change = node, diagnostics, on_change
-        self._frame = ""
+        self._node = node
+        self._diagnostics = diagnostics
+        self._on_change = on_change
+        self._was_received = False  # whether a message was, since the node's start
+        self._frame = ""  # of the zones
         self._zones: GridMap | None = None  # None if nothing is forbidden
-        self._have_come = False
-        # What they forbid on the last map, and the place of its cells.
-        self._last: tuple[Place, Forbidden | None] | None = None
-        # The publishers whose first message came, or was awaited long enough.
+        # The last map that was asked about, and what the zones forbid on it.
+        self._last_place: Place | None = None
+        self._last_forbidden: Forbidden | None = None
+        # Publishers whose first message came, or was awaited long enough.
         self._known_publishers: set[bytes] = set()
-        self._awaited_since: float | None = None
+        self.awaited_since = -math.inf
+        """When the wait for a new publisher began, by the steady clock in seconds;
+        -inf while there is none."""
         subscription = node.create_subscription(
             OccupancyGrid, DIRECTIONS, self.take, LATCHED
         )
-        self.topic = subscription.topic_name
-
-    @property
-    def awaited_since(self) -> float:
-        """When the wait for the first message of a publisher began; -inf if there is none."""
-        return -math.inf if self._awaited_since is None else self._awaited_since
+        self.topic: str = subscription.topic_name
 
     @property
     def required(self) -> str:
         """Why no map may be used: directions are required and none came; else empty."""
-        if self._have_come or not self._node.value("require_directions"):
+        if self._was_received or not self._node.value("require_directions"):
             return ""
         remedy = "let a map server publish them, or set require_directions to false"
         return f"{LATE.format(self.topic)}; {remedy}"
 
-    @property
-    def missing(self) -> str:
-        """Why a map that has come has to wait for directions; empty if it has not."""
-        if self.required:
-            return self.required
-        new = self._publishers() - self._known_publishers
-        if not new:
-            self._awaited_since = None
+    def wait_for_new_publisher(self) -> str:
+        """Begin, continue or end the wait for the first message of a new publisher.
+
+        Returns
+        -------
+        Why a new map must not be used yet, in words; empty if nothing is awaited.
+        """
+        # A latched topic brings a message within moments of the discovery of its
+        # publisher. A map server's publisher of directions is discovered before its
+        # map comes, as it is created before the publisher of the map.
+        if not self._publishers() - self._known_publishers:
+            self.awaited_since = -math.inf
             return ""
-        # A latched topic brings a message within moments of the discovery of its publisher. A map
-        # server is seen before its map comes, as its directions have the first publisher.
-        if self._awaited_since is None:
-            self._awaited_since = time.monotonic()
-        if time.monotonic() - self._awaited_since < PUBLISHER_WAIT:
+        now = time.monotonic()
+        if self.awaited_since == -math.inf:
+            self.awaited_since = now
+        if now - self.awaited_since < PUBLISHER_WAIT:
             late = LATE.format(self.topic)
             return f"{late}; a new publisher has {PUBLISHER_WAIT:g} s to send them"
-        self._know_publishers()
+        self._end_wait()
         return ""
 
     def take(self, message: OccupancyGrid) -> None:
-        """Obey a message from now on, or refuse it and obey the one before."""
+        """Obey the zones of a message, or none if the message has no cells.
+
+        A message that is no map is refused: the diagnostics report the reason, and the
+        zones of the message before stay in effect.
+        """
         with self._diagnostics.receiving(DIRECTIONS):
             zones = None
             if message.info.width or message.info.height or message.data:
                 grid = grid_from_message(message)
-                zones = grid.with_layers(
-                    forbidden=occupancy_values(message).view(np.uint8)
-                )
-            self._frame, self._zones = message.header.frame_id, zones
-            self._have_come, self._last = True, None
-            self._know_publishers()
+                # Of directions, a value is no occupancy but a set of eight bits.
+                forbidden: Forbidden = occupancy_values(message).view(np.uint8)
+                zones = grid.with_layers(forbidden=forbidden)
+            self._frame = message.header.frame_id
+            self._zones = zones
+            self._last_place = None
+            self._was_received = True
+            self._end_wait()
             self._on_change()
 
     def on(self, grid: GridMap, frame: str) -> Forbidden | None:
-        """Return what they forbid on a map; ValueError if they cannot hold there."""
-        zones, last = self._zones, self._last
-        if zones is None:
+        """Return what the zones forbid on a map in a frame; None if nothing.
+
+        A ValueError says why the zones cannot hold on the map. For a map in the place
+        of the last one the array is the same object, by which maps are compared
+        quickly.
+        """
+        if self._zones is None:
             return None
         if frame != self._frame:
-            frames = f"their frame is {self._frame!r}, the map's is {frame!r}; give both one frame"
-            raise ValueError(f"{self.topic} is not obeyed: {frames}")
-        place = grid.occupancy.shape, grid.resolution, grid.origin
-        if last is not None and place == last[0]:
-            return last[1]  # the same array, by which maps are compared quickly
+            frames = f"their frame is {self._frame!r}, the map's is {frame!r}"
+            remedy = "give both one frame"
+            raise ValueError(f"{self.topic} is not obeyed: {frames}; {remedy}")
+        place = Place(grid.occupancy.shape, grid.resolution, grid.origin)
+        if place == self._last_place:
+            return self._last_forbidden
         try:
-            forbidden = forbidden_on(grid, zones)
+            self._last_forbidden = forbidden_on(grid, self._zones)
         except (ValueError, MemoryError) as error:
             reason = str(error) or "no memory is left; give a smaller map"
             raise ValueError(f"{self.topic} is not obeyed: {reason}") from None
-        self._last = place, forbidden
-        return forbidden
+        self._last_place = place
+        return self._last_forbidden
 
     def _publishers(self) -> set[bytes]:
+        """Return the identifiers of the publishers that the node has discovered."""
         publishers = self._node.get_publishers_info_by_topic(self.topic)
         return {bytes(publisher.endpoint_gid) for publisher in publishers}
 
-    def _know_publishers(self) -> None:
-        self._known_publishers, self._awaited_since = self._publishers(), None
+    def _end_wait(self) -> None:
+        """Wait for the first message of no publisher that is discovered already."""
+        self._known_publishers = self._publishers()
+        self.awaited_since = -math.inf

@@ -58,19 +58,18 @@ ONE_WAY_ZONES = "one-way zones"
 
 # Seconds to wait for a costmap without a known period, as Nav2's planners do.
 UPDATE_WAIT = 1.0
-# Each map may be turned by another number: only another kind of reason is news.
 NUMBER = re.compile(r"-?\d[\d.]*(e[+-]?\d+)?")
 
 
 @dataclass(eq=False)
 class Received:
-    """A map, and the header and the time of the map or of its last update."""
+    """A map with its updates, which change the map's message in place."""
 
     message: OccupancyGrid
-    grid: GridMap
-    header: Header
-    came: float  # in seconds of the steady clock
-    forbidden: Forbidden | None = None
+    grid: GridMap  # the message as the parameters say, without directions
+    header: Header  # of the map, or of its last update
+    time: float  # of the map or its last update, in seconds of the steady clock
+    forbidden: Forbidden | None = None  # by the directions
 
 
 class MapPlace(NamedTuple):
@@ -94,7 +93,7 @@ class MapSource:
     diagnostics
         Where refused messages are reported.
     worker
-        Prepares the map: inflation and expected times.
+        Its thread prepares the map: inflation and expected times.
     on_map
         Called when anything about the map is new.
     clock
@@ -116,17 +115,18 @@ class MapSource:
         self._clock = clock
         self.times = ExpectedTimes(node, diagnostics, worker, self.change)
         self.arrivals = Arrivals(clock)
-        self._used: Received | None = None
+        self._map_in_use: Received | None = None
         # A newer map, whose directions may still come.
-        self._waiting: Received | None = None
-        self._waiting_since = math.inf
+        self._waiting_map: Received | None = None
+        self._waiting_since = math.inf  # by the steady clock; inf: no map waits
         self._logged_reason = ""  # why a map waits, without the numbers
-        self._size = ""  # of the map in use, in words
-        self._began = clock()
+        self._logged_size = ""
+        self._listening_since = clock()
         self._updates = 0
         self._applied_updates = 0
         self._inflate = Inflation()
-        self._ready: Future | None = None
+        # Of the map in use, with its layers; None: it has to be prepared anew.
+        self._prepared: Future | None = None
         # Before the subscription of the map: directions that come with a map are taken
         # first.
         self.directions = Directions(node, diagnostics, self._on_directions)
@@ -152,12 +152,14 @@ class MapSource:
     @property
     def frame(self) -> str:
         """The frame of the map; empty without a map."""
-        return self._used.header.frame_id if self._used is not None else ""
+        return self._map_in_use.header.frame_id if self._map_in_use is not None else ""
 
     @property
     def is_settling(self) -> bool:
         """Whether a map waits for directions that come within moments, if at all."""
-        return self._waiting is not None and self.directions.awaited_since > -math.inf
+        return (
+            self._waiting_map is not None and self.directions.awaited_since > -math.inf
+        )
 
     @property
     def _is_costmap(self) -> bool:
@@ -166,11 +168,14 @@ class MapSource:
     @property
     def retry_wait(self) -> float:
         """The seconds that a failed plan waits for the next costmap; 0 for a map."""
+        # A request has waited after the last costmap, and none came.
         is_silent = self.arrivals.awaited_in_vain == self.arrivals.number
         if not self._is_costmap or is_silent:
             return 0.0
-        timeout: float = self._node.value("map_timeout") or math.inf
-        wait = min(2 * self.arrivals.period, timeout)
+        timeout: float = self._node.value("map_timeout")
+        wait = 2 * self.arrivals.period
+        if timeout > 0:
+            wait = min(wait, timeout)
         return wait if wait < math.inf else UPDATE_WAIT
 
     def check(self) -> Header:
@@ -181,11 +186,11 @@ class MapSource:
         RequestError
             If there is no map to plan on, or a costmap is older than ``map_timeout``.
         """
-        self.look()
-        if self._used is None:
+        self.use_waiting_map()
+        if self._map_in_use is None:
             raise self._no_map()
         timeout: float = self._node.value("map_timeout")
-        if self._is_costmap and 0 < timeout < self._clock() - self._used.came:
+        if self._is_costmap and 0 < timeout < self._clock() - self._map_in_use.time:
             silence = f"nothing came on {self._topic} for longer than map_timeout"
             reason = f"{silence}, {timeout:g} s{self._refusal_in_brackets()}"
             remedy = (
@@ -193,27 +198,33 @@ class MapSource:
                 "often"
             )
             raise RequestError("MAP_TIMEOUT", f"{reason}; {remedy}")
-        return self._used.header
+        return self._map_in_use.header
 
     def _no_map(self) -> RequestError:
+        """Return the error of a request without a map in use.
+
+        The error names the time since which the node listens, as the first map, or its
+        directions, may still come.
+        """
         refusal = self._diagnostics.refused.get("map")
-        if refusal and self._waiting is not None:
-            listening_since = max(self._began, self.directions.awaited_since)
+        if refusal and self._waiting_map is not None:
+            listening_since = max(self._listening_since, self.directions.awaited_since)
             return RequestError("NO_MAP", refusal, listening_since)
         missing = f"no map was received on {self._topic} yet"
         reason = f"{missing}{self._refusal_in_brackets()}; start a map server"
-        return RequestError("NO_MAP", reason, self._began)
+        return RequestError("NO_MAP", reason, self._listening_since)
 
     def _refusal_in_brackets(self) -> str:
+        """Return why the last map was refused; empty if it was not."""
         refusal = self._diagnostics.refused.get("map")
         return f" ({refusal})" if refusal else ""
 
     @property
     def unknown(self) -> NDArray[np.bool_] | None:
         """Which cells of the map are unknown, (H, W) bool; None without a map."""
-        if self._used is None:
+        if self._map_in_use is None:
             return None
-        return occupancy_values(self._used.message) < 0
+        return occupancy_values(self._map_in_use.message) < 0
 
     @property
     def missing(self) -> str:
@@ -227,9 +238,9 @@ class MapSource:
     def describe(self) -> dict[str, str]:
         """Return the lines of the diagnostics about the map."""
         lines: dict[str, str] = {}
-        if self._used is not None:
-            lines["map"] = self._size
-            lines["map stamp (s)"] = seconds(self._used.header.stamp)
+        if self._map_in_use is not None:
+            lines["map"] = self._logged_size
+            lines["map stamp (s)"] = seconds(self._map_in_use.header.stamp)
         if self._updates:
             refused_updates = self._updates - self._applied_updates
             lines["map updates applied"] = str(self._applied_updates)
@@ -237,56 +248,68 @@ class MapSource:
         return lines | self.times.diagnostics_of(self._diagnostics.outcome)
 
     def ready(self) -> Future:
-        """Return the future of the `GridMap` to plan on, with the body and the times.
+        """Return the future of the `GridMap` to plan on, with inflation and times.
 
-        The worker computes it for the first request after a change.
+        The worker computes the map for the first request after a change.
         """
-        ready = self._ready
+        prepared = self._prepared
         # A preparation fails when no memory is left.
-        has_failed = ready is not None and ready.done() and ready.exception()
-        if ready is None or has_failed:
-            assert self._used is not None
-            grid = self._used.grid.with_layers(forbidden=self._used.forbidden)
+        has_failed = prepared is not None and prepared.done() and prepared.exception()
+        if prepared is None or has_failed:
+            received = self._map_in_use
+            assert received is not None
+            grid = received.grid.with_layers(forbidden=received.forbidden)
             radius: float = self._node.value("robot_radius")
             weight: float = self._node.value("clearance_weight")
             # ROS accepts a value that is above the range by a millionth.
-            ready = self._worker.call(self._prepare, grid, radius, min(weight, 1.0))
-            self._ready = ready
-        return ready
+            weight = min(weight, 1.0)
+            prepared = self._worker.call(self._prepare, grid, radius, weight)
+            self._prepared = prepared
+        return prepared
 
     def _prepare(self, grid: GridMap, radius: float, weight: float) -> GridMap:
+        """Return a map inflated by the robot's radius (metres), with expected times.
+
+        The weight, 0 to 1, is that of the costs near obstacles.
+        """
         return self.times.apply(self._inflate(grid, radius, weight))
 
     def apply_parameters(self, changed: set[str]) -> None:
-        """Read and prepare the map anew if one of the changed parameters matters."""
+        """Read and prepare the map anew if one of the changed parameters needs it."""
         if not changed & PARAMETERS:
             return
-        for received in (self._waiting, self._used):
+        for received in (self._waiting_map, self._map_in_use):
             if received is not None:
                 received.grid = self._read(received.message)
         self._on_directions()
 
     def change(self) -> None:
-        """Prepare the map anew for the next request."""
-        self._ready = None
+        """Prepare the map in use anew for the next request, and tell the node."""
+        self._prepared = None
         self._diagnostics.change()
         self._on_map()
 
     def take(self, message: OccupancyGrid) -> None:
-        """Plan on a map as soon as its directions are there, or refuse it."""
+        """Plan on a map as soon as its directions are there, or refuse the map."""
         try:
-            grid = self._read(message, self._waiting or self._used)
+            grid = self._read(message, self._newest_map)
         except (ValueError, MemoryError) as error:
             self._diagnostics.refuse("map", str(error) or repr(error))
             return
-        self._waiting = Received(message, grid, message.header, self.arrivals.note())
+        time_of_map = self.arrivals.note()
+        self._waiting_map = Received(message, grid, message.header, time_of_map)
         self._diagnostics.ok("map_updates")
-        self.look()
+        self.use_waiting_map()
+
+    @property
+    def _newest_map(self) -> Received | None:
+        return self._waiting_map or self._map_in_use
 
     def _read(self, message: OccupancyGrid, last: Received | None = None) -> GridMap:
-        """Return the map of a message.
+        """Return the map of a message, read as the parameters say.
 
-        If the last map has the same place, only the cells that differ are read.
+        If the last map has the same place, only the boxes of cells that differ from
+        the last message are read.
         """
         if last is None or _place(message) != _place(last.message):
             return grid_from_message(message, self._rules())
@@ -304,7 +327,18 @@ class MapSource:
     def _patched(
         self, grid: GridMap, values: NDArray[np.int8], x: int, y: int
     ) -> GridMap:
-        """Return a map with other values in the box whose first cell is (x, y)."""
+        """Return a copy of a map with a message's values in a box.
+
+        Parameters
+        ----------
+        grid
+            The map.
+        values
+            (height, width) of the box, as in a message.
+        x, y
+            The box's first cell in the map.
+        """
+        # The place of the patch is not used.
         patch = grid_from_values(values, 1.0, (0.0, 0.0, 0.0), self._rules())
         return grid.with_patch(
             patch.occupancy, x, y, patch.cost, patch.obstacles, patch.unknown
@@ -313,52 +347,66 @@ class MapSource:
     def take_update(self, update: MapUpdate) -> None:
         """Plan on the map with other values in a box, or refuse the update."""
         self._updates += 1
-        newest = self._waiting or self._used
+        newest = self._newest_map
         with self._diagnostics.receiving("map_updates", is_frequent=True):
             if newest is None:
                 raise ValueError(f"an update came before a map; {REMEDY}")
-            self._update(newest, update)
+            self._apply_update(newest, update)
             self._applied_updates += 1
-            if newest is self._used:
+            if newest is self._map_in_use:
                 self.change()
 
-    def _update(self, received: Received, update: MapUpdate) -> None:
+    def _apply_update(self, received: Received, update: MapUpdate) -> None:
+        """Change a received map, also its message; a ValueError refuses the update."""
         values = values_of_update(received.message, update)
         received.grid = self._patched(received.grid, values, update.x, update.y)
-        # In place, for the day when a parameter changes and the map is read anew.
+        # When a parameter changes, the map is read anew from the message.
         rows = slice(update.y, update.y + update.height)
         columns = slice(update.x, update.x + update.width)
         occupancy_values(received.message)[rows, columns] = values
         received.header = update.header
-        received.came = self.arrivals.note()
+        received.time = self.arrivals.note()
 
-    def look(self) -> None:
-        """Plan on a map that has come, unless it has to wait for directions."""
-        received = self._waiting
+    def use_waiting_map(self) -> None:
+        """Plan on the newer map that waits, if one waits, unless it still has to."""
+        received = self._waiting_map
         if received is None:
             return
-        reason = self.directions.missing or self._direct(received)
+        reason = self._reason_to_wait(received)
         if reason:
-            self._let_wait(reason)
+            self._refuse_waiting_map(reason)
             return
-        self._used = received
-        self._waiting = None
+        self._map_in_use = received
+        self._waiting_map = None
         self._waiting_since = math.inf
         self._logged_reason = ""
         self._log_size(received.grid)
         self._diagnostics.ok("map")
         self.change()
 
+    def _reason_to_wait(self, received: Received) -> str:
+        """Apply the directions to a map; return why it has to wait, or an empty text."""
+        if self.directions.required:
+            return self.directions.required
+        reason = self.directions.wait_for_new_publisher()
+        if reason:
+            return reason
+        return self._apply_directions(received)
+
     def _log_size(self, grid: GridMap) -> None:
         """Log the size and the frame of the map in use when they change."""
         cells = f"{grid.width} x {grid.height} cells of {grid.resolution:.6g} m"
         size = f"{cells} in frame {self.frame!r}"
-        if size != self._size:
-            self._size = size
+        if size != self._logged_size:
+            self._logged_size = size
             self._node.get_logger().info(f"map of {size}")
 
-    def _let_wait(self, reason: str) -> None:
-        """Refuse the map that waits; log why, once, if it waits for long."""
+    def _refuse_waiting_map(self, reason: str) -> None:
+        """Report in the diagnostics why a map waits; log the reason if it lasts.
+
+        Live maps wait for the same reason with other numbers each time, such as their
+        yaw: the reason is logged once.
+        """
         now = self._clock()
         self._waiting_since = min(self._waiting_since, now)
         is_lasting = now - self._waiting_since >= PUBLISHER_WAIT
@@ -370,18 +418,29 @@ class MapSource:
             self._diagnostics.refuse("map", reason, log=False)
 
     def _on_directions(self) -> None:
-        """Obey other directions on the map in use, or let it wait for them."""
-        used = self._used
-        if used is not None:
-            if self.directions.required or self._direct(used):
-                self._waiting = self._waiting or used
-                self._used = None
+        """Obey new directions, or another demand for them, on the maps received.
+
+        A map in use that must not be used without its directions waits again, unless a
+        newer one waits.
+        """
+        received = self._map_in_use
+        if received is not None:
+            reason = self.directions.required or self._apply_directions(received)
+            if reason:
+                self._waiting_map = self._newest_map
+                self._map_in_use = None
             else:
                 self.change()
-        self.look()
+        self.use_waiting_map()
 
-    def _direct(self, received: Received) -> str:
-        """Apply the directions to a map; return why the map cannot be used, if so."""
+    def _apply_directions(self, received: Received) -> str:
+        """Set which actions the directions forbid on a received map.
+
+        Returns
+        -------
+        Why the map must not be used, in words; empty if it may be used. It may be used
+        without directions that cannot hold on it, unless they are required.
+        """
         try:
             received.forbidden = self.directions.on(
                 received.grid, received.header.frame_id
@@ -397,6 +456,7 @@ class MapSource:
 
 
 def _place(message: OccupancyGrid) -> MapPlace:
+    """Return where the cells of a map message lie; equal for two maps to be compared."""
     info = message.info
     return MapPlace(
         message.header.frame_id,

@@ -44,15 +44,18 @@ def values_of_update(message: OccupancyGrid, update: MapUpdate) -> NDArray[np.in
         If the update does not belong to the map; with the remedy.
     """
     _check_header(message.header, update.header)
+    x = update.x
+    y = update.y
     width = update.width
     height = update.height
-    map_width: int = message.info.width
-    map_height: int = message.info.height
+    map_width = message.info.width
+    map_height = message.info.height
     size = f"{width} x {height} cells"
-    fits_columns = 0 <= update.x < update.x + width <= map_width
-    fits_rows = 0 <= update.y < update.y + height <= map_height
+    # The box has a cell, and the map has all cells of the box.
+    fits_columns = 0 <= x < x + width <= map_width
+    fits_rows = 0 <= y < y + height <= map_height
     if not fits_columns or not fits_rows:
-        box = f"an update of {size} from {(update.x, update.y)}"
+        box = f"an update of {size} from {(x, y)}"
         wrong = f"{box} is not inside the map of {map_width} x {map_height}"
         raise ValueError(f"{wrong}; {REMEDY}")
     if len(update.data) != width * height:
@@ -62,8 +65,12 @@ def values_of_update(message: OccupancyGrid, update: MapUpdate) -> NDArray[np.in
 
 
 def _check_header(map_header: Header, update_header: Header) -> None:
-    frame: str = update_header.frame_id
-    map_frame: str = map_header.frame_id
+    """Check that an update is of its map's frame, and has no earlier stamp than it.
+
+    An update without a stamp passes. A ValueError names the remedy.
+    """
+    frame = update_header.frame_id
+    map_frame = map_header.frame_id
     if frame != map_frame:
         frames = f"the update's frame is {frame!r}, the map's is {map_frame!r}"
         raise ValueError(f"{frames}; use one")

@@ -351,7 +351,7 @@ def test_a_map_waits_a_second_for_a_publisher_that_sends_nothing(
         assert source.on_map(stamp) == NOTHING
         assert source.is_settling
     now[0] += 0.02
-    source.look()
+    source.use_waiting_map()
     assert source.used() == (3, None)
     assert not source.is_settling
     assert source.on_map(4) == (4, None)  # it does not wait again
@@ -449,7 +449,7 @@ def test_why_a_map_waits_for_directions_is_logged_once(
             assert "map" in source.diagnostics.refused
             source.now += 0.5
         source.now += 2.0
-        source.look()
+        source.use_waiting_map()
         return logged
 
     set_parameters(require_directions=True)
@@ -469,13 +469,13 @@ def test_why_a_map_waits_for_directions_is_logged_once(
     logged.clear()
     assert source.on_map(21, frame="odom") == (20, EAST)
     source.now += 0.5
-    source.look()
+    source.use_waiting_map()
     assert source.on_map(22) == (22, EAST)
     source.now += 5.0
     assert source.on_map(23, frame="odom") == (22, EAST)
     assert not logged
     source.now += 1.0
-    source.look()
+    source.use_waiting_map()
     assert len(logged) == 1
 
 
