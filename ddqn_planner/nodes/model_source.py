@@ -2,9 +2,10 @@
 
 import gc
 import threading
-from typing import Any
+from typing import NamedTuple
 
 from rclpy.task import Future
+from std_msgs.msg import MultiArrayLayout
 
 from ddqn_planner.model import find_model
 from ddqn_planner.model.certificate import NO_CERTIFICATE
@@ -14,100 +15,150 @@ from ddqn_planner.nodes.worker import Worker
 from ddqn_planner.planning import Planner
 from ddqn_planner.warm_up import warm_up
 
-# Seconds until the rest is compiled: what waits for the model is planned first.
+# Seconds from the loading of a model to the compilation of what few requests need: what
+# waits for the model is planned first.
 REST_AFTER = 1.0
+# Python collects garbage after this number of new objects, not after 700: to compile
+# and to plan makes hardly any garbage.
+NEW_OBJECTS = 20_000
 
 
-def read_model(model: str) -> tuple[Planner, str]:
-    """Return a model's planner and file."""
-    path = find_model(model)
-    return Planner.load(path), str(path)
+class ModelOfFile(NamedTuple):
+    """A planner with a model, and the model's file."""
+
+    planner: Planner
+    file: str
+
+
+class FirstModel(NamedTuple):
+    """The node's first model, or why it could not be loaded."""
+
+    model: ModelOfFile | None
+    problem: str = ""
+
+
+def read_model(name: str) -> ModelOfFile:
+    """Read a model, by a shipped model's name or by the path of its file."""
+    path = find_model(name)
+    return ModelOfFile(Planner.load(path), str(path))
 
 
 class ModelSource:
-    """Has the planner with the last model that could be loaded, and its file."""
+    """Has the planner with the last model that could be loaded, and its file.
+
+    Parameters
+    ----------
+    node
+        The planner's node, with its parameters.
+    diagnostics
+        Where a model that cannot be loaded is reported.
+    worker
+        Its thread loads the first model.
+    """
 
     def __init__(
         self, node: BaseNode, diagnostics: PlannerDiagnostics, worker: Worker
     ) -> None:
         self.planner: Planner | None = None
         self.file = ""
-        self.layout: Any = None  # of the message that the model came in
-        self._node, self.diagnostics, self._worker = node, diagnostics, worker
-        # The first model, while it is being loaded.
+        # Of the trainer's message that the model came in; it holds the digest.
+        self.layout: MultiArrayLayout | None = None
+        self._node = node
+        self.diagnostics = diagnostics
+        self._worker = worker
         self.loading: Future | None = None
+        """Of the `FirstModel`, until `wait_until_loaded` uses or refuses it."""
 
     def load(self) -> None:
         """Begin to load the first model, and to compile what many requests need."""
+        self.loading = self._worker.call(self._load_and_compile)
 
-        def read() -> tuple[Planner | None, str]:
-            try:
-                planner, file = read_model(self._node.value("model"))
-                compiling = warm_up(planner, self._node.value("follow_trainer"))
-                # To compile and to plan makes hardly any garbage.
-                gc.set_threshold(20_000)
-                next(compiling)
-            except Exception as error:
-                return (
-                    None,
-                    f"{str(error) or repr(error)}; or set the parameter 'model'",
-                )
-            gc.freeze()  # a collection of all that would stop the node for 45 ms
-            rest = threading.Timer(REST_AFTER, next, [compiling])
-            rest.daemon = True  # no end of the process waits for it
-            rest.start()
-            return planner, file
+    def _load_and_compile(self) -> FirstModel:
+        """Load the model that the parameters name, in the worker's thread."""
+        try:
+            model = read_model(self._node.value("model"))
+            compiling = warm_up(model.planner, self._node.value("follow_trainer"))
+            gc.set_threshold(NEW_OBJECTS)
+            next(compiling)
+        except Exception as error:
+            problem = str(error) or repr(error)
+            return FirstModel(None, f"{problem}; or set the parameter 'model'")
+        # A collection of all objects that exist now would stop the node for 45 ms.
+        gc.freeze()
+        rest = threading.Timer(REST_AFTER, next, [compiling])
+        rest.daemon = True  # the end of the process does not wait for it
+        rest.start()
+        return FirstModel(model)
 
-        self.loading = self._worker.call(read)
+    async def wait_until_loaded(self) -> None:
+        """Wait for the first model, if it is still being loaded, and plan with it.
 
-    async def first(self) -> None:
-        """Wait for the first model, and use it unless another one was set since."""
-        if (loading := self.loading) is None:
+        A model that cannot be loaded is refused. If another model was set while this
+        function waited, the first one is dropped.
+        """
+        loading = self.loading
+        if loading is None:
             return
-        planner, said = await loading
-        if self.loading is loading and planner is not None:
-            self.use(planner, said)
-        elif self.loading is loading:
+        first: FirstModel = await loading
+        if self.loading is not loading:
+            return
+        if first.model is None:
             self.loading = None
-            self.diagnostics.refuse("model", said)
+            self.diagnostics.refuse("model", first.problem)
+        else:
+            self.use(first.model.planner, first.model.file)
 
-    def use(self, planner: Planner, file: str, layout: Any = None) -> None:
-        """Plan with it from now on."""
-        self.planner, self.file, self.layout, self.loading = planner, file, layout, None
+    def use(
+        self, planner: Planner, file: str, layout: MultiArrayLayout | None = None
+    ) -> None:
+        """Plan with a model of a file, or of a message of this layout, from now on."""
+        self.planner = planner
+        self.file = file
+        self.layout = layout
+        self.loading = None
         self.diagnostics.ok("model")
         self.diagnostics.change()
         self._node.get_logger().info(f"planning with the model {file}")
 
     def on_reload(self) -> tuple[bool, str]:
-        """Load the file of the model again."""
-        parameter = self._node.get_parameter("model")  # to set it loads the model
-        if reason := str(self._node.set_parameters([parameter])[0].reason):
-            self._node.get_logger().error(f"the model was not loaded again: {reason}")
-        return not reason, reason or f"loaded {self.file}"
+        """Load the file of the model again; return success and a message."""
+        # To set the parameter loads the model, also if it has that value already.
+        result = self._node.set_parameters([self._node.get_parameter("model")])[0]
+        if not result.successful:
+            reason = f"the model was not loaded again: {result.reason}"
+            self._node.get_logger().error(reason)
+            return False, result.reason
+        return True, f"loaded {self.file}"
 
     def describe(self, rule: str) -> dict[str, str]:
-        """Return what the diagnostics say of it, with the value of the parameter ``move_rule``."""
-        description = {"model": self._node.value("model")}
+        """Return the diagnostics' values about the model.
+
+        Parameters
+        ----------
+        rule
+            The parameter ``move_rule``; empty for the model's own.
+        """
+        values: dict[str, str] = {"model": self._node.value("model")}
         if self.planner is None:
-            return description
-        metadata, network = self.planner.metadata, self.planner.network
-        if body := self.planner.pose_planner:
-            description["model footprint (m)"] = str(body.footprint.tolist())
-        return description | {
-            "model file": self.file,
-            "move rule": rule or metadata.move_rule.value,
-            "model move rule": metadata.move_rule.value,
-            "model sizes": ", ".join(
-                f"{key} {size}" for key, size in metadata.sizes.items()
-            ),
-            "model training steps": str(metadata.steps),
-            "model certificate": str(
-                network.certificate(metadata.move_rule) or NO_CERTIFICATE
-            ),
-        }
+            return values
+        metadata = self.planner.metadata
+        pose_planner = self.planner.pose_planner
+        if pose_planner is not None:
+            values["model footprint (m)"] = str(pose_planner.footprint.tolist())
+        sizes = [f"{name} {size}" for name, size in metadata.sizes.items()]
+        certificate = self.planner.network.certificate(metadata.move_rule)
+        values["model file"] = self.file
+        values["move rule"] = rule or metadata.move_rule.value
+        values["model move rule"] = metadata.move_rule.value
+        values["model sizes"] = ", ".join(sizes)
+        values["model training steps"] = str(metadata.steps)
+        values["model certificate"] = str(certificate or NO_CERTIFICATE)
+        return values
 
     def forget(self) -> None:
-        """Free the model and its fields, with what `read` kept from collection."""
-        self.planner, self.file, self.loading = None, "", None
+        """Free the model and its fields, also objects that loading it has frozen."""
+        self.planner = None
+        self.file = ""
+        self.loading = None
         gc.unfreeze()
         gc.collect()

@@ -176,7 +176,7 @@ class PlannerNode(ManagedNode):
         """Load the model before ``configure``; refuse waiting requests before a stop."""
         if transition == "configure":
             self._model.load()
-            await unless(self._model.first(), lambda: self.is_stopping)
+            await unless(self._model.wait_until_loaded(), lambda: self.is_stopping)
             return self._model.planner is not None and not self.is_stopping
         if transition != "activate":
             self._refuse(NOT_ACTIVE)
@@ -282,7 +282,7 @@ class PlannerNode(ManagedNode):
 
         The node becomes active with its first model.
         """
-        await self._model.first()
+        await self._model.wait_until_loaded()
         if self._refusal is None and self.state == "inactive":
             self.change("activate")
         active = self._active

@@ -223,7 +223,7 @@ class Requests:
         """Wait for the map, ready to plan on, and for the planner."""
         header = await self._wait_for(self.map.check)
         ready = self.map.ready()
-        await self.model.first()
+        await self.model.wait_until_loaded()
         planner = self.model.planner
         if planner is None:
             reason = self.model.diagnostics.refused["model"]
