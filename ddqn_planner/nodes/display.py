@@ -32,23 +32,21 @@ COLOUR = ColorRGBA(r=0.13, g=0.13, b=0.23, a=0.9)
 
 
 class Picture(NamedTuple):
-    """What the topics show of an outcome; empty when its goal is gone."""
+    """What the topics show: the field of an outcome, or its plan's outlines."""
 
     outcome: Outcome
     header: Header
-    is_empty: bool
+    is_empty: bool  # whether the outcome's goal is gone, and nothing is shown
 
     @property
     def subject(self) -> tuple[object, ...]:
-        """What differs between two pictures.
-
-        The goal is part of it, as two goals may have the same field.
-        """
+        """What is shown: two pictures with equal subjects look the same."""
         request = self.outcome.request
         plan = self.outcome.plan
         grid = None if request is None else request.grid
         planner = None if self.is_empty else self.outcome.planner
-        path: object = plan if isinstance(plan, PosePlan) else None
+        # For bodies each plan's outlines are shown, for cells the field of a goal.
+        path = plan if isinstance(plan, PosePlan) else None
         move_rule = request.move_rule if isinstance(request, PlanRequest) else None
         return planner, grid, plan.goal, self.outcome.goal, path, move_rule
 
@@ -66,7 +64,7 @@ class Topic(NamedTuple):
 class FieldDisplay:
     """Publishes ``~/value`` and ``~/footprints`` while somebody subscribes to them."""
 
-    # Its worker, which publishes, has no other calls: neither requests nor maps wait
+    # Its worker, which publishes, has no other tasks: neither requests nor maps wait
     # for a field that is only shown.
     def __init__(self, node: Node, worker: Worker) -> None:
         self._logger = node.get_logger()
@@ -76,7 +74,7 @@ class FieldDisplay:
         self._published: dict[str, Picture | None] = {
             topic.name: None for topic in TOPICS
         }
-        matched = PublisherEventCallbacks(matched=self._look)
+        matched = PublisherEventCallbacks(matched=self._publish_later)
         self._publishers = {
             topic.name: node.create_publisher(
                 topic.message_type,
@@ -88,7 +86,7 @@ class FieldDisplay:
         }
 
     def show(self, outcome: Outcome) -> None:
-        """Show an outcome from now on; an empty picture if it has no goal."""
+        """Show an outcome from now on, or nothing if the outcome has no goal."""
         last = self._picture
         if outcome.plan.goal is not None:
             picture = Picture(outcome, outcome.header, is_empty=False)
@@ -98,18 +96,20 @@ class FieldDisplay:
             return
         if last is None or picture.subject != last.subject:
             self._picture = picture
-            self._look()
+            self._publish_later()
 
-    def _look(self, _: object = None) -> None:
+    def _publish_later(self, _: object = None) -> None:
+        """Let the worker publish what has changed, as when a subscription came."""
         self._worker.call(self._publish)
 
     def _publish(self) -> None:
+        """Publish the picture on the topics that do not show it yet; log failures."""
         for topic in TOPICS:
             picture = self._picture
             if picture is None:
                 return
             try:
-                self._update(topic, picture)
+                self._publish_on(topic, picture)
             except InvalidHandle:  # cleaned up meanwhile
                 return
             # As when no memory is left: the node must survive.
@@ -117,20 +117,26 @@ class FieldDisplay:
                 reason = f"no {topic.name} is shown ({error!r})"
                 self._logger.error(f"{reason}; give a smaller map")
 
-    def _update(self, topic: Topic, picture: Picture) -> None:
-        """Publish a picture on a topic, unless the topic shows it already."""
+    def _publish_on(self, topic: Topic, picture: Picture) -> None:
+        """Publish a picture on a topic, unless the topic shows it already.
+
+        The topic of the other kind of robot, with or without a body, shows nothing.
+        """
         has_body = isinstance(picture.outcome.plan, PosePlan)
         is_empty = picture.is_empty or has_body != topic.is_for_bodies
         visible = None if is_empty else picture
+        if visible is self._published[topic.name]:
+            return
         publisher = self._publishers[topic.name]
         # A latched picture is cleared even if nobody subscribes now.
-        is_wanted = is_empty or publisher.get_subscription_count() > 0
-        if visible is self._published[topic.name] or not is_wanted:
+        if not is_empty and publisher.get_subscription_count() == 0:
             return
         # First, so that a picture that cannot be made is not tried again each time.
         self._published[topic.name] = visible
-        make = topic.make_empty_message if is_empty else topic.make_message
-        publisher.publish(make(picture))
+        if is_empty:
+            publisher.publish(topic.make_empty_message(picture))
+        else:
+            publisher.publish(topic.make_message(picture))
 
 
 def value_message(field: QField | None, grid: GridMap, header: Header) -> OccupancyGrid:
@@ -149,13 +155,14 @@ def value_message(field: QField | None, grid: GridMap, header: Header) -> Occupa
     -------
     The message: 100 at the goal, 0 at the lowest value, -1 without a value.
     """
-    percent = np.full(grid.occupancy.shape, -1, dtype=np.int8)
+    percent = np.full(grid.occupancy.shape, -1, dtype=np.int8)  # (H, W)
     if field is not None:
         has_value = np.isfinite(field.value) & ~grid.occupancy  # (H, W)
         values = field.value[has_value]  # (N,)
         if len(values):
-            limits = (values.min(), values.max())
-            percent[has_value] = np.rint(np.interp(values, limits, (0, 100)))
+            lowest_and_goal = (values.min(), values.max())
+            percent_of_values = np.interp(values, lowest_and_goal, (0, 100))
+            percent[has_value] = np.rint(percent_of_values)
     return occupancy_message(percent, grid.resolution, grid.origin, header)
 
 
@@ -175,20 +182,33 @@ def outlines_along(poses: Float64, footprint: Float64) -> Float64:
         Corners in the map's frame: of the first pose, and of the first pose after each
         `OUTLINE_SPACING` of the path.
     """
-    x, y, yaw = poses.T
-    turns = np.abs(turn_between(yaw[:-1], yaw[1:]))  # (N - 1,) radians
-    steps = np.hypot(np.diff(x), np.diff(y)) + turns * METRES_PER_RADIAN
-    intervals = np.cumsum(steps) // OUTLINE_SPACING  # the number of each step's end
-    is_first = np.diff(intervals, prepend=0) > 0
-    x, y, yaw = poses[np.append(True, is_first)].T[..., None]  # (M, 1) each
-    ahead, aside = footprint.T  # (K,) each
-    corner_x = x + (np.cos(yaw) * ahead - np.sin(yaw) * aside)  # (M, K)
-    corner_y = y + (np.sin(yaw) * ahead + np.cos(yaw) * aside)
+    outlined_poses = poses[_is_outlined(poses)]  # (M, 3)
+    # As columns (M, 1), which with the rows (K,) of the footprint make (M, K).
+    x = outlined_poses[:, :1]
+    y = outlined_poses[:, 1:2]
+    cos = np.cos(outlined_poses[:, 2:])
+    sin = np.sin(outlined_poses[:, 2:])
+    ahead, aside = footprint.T
+    corner_x = x + (cos * ahead - sin * aside)
+    corner_y = y + (sin * ahead + cos * aside)
     return np.stack([corner_x, corner_y], axis=-1)
 
 
+def _is_outlined(poses: Float64) -> NDArray[np.bool_]:
+    """Return at which poses (N, 3) of a path an outline is drawn, (N,) bool."""
+    x, y, yaw = poses.T
+    turns = np.abs(turn_between(yaw[:-1], yaw[1:]))  # (N - 1,) radians
+    steps = np.hypot(np.diff(x), np.diff(y))  # (N - 1,) metres
+    distance = np.cumsum(steps + turns * METRES_PER_RADIAN)  # from the first pose
+    # The path is divided into intervals of the spacing. An outline is drawn at the
+    # first pose of the path, and at the first pose in each later interval.
+    interval = distance // OUTLINE_SPACING  # (N - 1,), the number of the interval
+    is_first = np.diff(interval, prepend=0) > 0
+    return np.append(True, is_first)
+
+
 def footprint_message(outlines: Float64, header: Header) -> MarkerArray:
-    """Make a message with the lines of outlines (M, K, 2)."""
+    """Make a message that draws outlines, (M, K, 2) metres, as lines."""
     marker = _marker(header, Marker.ADD)
     for outline in outlines.tolist():
         # The lines share their points, because most of the time goes into making
@@ -201,6 +221,7 @@ def footprint_message(outlines: Float64, header: Header) -> MarkerArray:
 
 
 def _marker(header: Header, action: int) -> Marker:
+    """Make a marker of the lines without points, to be added or deleted."""
     marker = Marker(header=header, ns="footprints", type=Marker.LINE_LIST, color=COLOUR)
     marker.action = action
     marker.pose.position.z = HEIGHT
