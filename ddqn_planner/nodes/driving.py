@@ -57,7 +57,8 @@ class DrivingRobot:
     name
         The robot's namespace; empty for the node's own robot.
     on_drive
-        Called with words for the robot, such as " by r1", and with each drive.
+        Called with each drive, after words for the robot such as " by r1" (empty for
+        the node's own robot).
     """
 
     def __init__(
@@ -87,54 +88,55 @@ class DrivingRobot:
             listen(node, f"{self._prefix}odom", 1000, node.diagnostics, self._on_pose)
 
     def _on_pose(self, pose: PoseStamped) -> None:
-        """Record a pose; a ValueError refuses it."""
+        """Record a pose, unless there is no map; a ValueError refuses the pose."""
         seconds = Time.from_msg(pose.header.stamp).nanoseconds / 1e9
         position = self._position("the robot's pose", pose)
         if position is None:
             return
-        if not seconds:
+        if seconds == 0:
             raise ValueError("the robot's pose has no stamp; give it the time")
         self.recorder.add(seconds, *position)
 
     def _look_up(self) -> None:
-        """Record the pose that TF has now."""
-        on_map = self._node.map
-        if on_map is None:
+        """Record the robot's pose by TF, or refuse it in the diagnostics."""
+        map_in_frame = self._node.map
+        if map_in_frame is None:
             return
         topic = f"{self._prefix}tf"
         with self._node.diagnostics.receiving(topic, is_frequent=True):
             frame = f"{self._prefix}{self._node.value('robot_frame')}".lstrip("/")
             try:
-                pose = self._frames.origin_of(frame, on_map.frame)
+                pose = self._frames.origin_of(frame, map_in_frame.frame)
             except ValueError as error:
                 raise ValueError(f"{error}, or set robot_frame") from None
             self._on_pose(pose)
 
     def _on_goal(self, goal: PoseStamped) -> None:
+        """Remember where the robot drives to, unless there is no map."""
         position = self._position("the goal", goal)
         if position is not None:
             self.recorder.set_goal(*position)
 
     def _position(self, name: str, pose: PoseStamped) -> tuple[float, float] | None:
-        """Return the position of a pose in the map's frame, metres.
+        """Return x and y of a pose in the map's frame, metres; None without a map.
 
-        None without a map. A ValueError refuses the pose, which it calls by its name.
+        A ValueError says why the pose cannot be used, and calls the pose by its name.
         """
-        on_map = self._node.map
-        if on_map is None:
+        map_in_frame = self._node.map
+        if map_in_frame is None:
             return None
-        position = self._frames.to_map(name, pose, on_map.frame).pose.position
+        position = self._frames.to_map(name, pose, map_in_frame.frame).pose.position
         return position.x, position.y
 
     def _on_status(self, message: GoalStatusArray) -> None:
-        """End the drive where the robot's navigation aborts a goal."""
+        """End the drive as aborted once the robot's navigation has aborted a goal."""
         aborted_goals = {
             bytes(status.goal_info.goal_id.uuid)
             for status in message.status_list
             if status.status == GoalStatus.STATUS_ABORTED
         }
         if self._aborted_goals is None:
-            # What failed before the node listened failed elsewhere.
+            # Goals that failed before the node listened end no drive of now.
             self._aborted_goals = aborted_goals
             return
         if aborted_goals - self._aborted_goals:
@@ -146,10 +148,11 @@ class DrivingRobot:
         positions = {"robot": self.recorder.position, "goal": self.recorder.goal}
         lines: dict[str, str] = {}
         for role, position in positions.items():
-            words = "unknown"
+            key = f"{role} {self._name}".rstrip()
+            lines[key] = "unknown"
             if position:
-                words = f"({position[0]:.6g}, {position[1]:.6g})"
-            lines[f"{role} {self._name}".rstrip()] = words
+                x, y = position
+                lines[key] = f"({x:.6g}, {y:.6g})"
         return lines
 
 
@@ -160,46 +163,53 @@ class Driving:
         self._node = node
         self._folder: DriveFolder | None = None  # while drives are recorded
         self._lines = {"last drive": ""}  # of the diagnostics
-        self._is_disk_full = False
-        self._shown: GridMap | None = None
+        self._is_disk_full = False  # whether the last start could not write its files
+        # The map whose slowness was published last; None: the slowness has changed.
+        self._grid_of_slowness: GridMap | None = None
         self._slowness = node.create_publisher(OccupancyGrid, "~/slowness", LATCHED)
         frames = Frames(node)
         names: list[str] = node.value("robots")
         self.robots = [
             DrivingRobot(node, frames, name, self._on_drive) for name in names
         ]
-        self._is_speed_wrong = False
+        self._is_speed_wrong = False  # whether the last warning of it still holds
+        # Places with evidence when the training of the prior last began.
         self._places_of_prior = 0
         group = MutuallyExclusiveCallbackGroup()  # the callback awaits the worker
         self._prior_timer = node.create_timer(
             1.0, self.train_prior, group, clock=STEADY
         )
+        node.create_timer(1.0, self._on_second, clock=STEADY)
         self.start()
 
     def _on_drive(self, by_robot: str, drive: Drive) -> None:
-        on_map = self._node.map
+        """Record a drive, learn from it, and draw it.
+
+        `by_robot` says in the log whose drive it is, such as " by r1".
+        """
+        map_in_frame = self._node.map
         folder = self._folder
-        if on_map is None or folder is None:
+        if map_in_frame is None or folder is None:
             return
         try:
-            learned = folder.add(drive, on_map.grid)
+            learned = folder.add(drive, map_in_frame.grid)
         except Exception as error:  # the node must survive
             self._node.fail("the drive could not be learned from", error)
             return
-        words = (
-            f"{folder.drives}{by_robot}: {drive.metres:.1f} m, {drive.outcome.value}"
-        )
+        end = f"{drive.metres:.1f} m, {drive.outcome.value}"
+        description = f"{folder.drives}{by_robot}: {end}"
         if learned:
-            self._node.get_logger().info(f"drive {words}")
+            self._node.get_logger().info(f"drive {description}")
         else:
-            words = f"{words}; it taught nothing: {learned.reason}"
-            self._node.get_logger().warning(f"drive {words}")
-        self._lines["last drive"] = words
-        self._node.draw(on_map.frame, drive.positions)
+            description += f"; it taught nothing: {learned.reason}"
+            self._node.get_logger().warning(f"drive {description}")
+        self._lines["last drive"] = description
+        self._node.draw(map_in_frame.frame, drive.positions)
 
     def _on_saved(self, folder: DriveFolder) -> None:
+        """Publish what was saved, or why that failed, after each attempt."""
         experience = folder.experience
-        self._shown = None
+        self._grid_of_slowness = None
         self._check_speed(folder)
         self._lines["drives"] = str(folder.drives)
         self._lines["learned speed (m/s)"] = f"{experience.learned_speed:.3f}"
@@ -210,12 +220,14 @@ class Driving:
         )
 
     def _check_speed(self, folder: DriveFolder) -> None:
-        """Warn when the nominal speed turns out to be wrong."""
+        """Warn once when drives show that the nominal speed is wrong."""
         experience = folder.experience
+        # Log slowness is 0 where the robot drives at the nominal speed.
         population = experience.evidence.population
-        # Where most places are slow, the fastest places are slow, too, if the robot is.
+        is_faster = population.open_log < -WRONG_SPEED
+        # Many places may be slow. If even the fastest are, it is the robot that is.
         is_slower = population.fastest_log > WRONG_SPEED
-        is_wrong = population.open_log < -WRONG_SPEED or is_slower
+        is_wrong = is_faster or is_slower
         if is_wrong and not self._is_speed_wrong:
             speeds = (
                 f"the robot drives {experience.learned_speed:.3g} m/s in the open, "
@@ -226,9 +238,9 @@ class Driving:
 
     async def train_prior(self) -> None:
         """Train the prior, and again once drives have shown a tenth more places."""
-        on_map = self._node.map
+        map_in_frame = self._node.map
         folder = self._folder
-        if on_map is None or folder is None:
+        if map_in_frame is None or folder is None:
             return
         evidence = folder.experience.evidence
         places = len(evidence.places)
@@ -237,10 +249,10 @@ class Driving:
         self._places_of_prior = places
         seed: int = self._node.value("seed")
         try:
-            # A copy, as drives change it meanwhile.
+            # A copy of the places, as drives change them meanwhile.
             prior: Prior | None = await self._node.worker.call(
                 _trained_prior,
-                on_map.grid,
+                map_in_frame.grid,
                 copy.deepcopy(evidence.places),
                 evidence.prior,
                 seed,
@@ -258,31 +270,43 @@ class Driving:
             folder.try_to_save()
 
     def _is_prior_due(self, places: int) -> bool:
+        """Return whether to train the prior, with a number of places with evidence."""
         if places == 0:
             return False
         was_forgotten = places < self._places_of_prior
         return was_forgotten or places >= MORE_PLACES * self._places_of_prior
 
     def _show_slowness(self) -> None:
-        on_map = self._node.map
+        """Publish the slowness on the map if it is new and somebody subscribes.
+
+        The message has 0 at the nominal speed, 100 at `SLOWEST`, on a log scale.
+        """
+        map_in_frame = self._node.map
         folder = self._folder
-        if on_map is None or folder is None or self._shown is on_map.grid:
+        if (
+            map_in_frame is None
+            or folder is None
+            or self._grid_of_slowness is map_in_frame.grid
+        ):
             return
         if not self._slowness.get_subscription_count():
             return
-        grid = on_map.grid
-        self._shown = grid
+        grid = map_in_frame.grid
+        self._grid_of_slowness = grid
         slowness = folder.experience.slowness(grid)  # (H, W), 1 at the nominal speed
         percent = 100 * np.log(slowness) / np.log(SLOWEST)
         percent = np.clip(percent, 0, 100).round()
         percent[grid.occupancy] = -1
-        header = self._node.header(on_map.frame)
+        header = self._node.header(map_in_frame.frame)
         self._slowness.publish(
             occupancy_message(percent, grid.resolution, grid.origin, header)
         )
 
     def start(self) -> Answer:
-        """Record drives; those of before are forgotten where they were not complete."""
+        """Record drives in the folder of the parameters.
+
+        What robots drove before, without an end, is no part of the first drives.
+        """
         node = self._node
         if self._folder is not None:
             return Answer(False, "drives are being recorded already; call ~/stop first")
@@ -353,18 +377,21 @@ class Driving:
         done = f"forgot all but the drives. {backup} has what was known"
         return Answer(True, f"{done}: {undo}")
 
-    def recorded(self, file: Path, on_map: MapInFrame) -> Recording:
-        """Return the drives of a file."""
+    def recorded(self, file: Path, map_in_frame: MapInFrame) -> Recording:
+        """Return the drives of a file, of which the map has the frame."""
         paths = (drive.positions[::REPLAY_STRIDE] for drive in read_drives(file))
-        return Recording(on_map.frame, paths)
+        return Recording(map_in_frame.frame, paths)
 
-    def look(self) -> dict[str, str]:
-        """Save again after a full disk, show the slowness; return diagnostics."""
+    def _on_second(self) -> None:
+        """Try again what a full disk prevented, and show the slowness."""
         if self._folder is not None and self._folder.save_error:
             self._folder.try_to_save()
         elif self._node.state == "failed" and self._is_disk_full:
             self.start()
         self._show_slowness()
+
+    def describe(self) -> dict[str, str]:
+        """Return the lines of the diagnostics about the drives and the robots."""
         for robot in self.robots:
             self._lines |= robot.describe()
         return self._lines
@@ -373,6 +400,7 @@ class Driving:
 def _trained_prior(
     grid: GridMap, places: Places, older: Prior | None, seed: int
 ) -> Prior | None:
+    """Return a prior that places on a map have taught, from the older prior on."""
     from ddqn_planner.training.prior_training import prior_of  # it imports torch
 
     return prior_of(grid, places, older, seed)

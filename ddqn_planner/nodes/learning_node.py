@@ -54,16 +54,20 @@ class Learner(Protocol):
         """Begin to learn, or continue."""
 
     def stop(self) -> Answer:
-        """Save, and learn no more."""
+        """Save, and stop learning."""
 
     def save(self) -> Answer:
-        """Save."""
+        """Save what was learned."""
 
-    def recorded(self, file: FilePath, on_map: MapInFrame) -> Recording:
-        """Return the paths of a file; they lie on a map unless it is known better."""
+    def recorded(self, file: FilePath, map_in_frame: MapInFrame) -> Recording:
+        """Return the paths of a file.
 
-    def look(self) -> dict[str, str]:
-        """Do what is due each second; return lines for the diagnostics."""
+        They are taken to lie on the map given, except where the learner knows the map
+        that they were recorded on.
+        """
+
+    def describe(self) -> dict[str, str]:
+        """Return lines for the diagnostics."""
 
     def close(self) -> None:
         """Stop, and wait until everything is saved."""
@@ -116,14 +120,16 @@ class LearningNode(BaseNode):
         error
             Why it cannot be saved; empty if it is saved. It is logged once.
         """
-        self._products.publish(bytes_message(self._product, data))
-        if error and not self.save_error:
-            self.get_logger().error(error)
-        if self.save_error and not error:
-            self.get_logger().info(f"the {self._product} is saved again")
+        last_error = self.save_error
         self.save_error = error
-        if not error:
-            self._saved_files.publish(String(data=str(path)))
+        self._products.publish(bytes_message(self._product, data))
+        if error:
+            if not last_error:
+                self.get_logger().error(error)
+            return
+        if last_error:
+            self.get_logger().info(f"the {self._product} is saved again")
+        self._saved_files.publish(String(data=str(path)))
 
     def draw(self, frame: str, positions: Float64) -> None:
         """Publish an episode or a drive (N, 2), unless a replay is shown."""
@@ -131,7 +137,10 @@ class LearningNode(BaseNode):
             self.publish_episode(frame, positions)
 
     def publish_episode(self, frame: str, positions: Float64) -> None:
-        """Publish an episode or a drive, (N, 2) metres; each pose faces the next."""
+        """Publish an episode or a drive, (N, 2) metres.
+
+        Each pose faces the next position, and the last pose faces as the one before.
+        """
         steps = np.diff(positions, axis=0)  # (N - 1, 2)
         yaw = np.arctan2(steps[:, 1], steps[:, 0])
         last_yaw = yaw[-1] if len(yaw) else 0.0

@@ -39,7 +39,8 @@ HYPER_PARAMETERS: Final = {
     for entry in fields(HyperParameters)
 }
 
-# Seconds that the end of the node waits for a training before its first step.
+# Seconds that the end of the node waits for a training that has not made its first
+# step.
 FIRST_STEP_PATIENCE = 0.5
 
 
@@ -61,19 +62,21 @@ class Simulation:
 
     def __init__(self, node: LearningNode, map_file: MapFile | None) -> None:
         self._node = node
-        self._poses: dict[str, PoseStamped] = {}  # of the start and the goal
+        self._poses: dict[str, PoseStamped] = {}  # by "start" and "goal"
         if map_file is not None and node.map is not None:
             self._use_poses_of(map_file, node.map.grid)
+        # The last training, also when it has ended; its map; the steps it began with.
         self._run: TrainingRun | None = None
-        self._run_map: MapInFrame | None = None
+        self._map_of_run: MapInFrame | None = None
         self._first_step = 0
         self._rewards = node.create_publisher(Float32, "~/average_reward", 100)
         for name, topic in (("start", "initialpose"), ("goal", "goal_pose")):
             listen(node, topic, 10, node.diagnostics, partial(self._on_pose, name))
-        # While the node answers already; only ~/start waits for the import.
+        # In the worker, so that the node answers; only ~/start waits for the import.
         self._imported = node.worker.call(import_training)
 
     def _use_poses_of(self, map_file: MapFile, grid: GridMap) -> None:
+        """Use the start and the goal of a map file, cells of its grid, if it has any."""
         for name, cell in (("start", map_file.start), ("goal", map_file.goal)):
             if cell is None:
                 continue
@@ -82,6 +85,10 @@ class Simulation:
             self._poses[name] = pose
 
     def _on_pose(self, name: str, stamped: PoseStamped) -> None:
+        """Use a pose as the "start" or the "goal" of the next training.
+
+        A ValueError refuses the pose.
+        """
         # A pose may come before the map: ~/start then checks its cell.
         check_pose(f"the {name}", stamped)
         if self._node.map is not None:
@@ -89,10 +96,15 @@ class Simulation:
             self._node.get_logger().info(f"the {name} is cell {cell}")
         self._poses[name] = stamped
 
-    def _cell(self, name: str, pose: PoseStamped, on_map: MapInFrame) -> Cell:
-        """Return the cell of a pose; ValueError if it is not a free cell of the map."""
-        cell = cell_from_pose(f"the {name}", pose, on_map.grid, on_map.frame)
-        if not on_map.grid.is_free(cell):
+    def _cell(self, name: str, pose: PoseStamped, map_in_frame: MapInFrame) -> Cell:
+        """Return the cell of the start's or the goal's pose.
+
+        A ValueError says that it is no free cell of the map; it calls the pose by name.
+        """
+        cell = cell_from_pose(
+            f"the {name}", pose, map_in_frame.grid, map_in_frame.frame
+        )
+        if not map_in_frame.grid.is_free(cell):
             wrong = f"the {name}'s cell {cell} is occupied or off the map"
             raise ValueError(f"{wrong}; set it on a free cell")
         return cell
@@ -103,9 +115,9 @@ class Simulation:
         node = self._node
         if node.state == "training":
             return Answer(False, "training already; call ~/stop first")
-        on_map = node.map
+        map_in_frame = node.map
         try:
-            run = self._open_run(on_map)
+            run = self._open_run(map_in_frame)
         except Exception as error:  # the node must survive any error
             return node.fail("the training cannot start", error)
         node.state = "training"
@@ -113,30 +125,35 @@ class Simulation:
         node.save_error = ""
         node.diagnostics.refused.clear()
         self._run = run
-        self._run_map = on_map
+        self._map_of_run = map_in_frame
         self._first_step = run.trainer.steps
         run.on_saved = self._tell_saved
         node.get_logger().info(run.description)
-        node.worker.call(self._train, run, on_map)
+        node.worker.call(self._train, run, map_in_frame)
         return Answer(True, run.description)
 
-    def _open_run(self, on_map: MapInFrame | None) -> TrainingRun:
-        if on_map is None:
+    def _open_run(self, map_in_frame: MapInFrame | None) -> TrainingRun:
+        """Return a training as the node's parameters, map and poses say.
+
+        It continues from the checkpoint in the output folder, if there is one. A
+        ValueError or another error says why it cannot begin.
+        """
+        if map_in_frame is None:
             raise ValueError(NO_MAP)
         if self._poses.keys() < {"start", "goal"}:
             remedy = (
                 "publish initialpose and goal_pose, or set map_file to a map with both"
             )
             raise ValueError(f"the start or the goal is unknown; {remedy}")
-        start = self._cell("start", self._poses["start"], on_map)
-        goal = self._cell("goal", self._poses["goal"], on_map)
+        start = self._cell("start", self._poses["start"], map_in_frame)
+        goal = self._cell("goal", self._poses["goal"], map_in_frame)
         # These import gymnasium and torch.
         from ddqn_planner.training.environment import Scenario
         from ddqn_planner.training.run import TrainingRun
 
         node = self._node
         move_rule = MoveRule(node.value("move_rule"))
-        scenario = Scenario(on_map.grid, start, goal, move_rule)
+        scenario = Scenario(map_in_frame.grid, start, goal, move_rule)
         parameters = hyper_parameters(vars(node.settings()))
         return TrainingRun(node.folder, [scenario], parameters, node.value("seed"))
 
@@ -144,7 +161,7 @@ class Simulation:
         """Stop the training, which saves."""
         if self._run is None or self._node.state != "training":
             return Answer(True, "no training was running")
-        self._run.asked.add("stop")
+        self._run.asked.add("stop")  # which the worker looks at after each step
         return Answer(True, "the training saves and stops, and ~/start continues it")
 
     def save(self) -> Answer:
@@ -154,10 +171,11 @@ class Simulation:
         self._run.asked.add("save")
         return Answer(True, "saving after this step; ~/model_saved or an error follows")
 
-    def _train(self, run: TrainingRun, on_map: MapInFrame) -> None:
-        """Train, in the worker, until the training has finished or is stopped."""
+    def _train(self, run: TrainingRun, map_in_frame: MapInFrame) -> None:
+        """Train until the training has finished or is stopped; the worker calls this."""
         node = self._node
-        # The executor draws where replays begin: no episode comes between their steps.
+        # Episodes are drawn in the executor's thread, in which replays begin: no
+        # episode comes between the steps of a replay.
         executor = node.executor
         assert executor is not None
         try:
@@ -165,8 +183,8 @@ class Simulation:
                 for episode in episodes:
                     self._rewards.publish(Float32(data=episode.average_reward))
                     if episode.number % node.value("episode_interval") == 0:
-                        positions = centres(episode.cells, on_map.grid)
-                        executor.create_task(node.draw, on_map.frame, positions)
+                        positions = centres(episode.cells, map_in_frame.grid)
+                        executor.create_task(node.draw, map_in_frame.frame, positions)
             end = "stopped" if "stop" in run.asked else "finished"
         except Exception as error:  # the node must survive any error
             end = "failed"
@@ -179,22 +197,27 @@ class Simulation:
         node.get_logger().info(f"the training {end}")
 
     def _tell_saved(self, run: TrainingRun) -> None:
+        """Publish and log what was saved, or why that failed, after each attempt."""
         self._node.tell_saved(run.model, run.model_path, run.save_error)
         if not run.save_error:
             place = f"step {run.saved_at} is saved in {run.checkpoint_path}"
             self._node.get_logger().info(place)
 
-    def recorded(self, file: Path, on_map: MapInFrame) -> Recording:
-        """Return the episodes of a file; those of this training lie on its own map."""
-        if self._run is not None and self._run.folder == file.parent:
-            assert self._run_map is not None
-            on_map = self._run_map
-        episodes = read_cells(file, self._node.value("episode_interval"))
-        paths = (centres(cells, on_map.grid) for cells in episodes)
-        return Recording(on_map.frame, paths)
+    def recorded(self, file: Path, map_in_frame: MapInFrame) -> Recording:
+        """Return the episodes of a file, whose cells lie on a map.
 
-    def look(self) -> dict[str, str]:
-        """Return the lines of the diagnostics."""
+        If the file is that of the last training, its own map is used in place of the
+        one given.
+        """
+        if self._run is not None and self._run.folder == file.parent:
+            assert self._map_of_run is not None
+            map_in_frame = self._map_of_run
+        episodes = read_cells(file, self._node.value("episode_interval"))
+        paths = (centres(cells, map_in_frame.grid) for cells in episodes)
+        return Recording(map_in_frame.frame, paths)
+
+    def describe(self) -> dict[str, str]:
+        """Return the lines of the diagnostics about the training."""
         lines: dict[str, str] = {}
         for name, pose in self._poses.items():
             position = pose.pose.position
@@ -208,20 +231,20 @@ class Simulation:
         return lines
 
     def close(self) -> None:
-        """Stop the training, and wait until it has saved.
-
-        The worker's import of torch has nothing to save, and is not awaited.
-        """
+        """Stop the training, if one runs, and wait until it has saved."""
         self.stop()
         run = self._run
-        if run is not None and self._node.state == "training":
+        if run is None or self._node.state != "training":
+            return
+        if run.trainer.steps > self._first_step:
+            self._node.worker.close()
+        else:
             # Before its first step a training compiles, for a minute perhaps, and has
             # nothing new to save.
-            has_news = run.trainer.steps > self._first_step
-            self._node.worker.close(None if has_news else FIRST_STEP_PATIENCE)
+            self._node.worker.close(FIRST_STEP_PATIENCE)
 
 
 def import_training() -> None:
-    """Import torch and the trainer."""
+    """Import torch and the trainer, if torch is installed."""
     with suppress(ImportError):  # without torch, ~/start says what is missing
         import_module("ddqn_planner.training.run")

@@ -143,7 +143,7 @@ class TrainerNode(LearningNode):
 
     def _on_look(self) -> None:
         """Publish the state, refusals and failures, and what is still missing."""
-        lines = self.learner.look()
+        lines = self.learner.describe()
         problems = self.diagnostics.problems()
         if self.save_error:
             problems.append(self.save_error)
