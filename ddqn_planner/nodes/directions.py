@@ -1,4 +1,4 @@
-"""The one-way zones of a map server, which hold on every map of the frame of the zones."""
+"""The one-way zones of a map server, which hold on every map of their frame."""
 
 import math
 import time

@@ -31,7 +31,7 @@ ENTITIES = {
     "client": "clients",
     "service": "services",
 }
-"""Attributes of a node with its entities, by kind; waitables come on top."""
+"""By kind of entity, the node's attribute that holds them; its waitables are apart."""
 
 STATES = {
     "unknown": 0,
@@ -57,7 +57,7 @@ class Change(NamedTuple):
     start: str
     transition_state: str  # while the node works
     goal: str
-    success_number: int  # of its success; failure and error have the next two
+    success_number: int  # of the transition that ends it: success, failure, error
 
 
 CHANGES = (
@@ -72,61 +72,68 @@ CHANGES = (
 
 
 def _state(label: str) -> State:
+    """Make the message of a state."""
     return State(id=STATES[label], label=label)
 
 
 def _description(
     number: int, label: str, start: str, goal: str
 ) -> TransitionDescription:
-    transition = Transition(id=number, label=label)
-    ends = {"start_state": _state(start), "goal_state": _state(goal)}
-    return TransitionDescription(transition=transition, **ends)
+    """Make the message of a transition from a start state to a goal state."""
+    return TransitionDescription(
+        transition=Transition(id=number, label=label),
+        start_state=_state(start),
+        goal_state=_state(goal),
+    )
 
 
 def _describe(change: Change) -> TransitionDescription:
+    """Make the message of a transition that can be requested.
+
+    It leads to the state in which the node works; another transition ends that.
+    """
     return _description(
         change.number, change.label, change.start, change.transition_state
     )
 
 
-class Ends(NamedTuple):
-    """The states in which the work of a transition state can end."""
-
-    success: str
-    failure: str
-    error: str
-
-
 def _transition_graph() -> Iterator[TransitionDescription]:
-    """Yield ROS's transitions, also those of a node that fails, as tools draw them."""
-    numbers: dict[str, int] = {}  # of the success, by transition state
-    ends: dict[str, Ends] = {}
+    """Yield ROS's transitions, also those of a node that fails, as tools draw them.
+
+    First those that can be requested, then those that end the work on them.
+    """
+    results = ("success", "failure", "error")
     for change in CHANGES:
-        state = change.transition_state
         yield _describe(change)
+    # By the state in which the node works: the number of the transition of success, and
+    # the states in which the work can end, in the order of the results.
+    ends: dict[str, tuple[int, list[str]]] = {}
+    for change in CHANGES:
         failure = change.goal if change.label == "shutdown" else change.start
-        numbers[state] = change.success_number
-        ends[state] = Ends(change.goal, failure, "errorprocessing")
-    numbers["errorprocessing"] = 60
-    ends["errorprocessing"] = Ends("unconfigured", "finalized", "finalized")
-    for state, number in numbers.items():
-        for offset, end in enumerate(Ends._fields):
-            goal: str = getattr(ends[state], end)
-            yield _description(number + offset, f"transition_{end}", state, goal)
+        goals = [change.goal, failure, "errorprocessing"]
+        ends[change.transition_state] = (change.success_number, goals)
+    ends["errorprocessing"] = (60, ["unconfigured", "finalized", "finalized"])
+    for state, (success_number, goals) in ends.items():
+        for offset, (result, goal) in enumerate(zip(results, goals, strict=True)):
+            number = success_number + offset
+            yield _description(number, f"transition_{result}", state, goal)
 
 
 # Not on rclpy's LifecycleNode: its answer to a transition that the state does not have
 # ends the process, its callbacks cannot say why they fail, and its services outlive the
 # node.
 class ManagedNode(BaseNode):
-    """Node that destroys what `configure` created if that fails, and at ``cleanup``."""
+    """Node with a lifecycle; see `Change` for its transitions.
+
+    What `configure` creates is destroyed at ``cleanup``, or if `configure` fails.
+    """
 
     def __init__(self, name: str, parameters: Parameters) -> None:
         # First, as a node that cannot start is destroyed, too.
         self.state = "unconfigured"  # or inactive, active or finalized
         self._is_changing = False
         self._is_destroyed = False
-        self._beats: Timer | None = None
+        self._heartbeat_timer: Timer | None = None
         super().__init__(name, parameters)
         self._events = self.create_publisher(TransitionEvent, "~/transition_event", 10)
         # The state can be asked for while a transition waits.
@@ -147,8 +154,12 @@ class ManagedNode(BaseNode):
             )
 
     def change(self, label: str) -> None:
-        """Do a transition; if that raises an error, the state stays."""
-        change = {change.label: change for change in self._changes()}[label]
+        """Do a transition that the state has, and tell subscribers.
+
+        If the method of that name raises an error, the state stays.
+        """
+        changes = {change.label: change for change in self._changes()}
+        change = changes[label]
         do_change = getattr(self, label)
         try:
             do_change()
@@ -163,6 +174,7 @@ class ManagedNode(BaseNode):
             super().tell_unread_qualities()
 
     def _publish_event(self, start: str, goal: str) -> None:
+        """Tell subscribers that the node went from a start state to a goal state."""
         event = TransitionEvent(start_state=_state(start), goal_state=_state(goal))
         self._events.publish(event)
 
@@ -192,7 +204,10 @@ class ManagedNode(BaseNode):
         return True
 
     def configure(self) -> None:
-        """Create what the node needs, after this."""
+        """Create what the node needs; an override calls this method first.
+
+        From now on, `cleanup` destroys what is created.
+        """
         self._entities_before = {
             entity for name in ENTITIES.values() for entity in getattr(self, name)
         }
@@ -202,15 +217,16 @@ class ManagedNode(BaseNode):
         """Begin to answer requests."""
 
     def deactivate(self) -> None:
-        """Stop, and end the bond."""
-        if self._beats is not None:
-            self.destroy_timer(self._beats)
-            self._beats = None
-            self._bond.active = False
-            self._beat()
-            # A publisher that ends at once would take its last message with it.
-            self._heart.wait_for_all_acked(Duration(seconds=0.2))
-            self.destroy_publisher(self._heart)
+        """Stop answering requests, and end the bond with the lifecycle manager."""
+        if self._heartbeat_timer is None:
+            return
+        self.destroy_timer(self._heartbeat_timer)
+        self._heartbeat_timer = None
+        self._heartbeat.active = False
+        self._publish_heartbeat()
+        # A publisher that ends at once would take its last message with it.
+        self._heartbeat_publisher.wait_for_all_acked(Duration(seconds=0.2))
+        self.destroy_publisher(self._heartbeat_publisher)
 
     def cleanup(self) -> None:
         """Destroy what was created since `configure`, also if that failed."""
@@ -218,8 +234,8 @@ class ManagedNode(BaseNode):
             destroy = getattr(self, f"destroy_{kind}")
             for entity in {*getattr(self, name)} - self._entities_before:
                 destroy(entity)
-        # Handlers of events have ended with their publisher or subscription. Only
-        # action servers are left.
+        # Of waitables, the handlers of events were destroyed with their publisher or
+        # subscription. Only action servers are left.
         servers: set[Any] = {*self.waitables} - self._waitables_before
         for server in servers:
             server.destroy()
@@ -251,6 +267,10 @@ class ManagedNode(BaseNode):
         return response
 
     async def _on_change_state(self, request: Any, response: Any) -> Any:
+        """Do the transition with the requested label, or number if it has no label.
+
+        Refuse it while another one is done, and if the state does not have it.
+        """
         labels = {change.number: change.label for change in self._changes()}
         number: int = request.transition.id
         requested_label: str = request.transition.label
@@ -279,7 +299,7 @@ class ManagedNode(BaseNode):
         return response
 
     def _circumstance(self) -> str:
-        """Return in words when a transition was refused."""
+        """Return why a transition is refused, as the end of a sentence."""
         if self.is_stopping:
             return "as it is being stopped"
         if self._is_changing:
@@ -296,13 +316,17 @@ class ManagedNode(BaseNode):
             return
         # As bondpy does, without a subscription: the topic has the bonds of all nodes,
         # each ten times per second.
-        self._bond = Status(id=self.get_name(), instance_id=str(uuid4()), active=True)
-        self._bond.heartbeat_period = BEAT_PERIOD
-        self._bond.heartbeat_timeout = BEAT_TIMEOUT
-        self._heart = self.create_publisher(Status, "bond", 1)
-        self._beat()
-        self._beats = self.create_timer(BEAT_PERIOD, self._beat, clock=STEADY)
+        self._heartbeat = Status(
+            id=self.get_name(), instance_id=str(uuid4()), active=True
+        )
+        self._heartbeat.heartbeat_period = BEAT_PERIOD
+        self._heartbeat.heartbeat_timeout = BEAT_TIMEOUT
+        self._heartbeat_publisher = self.create_publisher(Status, "bond", 1)
+        self._publish_heartbeat()
+        self._heartbeat_timer = self.create_timer(
+            BEAT_PERIOD, self._publish_heartbeat, clock=STEADY
+        )
 
-    def _beat(self) -> None:
-        self._bond.header = self.header()
-        self._heart.publish(self._bond)
+    def _publish_heartbeat(self) -> None:
+        self._heartbeat.header = self.header()
+        self._heartbeat_publisher.publish(self._heartbeat)

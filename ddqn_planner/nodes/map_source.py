@@ -385,7 +385,7 @@ class MapSource:
         self.change()
 
     def _reason_to_wait(self, received: Received) -> str:
-        """Apply the directions to a map; return why it has to wait, or an empty text."""
+        """Apply the directions to a map; return why it has to wait, or nothing."""
         if self.directions.required:
             return self.directions.required
         reason = self.directions.wait_for_new_publisher()
@@ -456,7 +456,7 @@ class MapSource:
 
 
 def _place(message: OccupancyGrid) -> MapPlace:
-    """Return where the cells of a map message lie; equal for two maps to be compared."""
+    """Return where the cells of a map message lie."""
     info = message.info
     return MapPlace(
         message.header.frame_id,

@@ -76,7 +76,7 @@ class Simulation:
         self._imported = node.worker.call(import_training)
 
     def _use_poses_of(self, map_file: MapFile, grid: GridMap) -> None:
-        """Use the start and the goal of a map file, cells of its grid, if it has any."""
+        """Use the start and the goal, cells of a grid, that a map file may name."""
         for name, cell in (("start", map_file.start), ("goal", map_file.goal)):
             if cell is None:
                 continue
@@ -172,7 +172,7 @@ class Simulation:
         return Answer(True, "saving after this step; ~/model_saved or an error follows")
 
     def _train(self, run: TrainingRun, map_in_frame: MapInFrame) -> None:
-        """Train until the training has finished or is stopped; the worker calls this."""
+        """Train until the training has finished or is stopped, in the worker."""
         node = self._node
         # Episodes are drawn in the executor's thread, in which replays begin: no
         # episode comes between the steps of a replay.
