@@ -44,8 +44,9 @@ class BaseNode(Node):
 
     def __init__(self, name: str, parameters: Parameters) -> None:
         self._logged_problems: list[str] = []
-        self.after_jump_back: list[Callable[[], None]] = []
-        """Called when a bag loops or a simulator is reset."""
+        self.jump_back_callbacks: list[Callable[[], None]] = []
+        """Functions called when the clock is set back: a bag loops, or a simulator is
+        reset."""
         self.is_stopping = False
         """A signal has come: requests that wait are to be refused."""
         self._pending_requests = PendingRequests()
@@ -81,6 +82,15 @@ class BaseNode(Node):
             )
 
     def _warn_of_unread(self, overrides: dict[str, Any], known_names: set[str]) -> None:
+        """Warn of given parameters that the node does not have.
+
+        Parameters
+        ----------
+        overrides
+            The values that the command line and its files give, by parameter.
+        known_names
+            The parameters that the node has.
+        """
         node = self.get_fully_qualified_name()
         unread_parameters = unread_names(overrides, known_names, node)
         if unread_parameters:
@@ -89,7 +99,10 @@ class BaseNode(Node):
             self.get_logger().warning(warning)
 
     def tell_unread_qualities(self) -> None:
-        """Log once which qualities are for no subscription, after all are created."""
+        """Warn of parameters ``qos_overrides`` that no subscription has read.
+
+        To be called once, after all subscriptions were created.
+        """
         known_names = self.list_parameters([], 0).names
         node = self.get_fully_qualified_name()
         for warning in unread_qualities(self._qualities, known_names, node):
@@ -97,17 +110,19 @@ class BaseNode(Node):
         self._qualities = []
 
     def _on_jump(self, jump: TimeJump) -> None:
+        """Warn that ROS's clock was set back, and forget what depends on its time."""
         seconds = jump.delta.nanoseconds / 1e9
         change = f"jumped by {seconds:.6g} s" if seconds else "changed"
         self.get_logger().warning(
             f"the clock {change}: transforms and odometry are forgotten"
         )
-        for forget in self.after_jump_back:
+        for forget in self.jump_back_callbacks:
             forget()
 
     # Parameters
 
     def _check(self, parameters: list[Parameter]) -> msg.SetParametersResult:
+        """Accept new values of parameters, or refuse them with a reason, for rclpy."""
         try:
             self.check_parameters(
                 {parameter.name: parameter.value for parameter in parameters}
@@ -132,9 +147,9 @@ class BaseNode(Node):
         return SimpleNamespace(**{name: self.value(name) for name in self._declared})
 
     def _on_set_parameters(self, request: Any, response: Any) -> Any:
-        """Set parameters one by one or together.
+        """Answer a request to set parameters: one by one, or all or none of them.
 
-        rclpy's own answer to bad ones ends the node.
+        rclpy's own callback ends the node at values of a wrong type.
         """
         if isinstance(response, srv.SetParameters.Response):
             response.results = [self._set([message]) for message in request.parameters]
@@ -143,6 +158,7 @@ class BaseNode(Node):
         return response
 
     def _set(self, messages: list[msg.Parameter]) -> msg.SetParametersResult:
+        """Set all parameters of the messages, or none; return why in the result."""
         try:
             parameters = parameters_from_messages(
                 messages,
@@ -157,7 +173,7 @@ class BaseNode(Node):
     # Requests
 
     def answer_with(self, service_type: Any, callback: Callable[..., Any]) -> None:
-        """Answer a service of rclpy with another callback."""
+        """Give the node's service of a type, which rclpy created, another callback."""
         for service in self.services:
             if service.srv_type is service_type:
                 service.callback = callback
@@ -183,7 +199,17 @@ class BaseNode(Node):
     def create_trigger(
         self, name: str, handler: Callable[[], Any], **options: Any
     ) -> None:
-        """Create a service; its handler returns or awaits success and a message."""
+        """Create a service of ``std_srvs/Trigger``.
+
+        Parameters
+        ----------
+        name
+            The name of the service.
+        handler
+            Returns, or awaits, success and a message.
+        options
+            More arguments of `create_service`.
+        """
 
         async def answer(
             _: Trigger.Request, response: Trigger.Response

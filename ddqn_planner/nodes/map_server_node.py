@@ -85,7 +85,15 @@ class MapServerNode(BaseNode):
             raise ValueError(f"topic_name is {topic!r} ({reason}); {remedy}") from None
 
     def _load(self, url: str, only_below: bool = False) -> int:
-        """Load a map and serve it, or log why not; return LoadMap's result code."""
+        """Load a map and serve it, or log why not; return LoadMap's result code.
+
+        Parameters
+        ----------
+        url
+            A path or URL of a map file, or a shipped map's name.
+        only_below
+            Whether the map's image must lie in the folder of the map file, or below.
+        """
         try:
             path = find_map(url)
             loaded = read_map_file(path, only_below)
@@ -94,15 +102,18 @@ class MapServerNode(BaseNode):
             if self._loaded is not None:
                 consequence = "the map before it stays"
             self.get_logger().error(f"cannot load {url!r}, {consequence}: {error}")
-            undefined: int = LoadMap.Response.RESULT_UNDEFINED_FAILURE
-            return RESULTS.get(type(error), undefined)
+            return RESULTS.get(type(error), LoadMap.Response.RESULT_UNDEFINED_FAILURE)
         self._loaded = loaded
         self._serve(loaded.values)
         height, width = loaded.values.shape
         self.get_logger().info(f"serving {path}, {width} x {height} cells")
-        return int(LoadMap.Response.RESULT_SUCCESS)
+        return LoadMap.Response.RESULT_SUCCESS
 
     def _serve(self, values: NDArray[np.int8]) -> None:
+        """Publish a map in the place of the loaded one, after its directions.
+
+        `values` is (H, W), as in a map message.
+        """
         loaded = self._loaded
         assert loaded is not None
         header = self.header(self.value("frame_id"))
@@ -136,7 +147,10 @@ class MapServerNode(BaseNode):
         return response
 
     def _on_scatter_obstacles(self) -> tuple[bool, str]:
-        """Serve the loaded map with new obstacles, none of an earlier call."""
+        """Serve the loaded map with new obstacles, without those of earlier calls.
+
+        Obstacles fall off the path of `known_path`. Return success and a message.
+        """
         loaded = self._loaded
         try:
             if loaded is None:
@@ -151,15 +165,16 @@ class MapServerNode(BaseNode):
             return False, str(error)
         is_new = noisy_grid.occupancy & ~grid.occupancy  # (H, W)
         self._serve(np.where(is_new, np.int8(OCCUPIED), loaded.values))
-        places = grid.centres(np.argwhere(is_new)[:, ::-1]).tolist()
-        cells = ", ".join(f"({x:.3f}, {y:.3f})" for x, y in places)
-        message = (
-            f"{len(places)} new obstacles at {cells} m; {rejected} draws thrown away"
-        )
+        cells = np.argwhere(is_new)[:, ::-1]  # (N, 2), x and y
+        centres: list[list[float]] = grid.centres(cells).tolist()  # metres
+        places = ", ".join(f"({x:.3f}, {y:.3f})" for x, y in centres)
+        obstacles = f"{len(centres)} new obstacles at {places} m"
+        message = f"{obstacles}; {rejected} draws thrown away"
         self.get_logger().info(message)
         return True, message
 
     def _on_restore_map(self) -> tuple[bool, str]:
+        """Serve the loaded map without new obstacles; return success and a message."""
         if self._loaded is None:
             return False, NO_MAP
         self._serve(self._loaded.values)
@@ -167,11 +182,13 @@ class MapServerNode(BaseNode):
 
 
 def known_path(grid: GridMap, map_file: MapFile) -> tuple[MoveRule, list[Cell]]:
-    """Return the shortest path, and the safest move rule that allows a path.
+    """Return the safest move rule that allows a path, and the shortest path by it.
 
-    A ValueError says why there is none.
+    The path leads over a grid from the start to the goal that the grid's map file
+    names. A ValueError says why there is none.
     """
-    start, goal = map_file.start, map_file.goal
+    start = map_file.start
+    goal = map_file.goal
     if start is None or goal is None:
         remedy = (
             f"add '{PACKAGE}: {{start: [x, y], goal: [x, y]}}' in cells to its YAML"

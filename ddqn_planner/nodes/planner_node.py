@@ -164,7 +164,7 @@ class PlannerNode(ManagedNode):
         self.deactivate()
         self._diagnostics.refused.clear()
         self._diagnostics.note(NO_REQUEST)
-        self.after_jump_back.clear()
+        self.jump_back_callbacks.clear()
         for name in ("_places", "_display", "_map", "_requests"):
             if hasattr(self, name):  # `configure` may have failed before it
                 delattr(self, name)

@@ -177,7 +177,7 @@ class Frames:
             # No executor wakes for them, a hundred a second: they are read when they are needed.
             self._listener.group.can_execute = lambda _: False
             self._node.create_timer(READ_PERIOD, self._read, clock=STEADY)
-            self._node.after_jump_back.append(self._forget)
+            self._node.jump_back_callbacks.append(self._forget)
 
     def _read(self) -> None:
         for subscription in (self._listener.tf_sub, self._listener.tf_static_sub):
@@ -294,7 +294,7 @@ class Places(Frames):
         self._subscription: Any = None
         self.topic = ""
         self.listen_to_source()
-        node.after_jump_back.append(self._forget_odometry)
+        node.jump_back_callbacks.append(self._forget_odometry)
 
     def listen_to_source(self) -> None:
         """Listen to what the parameter names, if it is another source."""

@@ -30,7 +30,19 @@ LOGGER = "ddqn_planner"  # as long as there is no node
 def spin_until_shutdown(
     make_node: Callable[[], Node], parameters: Parameters | None = None
 ) -> int:
-    """Run a node until SIGINT or SIGTERM, or print help; 1 if it cannot start."""
+    """Run a node until SIGINT or SIGTERM, or print help if the arguments ask for it.
+
+    Parameters
+    ----------
+    make_node
+        Creates the node.
+    parameters
+        The node's parameters; None for a node without help.
+
+    Returns
+    -------
+    The exit code of the process: 1 if the node cannot start, otherwise 0.
+    """
     if parameters and {"-h", "--help"} & {*sys.argv[1:]}:
         return unless_cut_off(lambda: print_help(make_node, parameters))
     stop = StopSignal()
@@ -61,6 +73,7 @@ def spin_until_shutdown(
 
 
 def _warn_of_unread_arguments() -> None:
+    """Log the arguments of the command line that are not for ROS: nothing reads them."""
     unread = remove_ros_args(sys.argv)[1:]
     if unread:
         example = "--ros-args -p robot_radius:=0.3"
@@ -69,7 +82,7 @@ def _warn_of_unread_arguments() -> None:
 
 
 def _reason(error: Exception) -> str:
-    """Return why the node cannot start, with the argument that is wrong."""
+    """Return why the node cannot start; name the argument that ROS could not read."""
     if rclpy.ok():  # the arguments were read
         return str(error)
     # rcl names neither the argument nor the line in some cases.

@@ -14,18 +14,22 @@ class Interrupted(BaseException):
 
 
 class StopSignal:
-    """The first SIGINT or SIGTERM. It ends what the main thread does."""
+    """The first SIGINT or SIGTERM, and whether the main thread has obeyed it.
+
+    The signal lets the executor end after its callback. A callback that takes longer
+    than `CALLBACK_PATIENCE` is ended by `Interrupted`.
+    """
 
     def __init__(self) -> None:
         self.has_come = False
-        self._is_late = False
         self.obeyed = threading.Event()
-        """The main thread runs no callback any more: from now on, it saves."""
+        """Set by the main thread when it runs no callback any more: it saves now."""
+        self._interrupts = False  # whether signals raise `Interrupted`
 
     def listen(self, executor: Executor) -> None:
         """Receive the signals from now on, and wake the executor at the first."""
-        # Python's handlers run in the main thread, and not while that waits for
-        # messages.
+        # Python's handlers run in the main thread, and not while the executor waits
+        # there for messages. So Python writes a byte into a pipe, and a thread reads it.
         pipe_end, signal_end = os.pipe()
         os.set_blocking(signal_end, False)
         signal.set_wakeup_fd(signal_end, warn_on_full_buffer=False)
@@ -34,17 +38,17 @@ class StopSignal:
 
         def wait() -> None:
             os.read(pipe_end, 1)
-            # A flag, as many requests may stand before a task; a task, as it wakes the
-            # executor.
+            # The executor looks at the flag after each callback; a task wakes it.
             self.has_come = True
             executor.create_task(lambda: None)
-            # It may compile in a callback, or wait for a thread that does.
+            # A callback may compile for long, or wait for a thread that does.
             while not self.obeyed.wait(CALLBACK_PATIENCE):
-                self._is_late = True
+                self._interrupts = True
                 signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
 
         threading.Thread(target=wait, daemon=True).start()
 
     def _on_signal(self, *_: object) -> None:
-        if self._is_late and not self.obeyed.is_set():
+        """Handle SIGINT and SIGTERM in the main thread: end its callback if it is late."""
+        if self._interrupts and not self.obeyed.is_set():
             raise Interrupted

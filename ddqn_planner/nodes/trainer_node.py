@@ -81,7 +81,7 @@ class TrainerNode(LearningNode):
     """Trains on the last ``map`` from the last ``initialpose`` to ``goal_pose``."""
 
     def __init__(self) -> None:
-        self._has_begun = False
+        self._is_complete = False  # whether the node has its learner
         super().__init__("trainer", PARAMETERS)
         self._replay_timer: Timer | None = None
         map_file = self._read_map_file()
@@ -100,7 +100,7 @@ class TrainerNode(LearningNode):
         for name, handler in services.items():
             self.create_trigger(f"~/{name}", handler, callback_group=group)
         self.create_timer(1.0, self._on_look, clock=STEADY)
-        self._has_begun = True
+        self._is_complete = True
 
     def check_parameters(self, new: dict[str, Any]) -> None:
         """Check new values as `BaseNode` does, and hyper-parameters together.
@@ -111,7 +111,7 @@ class TrainerNode(LearningNode):
         check_source("pose_source", new.get("pose_source", ""), "'odometry'")
         if "output_folder" in new:
             as_path(new["output_folder"], "output_folder")
-        if new.get("experience") and self._has_begun:
+        if new.get("experience") and self._is_complete:
             Experience.load(new["experience"])
         hyper_parameters(vars(self.settings()) | new)
 
@@ -136,6 +136,7 @@ class TrainerNode(LearningNode):
         )
 
     def _on_map(self, message: OccupancyGrid) -> None:
+        """Learn on a map from now on, or refuse it in the diagnostics."""
         with self.diagnostics.receiving("map"):
             grid = grid_from_message(message, self._map_rules())
             self.map = MapInFrame(grid, message.header.frame_id)
@@ -168,7 +169,7 @@ class TrainerNode(LearningNode):
         return Answer(answer.success, f"{answer.message}; the replay was stopped")
 
     def _on_replay(self) -> Answer:
-        """Draw the recorded episodes one after another, each place by place."""
+        """Begin to publish the recorded episodes, each one place longer each time."""
         if self.map is None:
             return Answer(False, NO_MAP)
         file = self.folder / "episodes.csv"
@@ -182,7 +183,7 @@ class TrainerNode(LearningNode):
         except OSError as error:
             return Answer(False, f"no recorded episodes ({error}); call ~/start first")
 
-        def step() -> None:
+        def publish_next() -> None:
             try:
                 self.publish_episode(recording.frame, next(beginnings))
             except (StopIteration, OSError):
@@ -191,11 +192,12 @@ class TrainerNode(LearningNode):
         self._stop_replay()
         self.is_replaying = True
         self._replay_timer = self.create_timer(
-            self.value("replay_period"), step, clock=STEADY
+            self.value("replay_period"), publish_next, clock=STEADY
         )
         return Answer(True, "replaying the recorded episodes on ~/episode")
 
     def _stop_replay(self) -> None:
+        """Stop the replay, if one is shown."""
         self.is_replaying = False
         if self._replay_timer is not None:
             self.destroy_timer(self._replay_timer)
@@ -204,8 +206,8 @@ class TrainerNode(LearningNode):
     def destroy_node(self) -> None:
         """Save what was learned, and destroy the node."""
         # Newer releases destroy a node that cannot start, and some destroy it twice.
-        if self._has_begun:
-            self._has_begun = False
+        if self._is_complete:
+            self._is_complete = False
             self.learner.close()
         super().destroy_node()
 

@@ -1,4 +1,4 @@
-"""A thread for calls that take long, so that the node goes on answering."""
+"""A thread for calls that take long, so that the node continues to answer."""
 
 import queue
 import threading
@@ -15,7 +15,7 @@ class Worker:
     """Calls functions one after another in a daemon thread."""
 
     def __init__(self, node: Node) -> None:
-        # A task alone does not wake an executor in another thread.
+        # Wakes the executor, so that it resumes callbacks that await a call.
         self._wake = node.create_guard_condition(lambda: None)
         self._calls: queue.SimpleQueue[Task | None] = queue.SimpleQueue()
         # The end of the process does not wait for a daemon thread.
@@ -23,11 +23,12 @@ class Worker:
         self._thread.start()
 
     def _work(self) -> None:
+        """Make the calls, in the worker's thread, until `close`."""
         for task in iter(self._calls.get, None):
             task()  # does nothing if the task was cancelled
             with suppress(InvalidHandle):  # the node was destroyed meanwhile
                 self._wake.trigger()
-            del task  # it holds a map
+            del task  # it holds a map, which would live until the next call
 
     def call(self, function: Callable[..., Any], *arguments: object) -> Task:
         """Return the future of a call: its result, or the exception that it raised."""

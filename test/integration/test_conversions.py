@@ -353,7 +353,7 @@ NOW = 111  # seconds of the node's clock
 def new_node(source: str = "tf") -> Mock:
     """Return what `Places` and `Diagnostics` ask of a node."""
     values = {"start_source": source, "robot_frame": "odom", "transform_tolerance": 5.0}
-    node = Mock(after_jump_back=[], value=values.__getitem__)
+    node = Mock(jump_back_callbacks=[], value=values.__getitem__)
     node.create_subscription = lambda _, topic, *__: SimpleNamespace(topic_name=topic)
     node.get_clock().now.return_value = Time(seconds=NOW, clock_type=ClockType.ROS_TIME)
     return node
@@ -433,7 +433,7 @@ def test_transforms_from_before_the_clock_jumped_back_are_forgotten(
     frames = listening(100)
     assert frames.origin_of("odom", "map").pose.position.x == 1.0
     frames.began -= 60
-    for forget in frames._node.after_jump_back:  # as the node does
+    for forget in frames._node.jump_back_callbacks:  # as the node does
         forget()
     with pytest.raises(ValueError, match="does not exist"):
         frames.origin_of("odom", "map")
@@ -446,7 +446,7 @@ def test_a_set_start_outlives_time_and_a_jump_of_the_clock() -> None:
     node, pose = new_node("initialpose"), pose_at(NOW, "map")
     places = Places(node, Diagnostics(node), lambda: "map", lambda: None)
     places._take(pose)
-    for forget in node.after_jump_back:
+    for forget in node.jump_back_callbacks:
         forget()
     node.get_clock().now.return_value = Time(
         seconds=2 * NOW, clock_type=ClockType.ROS_TIME
