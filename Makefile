@@ -89,7 +89,9 @@ format: setup
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+# ROS's messages have no types. Their stubs, without which mypy takes messages for Any, go to typings/.
 types: setup
+	$(BIN)/python tools/message_types.py typings
 	$(BIN)/mypy
 
 # The versions of the libraries and tools in .venv; `PIP_CONSTRAINT=constraints.txt make setup` installs them.

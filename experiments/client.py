@@ -247,7 +247,8 @@ class Client(ExitStack):
     def get_plan(self, start: PoseStamped, goal: PoseStamped) -> Path:
         """Return the planner's answer."""
         request = GetPlan.Request(start=start, goal=goal)
-        return self.call(GetPlan, "planner/get_plan", request).plan
+        answer: GetPlan.Response = self.call(GetPlan, "planner/get_plan", request)
+        return answer.plan
 
     def set_parameters(self, node: str, **values: Any) -> list[Any]:
         """Set parameters of a node one by one; return a SetParametersResult for each."""

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from rosidl_parser import definition
 
-# What the code imports. Packages that the fields of its messages are from are added.
+# What the code imports. The packages of the fields of their messages are added.
 PACKAGES = (
     "action_msgs",
     "diagnostic_msgs",
@@ -27,22 +27,17 @@ PACKAGES = (
     "visualization_msgs",
 )
 KINDS = ("msg", "srv", "action")
-PYTHON_TYPES = {
-    "boolean": "bool",
-    "octet": "bytes",
-    "float": "float",
-    "double": "float",
-}
-# Sequences of these numbers are arrays; sequences of all else are lists.
-NUMPY_TYPES = {"float": "float32", "double": "float64"} | {
-    f"{sign}int{bits}": f"{sign}int{bits}"
-    for sign in ("", "u")
-    for bits in (8, 16, 32, 64)
-}
+FLOATS = definition.FLOATING_POINT_TYPES
+# All other basic types are integers.
+PYTHON_TYPES = {"boolean": "bool", "octet": "bytes", **dict.fromkeys(FLOATS, "float")}
+NUMPY_TYPES = {"float": "float32", "double": "float64"}
+# Sequences of numbers are arrays; sequences of all else, also of bytes, are lists.
+NUMBERS = (*definition.EXPLICIT_INTEGER_TYPES, *FLOATS)
 MODULE = re.compile(rf"\b\w+\.(?:{'|'.join(KINDS)})\b")
 HEAD = """\
 from array import array
 from collections.abc import Sequence
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,11 +58,11 @@ def types_of_field(idl: definition.AbstractType) -> tuple[str, str]:
     if not isinstance(idl, definition.AbstractNestedType):
         return type_of_value(idl), type_of_value(idl)
     item = type_of_value(idl.value_type)
-    numpy_type = NUMPY_TYPES.get(getattr(idl.value_type, "typename", ""))
-    if numpy_type is None:
+    number = getattr(idl.value_type, "typename", "")
+    if number not in NUMBERS:
         return f"list[{item}]", f"Sequence[{item}]"
     if isinstance(idl, definition.Array):
-        array = f"NDArray[np.{numpy_type}]"
+        array = f"NDArray[np.{NUMPY_TYPES.get(number, number)}]"
         return array, f"{array} | Sequence[{item}]"
     return f"array[{item}]", f"Sequence[{item}]"
 
@@ -102,7 +97,7 @@ def group_stub(group: type, indent: str = "") -> Iterator[str]:
             yield from group_stub(member, f"{indent}    ")
         else:
             package, kind, _ = member.__module__.split(".")
-            yield f"{indent}    {name} = {package}.{kind}.{member.__name__}"
+            yield f"{indent}    {name}: TypeAlias = {package}.{kind}.{member.__name__}"
 
 
 def module_stub(package: str, kind: str) -> str:
@@ -122,7 +117,7 @@ def module_stub(package: str, kind: str) -> str:
 def main() -> None:
     """Write the stubs of all packages into a folder."""
     folder = Path(sys.argv[1])
-    packages = [*PACKAGES]
+    packages = [*PACKAGES]  # grows while its stubs are written
     for package in packages:
         for kind in KINDS:
             try:

@@ -167,7 +167,7 @@ def occupancy_message(
 def path_message(
     points: Float64, yaws: Float64, header: Header, last: Quaternion | None = None
 ) -> Path:
-    """Make a path message; for the parameters see `path_bytes`."""
+    """Make a path message of `path_bytes`'s parameters; `points` are its positions."""
     path = Path(header=header)
     # Most of an answer's time is making messages. Poses in the same direction share a
     # quaternion, and all are copies, which take a quarter of the time of the messages'
@@ -179,7 +179,8 @@ def path_message(
     yaw_of_poses: list[float] = yaws.tolist()
     quaternions = {yaw: quaternion(yaw) for yaw in set(yaw_of_poses)}
     orientations = [quaternions[yaw] for yaw in yaw_of_poses]
-    orientations.append(last)
+    if last is not None:
+        orientations.append(last)
     positions: list[list[float]] = points.tolist()
     for stamped, (x, y), orientation in zip(
         poses, positions, orientations, strict=False

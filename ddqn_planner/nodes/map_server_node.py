@@ -102,12 +102,14 @@ class MapServerNode(BaseNode):
             if self._loaded is not None:
                 consequence = "the map before it stays"
             self.get_logger().error(f"cannot load {url!r}, {consequence}: {error}")
-            return RESULTS.get(type(error), LoadMap.Response.RESULT_UNDEFINED_FAILURE)
+            undefined: int = LoadMap.Response.RESULT_UNDEFINED_FAILURE
+            return RESULTS.get(type(error), undefined)
         self._loaded = loaded
         self._serve(loaded.values)
         height, width = loaded.values.shape
         self.get_logger().info(f"serving {path}, {width} x {height} cells")
-        return LoadMap.Response.RESULT_SUCCESS
+        success: int = LoadMap.Response.RESULT_SUCCESS
+        return success
 
     def _serve(self, values: NDArray[np.int8]) -> None:
         """Publish a map in the place of the loaded one, after its directions.

@@ -144,7 +144,9 @@ class Frames:
         self.listen()
         self._read()
         try:
-            transform = self._buffer.lookup_transform(target, source, stamp)
+            transform: TransformStamped = self._buffer.lookup_transform(
+                target, source, stamp
+            )
             problem = "" if stamp.nanoseconds else self._age_problem(transform)
             if not problem:
                 return transform

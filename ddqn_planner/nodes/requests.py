@@ -187,6 +187,7 @@ class Requests:
         assert isinstance(request, PoseRequest)
         assert isinstance(outcome.plan, PosePlan)
         assert planner is not None
+        assert goal is not None
         request = replace(request, bound=1.0, under_way=outcome.plan.poses)
         plan = await self._plan(planner, request)
         reason = reason_of(request, plan, goal, goal, 0.0)

@@ -73,7 +73,7 @@ def spin_until_shutdown(
 
 
 def _warn_of_unread_arguments() -> None:
-    """Log the arguments of the command line that are not for ROS: nothing reads them."""
+    """Warn of arguments of the command line that are not for ROS: they are not read."""
     unread = remove_ros_args(sys.argv)[1:]
     if unread:
         example = "--ros-args -p robot_radius:=0.3"

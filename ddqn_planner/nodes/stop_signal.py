@@ -29,7 +29,7 @@ class StopSignal:
     def listen(self, executor: Executor) -> None:
         """Receive the signals from now on, and wake the executor at the first."""
         # Python's handlers run in the main thread, and not while the executor waits
-        # there for messages. So Python writes a byte into a pipe, and a thread reads it.
+        # there for messages. So Python writes a byte into a pipe, which a thread reads.
         pipe_end, signal_end = os.pipe()
         os.set_blocking(signal_end, False)
         signal.set_wakeup_fd(signal_end, warn_on_full_buffer=False)
@@ -49,6 +49,6 @@ class StopSignal:
         threading.Thread(target=wait, daemon=True).start()
 
     def _on_signal(self, *_: object) -> None:
-        """Handle SIGINT and SIGTERM in the main thread: end its callback if it is late."""
+        """End the main thread's callback if the executor is late to obey the signal."""
         if self._interrupts and not self.obeyed.is_set():
             raise Interrupted

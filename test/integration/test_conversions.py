@@ -182,7 +182,8 @@ def test_a_path_looks_ahead_and_ends_as_the_goal_and_is_the_same_serialized(
     assert corners.tolist() == [[*grid.cell_to_world(cell)] for cell in cells]
     poses = along(corners, 0.05) if is_dense else along(corners)
     path = path_message(*poses, header, quaternion(0.7))
-    assert all(each.header is header for each in [path, *path.poses])
+    assert path.header is header
+    assert all(stamped.header is header for stamped in path.poses)
     points = points_of(path)
     if is_dense:
         assert all(math.dist(*step) <= 0.05 * (1 + 1e-5) for step in pairwise(points))

@@ -250,7 +250,7 @@ def test_a_planner_that_plans_leaves_the_graph_at_once(robot: Robot) -> None:
     assert not all(answer.done() and answer.result().plan.poses for answer in answers)
 
 
-SERVICES = {
+SERVICES: dict[str, Any] = {
     "get_state": GetState,
     "get_available_states": GetAvailableStates,
     "get_available_transitions": GetAvailableTransitions,
