@@ -331,21 +331,29 @@ def test_nothing_that_comes_in_ends_the_node(user: Trainee, tmp_path: FilePath) 
     user.configure(tmp_path, **ENDLESS)
     names = user.client.call(ListParameters, "trainer/list_parameters").result.names
     user.call("start")
+    set_one_by_one = user.client.service(SetParameters, "trainer/set_parameters")
+    set_together = user.client.service(
+        SetParametersAtomically, "trainer/set_parameters_atomically"
+    )
+    save = user.client.service(Trigger, "trainer/save")
 
     @given(maps(), STAMPED_POSES, some_parameters(names))
     def fuzz(grid: OccupancyGrid, stamped: PoseStamped, some: list[Any]) -> None:
         user.client.publish("map", grid, LATCHED)
         user.client.publish("initialpose", initial_pose(stamped))
         user.client.publish("goal_pose", stamped)
-        request = SetParameters.Request(parameters=some)
-        results = user.client.call(
-            SetParameters, "trainer/set_parameters", request
-        ).results
-        assert len(results) == len(some)
-        assert all(
-            one.successful or one.reason for one in [*results, user.try_to_set(*some)]
-        )
-        user.call("save")
+        # At once: one after another they would wait for the training each time.
+        answers = [
+            set_one_by_one.call_async(SetParameters.Request(parameters=some)),
+            set_together.call_async(SetParametersAtomically.Request(parameters=some)),
+            save.call_async(Trigger.Request()),
+        ]
+        wait_for("answers", lambda: all(answer.done() for answer in answers))
+        one_by_one, together, saved = (answer.result() for answer in answers)
+        assert len(one_by_one.results) == len(some)
+        results = [*one_by_one.results, together.result]
+        assert all(result.successful or result.reason for result in results)
+        assert saved.success, saved.message
 
     fuzz()
     for service in ("stop", "replay", "start"):
