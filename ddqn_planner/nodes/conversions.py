@@ -27,10 +27,10 @@ from ddqn_planner.planning.exact_paths import dense
 Origin = tuple[float, float, float]
 Float64 = NDArray[np.float64]
 
-# Of one degree, as `Rotation.tilt`: a quaternion of two decimals tilts less.
+# `Rotation.tilt` of a turn by one degree; quaternions of two decimals tilt less.
 MAX_TILT = math.sin(math.radians(1) / 2)
 NORM_TOLERANCE = 1e-6  # a norm that differs less from 1 is left as it is
-# Of bytes in a message: their kind, its version and their digest.
+# Of bytes in a message: "model" or "experience", the version of that, and the digest.
 LABEL = "ddqn_planner {} 1 sha256:{}"
 ENCODING_BYTES = 4  # at the start of a serialised message
 
@@ -83,6 +83,7 @@ def grid_from_message(
 
 
 def _check_map(message: OccupancyGrid) -> None:
+    """Raise a ValueError with the remedy if a message is no complete map in a frame."""
     if not message.header.frame_id:
         raise ValueError("the map's frame is ''; name one in header.frame_id")
     resolution: float = message.info.resolution
@@ -121,7 +122,11 @@ def occupancy_values(message: OccupancyGrid) -> NDArray[np.int8]:
 def grid_from_values(
     values: NDArray[np.int8], resolution: float, origin: Origin, rules: MapRules
 ) -> GridMap:
-    """Make a grid map of values as they are in a map message, (H, W) int8."""
+    """Make a grid map of values as they are in a map message, (H, W) int8.
+
+    The resolution is in metres per cell; the origin is the pose of the corner of the
+    first cell, in metres and radians.
+    """
     if rules.map_type == "costmap":
         return grid_from_costmap(values, resolution, origin, rules.allow_unknown)
     return GridMap.from_occupancy_values(
@@ -177,8 +182,8 @@ def path_message(
         poses += pickle.loads(BLANK_POSES)
     del poses[len(points) :]
     yaw_of_poses: list[float] = yaws.tolist()
-    quaternions = {yaw: quaternion(yaw) for yaw in set(yaw_of_poses)}
-    orientations = [quaternions[yaw] for yaw in yaw_of_poses]
+    quaternion_of_yaw = {yaw: quaternion(yaw) for yaw in set(yaw_of_poses)}
+    orientations = [quaternion_of_yaw[yaw] for yaw in yaw_of_poses]
     if last is not None:
         orientations.append(last)
     positions: list[list[float]] = points.tolist()
@@ -194,17 +199,31 @@ def path_message(
 
 
 def along(points: Float64, spacing: float = math.inf) -> tuple[Float64, Float64]:
-    """Return points on a path (N, 2), at most a spacing apart, and headings (N - 1)."""
-    x, y = np.diff(points, axis=0).T
-    yaws = np.arctan2(y, x)
-    if len(yaws) and math.isfinite(spacing):
-        points, piece = dense(points, spacing)
-        yaws = yaws[piece]
-    return points, yaws
+    """Return points at most a spacing apart on a path, and the path's headings.
+
+    Parameters
+    ----------
+    points : (N, 2) float64
+        The corners of the path, metres.
+    spacing
+        Metres; if infinite, the points returned are the corners.
+
+    Returns
+    -------
+    (M, 2) float64 and (M - 1,) float64
+        The points, with all corners among them, and the heading from each point to the
+        next, radians.
+    """
+    dx, dy = np.diff(points, axis=0).T
+    yaw_of_pieces = np.arctan2(dy, dx)  # (N - 1,), of the straight pieces of the path
+    if len(points) < 2 or math.isinf(spacing):
+        return points, yaw_of_pieces
+    dense_points, piece_of_points = dense(points, spacing)
+    return dense_points, yaw_of_pieces[piece_of_points]
 
 
 def centres(cells: Cells, grid: GridMap) -> Float64:
-    """Return the centres of cells in metres, (N, 2)."""
+    """Return the centres of cells (x, y) of a map in metres, (N, 2)."""
     return grid.centres(np.asarray(cells, dtype=np.float64).reshape(-1, 2))
 
 
@@ -217,10 +236,10 @@ def frame_of(path: Path) -> str:
 
 
 def poses_of(path: Path, with_yaw: bool = True) -> Float64:
-    """Return the poses of a path, (N, 3): metres and radians.
+    """Return the poses of a path, (N, 3): x and y in metres, yaw in radians.
 
-    The yaw is 0 unless it is asked for. A ValueError says which pose is not finite, or
-    that there is none.
+    Without `with_yaw`, the yaw is 0. A ValueError says which pose is not finite, or
+    that the path has no pose.
     """
     messages: list[Pose] = [stamped.pose for stamped in path.poses]
     if not messages:
@@ -237,15 +256,23 @@ def poses_of(path: Path, with_yaw: bool = True) -> Float64:
     return poses
 
 
-def moved(poses: Float64, origin: Origin) -> Float64:
-    """Return poses (N, 3) in the frame in which `origin` is the pose of their frame."""
+def in_outer_frame(poses: Float64, origin: Origin) -> Float64:
+    """Return poses of one frame as poses of another one.
+
+    Parameters
+    ----------
+    poses : (N, 3) float64
+        x and y in metres, yaw in radians.
+    origin
+        The pose of the frame of the poses in the other frame.
+    """
     x, y, yaw = poses.T
     origin_x, origin_y, origin_yaw = origin
     cos = math.cos(origin_yaw)
     sin = math.sin(origin_yaw)
-    moved_x = origin_x + cos * x - sin * y
-    moved_y = origin_y + sin * x + cos * y
-    return np.column_stack([moved_x, moved_y, yaw + origin_yaw])
+    outer_x = origin_x + cos * x - sin * y
+    outer_y = origin_y + sin * x + cos * y
+    return np.column_stack([outer_x, outer_y, yaw + origin_yaw])
 
 
 def path_bytes(
@@ -268,19 +295,20 @@ def path_bytes(
     -------
     The message in OMG DDS-XTypes' plain CDR, little-endian.
     """
-    count = len(positions)
+    count = len(positions)  # N
     # The header without the four bytes that name the encoding.
     pose_header = serialize_message(header)[ENCODING_BYTES:]
-    # A path without poses ends with their number, 0.
+    # A path without poses ends with the number of its poses, 0, in four bytes.
     empty_path = serialize_message(Path(header=header))
     start = empty_path[:-4] + count.to_bytes(4, "little")
     if count == 0:
         return start
-    # Numbers are aligned to their size, 8 bytes. So each pose has the same bytes before
-    # its seven numbers, except for the first pose, which begins elsewhere.
+    # Numbers are aligned to their size, 8 bytes, from the end of the encoding on. The
+    # seven numbers of a pose end there, so all poses but the first begin aligned, and
+    # have the same bytes before their numbers.
     first_pose_header = _padded(pose_header, offset=len(start) - ENCODING_BYTES)
     next_pose_header = _padded(pose_header, offset=0)
-    header_type = f"V{len(next_pose_header)}"
+    header_type = f"V{len(next_pose_header)}"  # so many bytes
     poses = np.zeros(count, dtype=[("header", header_type), ("numbers", "<f8", 7)])
     poses["header"] = np.void(next_pose_header)
     numbers = poses["numbers"]  # (N, 7): x, y, z, and a quaternion x, y, z, w
@@ -289,12 +317,15 @@ def path_bytes(
     numbers[: len(yaw), 6] = np.cos(yaw / 2)
     if last is not None:
         numbers[-1, 3:] = (last.x, last.y, last.z, last.w)
-    content = poses.tobytes()[len(next_pose_header) :]
-    return start + first_pose_header + content
+    content = poses.tobytes()
+    return start + first_pose_header + content[len(next_pose_header) :]
 
 
 def _padded(content: bytes, offset: int) -> bytes:
-    """Return bytes that begin at an offset, with zeros up to a multiple of 8 bytes."""
+    """Return bytes with zeros appended, to end at a multiple of 8 bytes.
+
+    The offset is the position of the first byte.
+    """
     end = offset + len(content)
     return content + bytes(-end % 8)
 
@@ -309,17 +340,21 @@ def bytes_message(kind: str, data: bytes) -> UInt8MultiArray:
 
 
 def bytes_of(kind: str, message: UInt8MultiArray) -> bytes:
-    """Return the bytes of a message; a ValueError if damaged or of another kind."""
+    """Return the bytes of a kind that a message of `bytes_message` carries.
+
+    A ValueError says that they are damaged, or of another kind or version.
+    """
     data = bytes(message.data)
     label: str = message.layout.dim[0].label if message.layout.dim else ""
     expected_label = LABEL.format(kind, hashlib.sha256(data).hexdigest())
     if label == expected_label:
         return data
     wrong = f"{len(data)} bytes with the label {label!r}, not {expected_label!r}"
-    is_same_kind = label.partition(":")[0] == expected_label.partition(":")[0]
-    remedy = "let trainer and planner have one version"
-    if is_same_kind:  # the bytes were damaged
+    kind_and_version = label.partition(":")[0]
+    if kind_and_version == expected_label.partition(":")[0]:  # the bytes are damaged
         remedy = "save there again"
+    else:
+        remedy = "let trainer and planner have one version"
     raise ValueError(f"the trainer sent {wrong}; {remedy}")
 
 
@@ -357,7 +392,10 @@ def check_pose(
 
 
 def cell_from_pose(name: str, stamped: PoseStamped, grid: GridMap, frame: str) -> Cell:
-    """Return the cell of a pose, perhaps off the map; errors as of `check_pose`."""
+    """Return the cell (x, y) of a pose, which may be off the map.
+
+    A ValueError says why there is none, as in `check_pose`, whose parameters these are.
+    """
     check_pose(name, stamped, frame)
     position = stamped.pose.position
     try:
@@ -369,13 +407,13 @@ def cell_from_pose(name: str, stamped: PoseStamped, grid: GridMap, frame: str) -
 
 
 def pose_of(stamped: PoseStamped) -> Origin:
-    """Return x, y and yaw of a pose, about z alone."""
+    """Return x and y of a pose in metres, and its yaw in radians."""
     position = stamped.pose.position
     return position.x, position.y, rotation(stamped.pose.orientation).yaw
 
 
 def rotation(message: Quaternion) -> Rotation:
-    """Return the numbers of a message."""
+    """Return the rotation of a message."""
     return Rotation(message.x, message.y, message.z, message.w)
 
 
@@ -410,6 +448,10 @@ def quaternion(yaw: float) -> Quaternion:
 
 
 def _check_pose(name: str, pose: Pose) -> None:
+    """Raise a ValueError if a number of a pose is not finite, or it is no rotation.
+
+    The error calls the pose by its name.
+    """
     position: Point = pose.position
     coordinates: tuple[float, float, float] = (position.x, position.y, position.z)
     if not all(map(math.isfinite, coordinates)):
@@ -424,5 +466,6 @@ def _check_pose(name: str, pose: Pose) -> None:
 
 
 def _numbers(message: Point | Quaternion) -> str:
+    """Return the fields of a message in words, such as "x = 1, y = 2, z = 0"."""
     names = message.get_fields_and_field_types()
     return ", ".join(f"{name} = {getattr(message, name):.6g}" for name in names)

@@ -6,7 +6,7 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
 from std_msgs.msg import Header
 
-from ddqn_planner.nodes.conversions import frame_of, moved, pose_of, poses_of
+from ddqn_planner.nodes.conversions import frame_of, in_outer_frame, pose_of, poses_of
 from ddqn_planner.nodes.outcome import RequestError
 from ddqn_planner.nodes.requests import THE_START, PlanInputs, Requests, clearing_radius
 from ddqn_planner.planning.path_check import LETHAL, Float64, invalid_poses
@@ -104,7 +104,7 @@ async def poses_in_map(
     origin = PoseStamped(header=Header(frame_id=frame))
     origin.pose.orientation.w = 1.0
     origin_in_map = await requests.in_map(inputs, "the path", origin)
-    return moved(poses, pose_of(origin_in_map.message))
+    return in_outer_frame(poses, pose_of(origin_in_map.message))
 
 
 async def robot_in_map(requests: Requests, inputs: PlanInputs) -> tuple[float, float]:
