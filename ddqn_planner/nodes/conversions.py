@@ -73,9 +73,9 @@ def grid_from_message(
         If the message is no complete map in a named frame; with the remedy.
     """
     _check_map(message)
-    pose: Pose = message.info.origin
+    pose = message.info.origin
     origin = (pose.position.x, pose.position.y, rotation(pose.orientation).yaw)
-    resolution: float = message.info.resolution
+    resolution = message.info.resolution
     try:
         return grid_from_values(occupancy_values(message), resolution, origin, rules)
     except MemoryError:
@@ -86,13 +86,13 @@ def _check_map(message: OccupancyGrid) -> None:
     """Raise a ValueError with the remedy if a message is no complete map in a frame."""
     if not message.header.frame_id:
         raise ValueError("the map's frame is ''; name one in header.frame_id")
-    resolution: float = message.info.resolution
+    resolution = message.info.resolution
     finest, coarsest = RESOLUTIONS
     if not finest <= resolution <= coarsest:
         wrong = f"the map's resolution is {resolution}"
         raise ValueError(f"{wrong}; give {METRES_PER_CELL}")
-    width: int = message.info.width
-    height: int = message.info.height
+    width = message.info.width
+    height = message.info.height
     number_of_cells = width * height
     size = f"{width} x {height} cells"
     if number_of_cells == 0:
@@ -104,7 +104,7 @@ def _check_map(message: OccupancyGrid) -> None:
     if len(message.data) != number_of_cells:
         wrong = f"the map's data has {len(message.data)} values"
         raise ValueError(f"{wrong}; its {size} need {number_of_cells}")
-    origin: Pose = message.info.origin
+    origin = message.info.origin
     _check_pose("the map's origin", origin)
     if rotation(origin.orientation).tilt > MAX_TILT:
         wrong = (
@@ -380,7 +380,7 @@ def check_pose(
         If a number is not finite, the orientation is no rotation, or the frame is
         wrong.
     """
-    pose_frame: str = stamped.header.frame_id
+    pose_frame = stamped.header.frame_id
     if pose_frame and frame in ("", pose_frame):
         return _check_pose(name, stamped.pose)
     remedy = "name one in header.frame_id"
@@ -422,7 +422,7 @@ def with_unit_quaternion(stamped: PoseStamped) -> PoseStamped:
 
     `check_pose` accepts rounded quaternions; Nav2 refuses them in a path.
     """
-    pose: Pose = stamped.pose
+    pose = stamped.pose
     orientation = unit_quaternion(pose.orientation)
     if orientation is pose.orientation:
         return stamped
@@ -452,8 +452,8 @@ def _check_pose(name: str, pose: Pose) -> None:
 
     The error calls the pose by its name.
     """
-    position: Point = pose.position
-    coordinates: tuple[float, float, float] = (position.x, position.y, position.z)
+    position = pose.position
+    coordinates = (position.x, position.y, position.z)
     if not all(map(math.isfinite, coordinates)):
         wrong = f"{name}'s position is ({_numbers(position)})"
         raise ValueError(f"{wrong}; give finite numbers")

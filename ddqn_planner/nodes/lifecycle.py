@@ -248,32 +248,46 @@ class ManagedNode(BaseNode):
         if is_active or self.state == "inactive":
             self.cleanup()
 
-    def _on_get_state(self, _: Any, response: Any) -> Any:
+    def _on_get_state(
+        self, _: GetState.Request, response: GetState.Response
+    ) -> GetState.Response:
         response.current_state = _state(self.state)
         return response
 
-    def _on_get_states(self, _: Any, response: Any) -> Any:
+    def _on_get_states(
+        self, _: GetAvailableStates.Request, response: GetAvailableStates.Response
+    ) -> GetAvailableStates.Response:
         response.available_states = [_state(label) for label in STATES]
         return response
 
-    def _on_get_transitions(self, _: Any, response: Any) -> Any:
+    def _on_get_transitions(
+        self,
+        _: GetAvailableTransitions.Request,
+        response: GetAvailableTransitions.Response,
+    ) -> GetAvailableTransitions.Response:
         response.available_transitions = [
             _describe(change) for change in self._changes()
         ]
         return response
 
-    def _on_get_graph(self, _: Any, response: Any) -> Any:
+    def _on_get_graph(
+        self,
+        _: GetAvailableTransitions.Request,
+        response: GetAvailableTransitions.Response,
+    ) -> GetAvailableTransitions.Response:
         response.available_transitions = [*_transition_graph()]
         return response
 
-    async def _on_change_state(self, request: Any, response: Any) -> Any:
+    async def _on_change_state(
+        self, request: ChangeState.Request, response: ChangeState.Response
+    ) -> ChangeState.Response:
         """Do the transition with the requested label, or number if it has no label.
 
         Refuse it while another one is done, and if the state does not have it.
         """
         labels = {change.number: change.label for change in self._changes()}
-        number: int = request.transition.id
-        requested_label: str = request.transition.label
+        number = request.transition.id
+        requested_label = request.transition.label
         label = requested_label or labels.get(number, "")
         is_refused = self._is_changing or self.is_stopping
         if is_refused or label not in labels.values():

@@ -142,7 +142,9 @@ class MapServerNode(BaseNode):
         response.map = self._served
         return response
 
-    def _on_load_map(self, request: Any, response: Any) -> Any:
+    def _on_load_map(
+        self, request: LoadMap.Request, response: LoadMap.Response
+    ) -> LoadMap.Response:
         response.result = self._load(request.map_url, only_below=True)
         if response.result == LoadMap.Response.RESULT_SUCCESS:
             response.map = self._served
