@@ -265,5 +265,6 @@ class BaseNode(Node):
 
 
 def _refusal(error: Exception) -> msg.SetParametersResult:
+    """Make the result of parameters that an error refuses."""
     reason = str(error) or repr(error)
     return msg.SetParametersResult(successful=False, reason=reason)

@@ -231,6 +231,7 @@ def _marker(header: Header, action: int) -> Marker:
 
 
 def _point(x: float, y: float) -> Point:
+    """Make a point on the plane, metres."""
     point = Point()  # faster than Point(x=x, y=y)
     point.x = x
     point.y = y
@@ -250,12 +251,14 @@ def _value_message(picture: Picture) -> OccupancyGrid:
 
 
 def _empty_value_message(picture: Picture) -> OccupancyGrid:
+    """Make the message of a map on which no cell has a value."""
     request = picture.outcome.request
     assert request is not None
     return value_message(None, request.grid, picture.header)
 
 
 def _footprint_message(picture: Picture) -> MarkerArray:
+    """Make the message of a body's outlines along the path of a plan."""
     planner = picture.outcome.planner
     plan = picture.outcome.plan
     assert planner is not None

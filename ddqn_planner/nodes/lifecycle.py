@@ -342,5 +342,6 @@ class ManagedNode(BaseNode):
         )
 
     def _publish_heartbeat(self) -> None:
+        """Tell the lifecycle manager that the process lives, or that the bond ends."""
         self._heartbeat.header = self.header()
         self._heartbeat_publisher.publish(self._heartbeat)

@@ -135,6 +135,7 @@ class MapServerNode(BaseNode):
     def _on_get_map(
         self, request: GetMap.Request, response: GetMap.Response
     ) -> GetMap.Response:
+        """Answer with the map that is served, without cells if none is loaded."""
         if self._loaded is None:
             self.get_logger().warning(
                 "asked for a map, but none is loaded: the answer is empty"
@@ -145,6 +146,7 @@ class MapServerNode(BaseNode):
     def _on_load_map(
         self, request: LoadMap.Request, response: LoadMap.Response
     ) -> LoadMap.Response:
+        """Load a map; the answer has the map, or the code of the failure."""
         response.result = self._load(request.map_url, only_below=True)
         if response.result == LoadMap.Response.RESULT_SUCCESS:
             response.map = self._served

@@ -138,6 +138,7 @@ class MapSource:
         node.get_logger().info(f"waiting for a map on {self._topic}")
 
     def _subscribe_to_updates(self) -> None:
+        """Subscribe to the map's updates, or log that their package is missing."""
         topic = f"{self._topic}_updates"
         if OccupancyGridUpdate is not None:
             self._node.create_subscription(
@@ -179,7 +180,9 @@ class MapSource:
         return wait if wait < math.inf else UPDATE_WAIT
 
     def check(self) -> Header:
-        """Return the header of the map, or of the update, that is planned on.
+        """Use a map that has waited long enough; return the header of the map in use.
+
+        The header is that of the map's last update, if updates came.
 
         Raises
         ------
@@ -228,7 +231,7 @@ class MapSource:
 
     @property
     def missing(self) -> str:
-        """Why there is no map to plan on, and what to do; empty with a map."""
+        """Why `check` finds no map to plan on, and what to do; empty with a map."""
         try:
             self.check()
         except RequestError as error:
@@ -303,6 +306,7 @@ class MapSource:
 
     @property
     def _newest_map(self) -> Received | None:
+        """The map that waits, else the map in use; None without a map."""
         return self._waiting_map or self._map_in_use
 
     def _read(self, message: OccupancyGrid, last: Received | None = None) -> GridMap:
@@ -322,6 +326,7 @@ class MapSource:
         return grid
 
     def _rules(self) -> MapRules:
+        """Return how to read a map, by the node's parameters."""
         return MapRules(**{name: self._node.value(name) for name in MapRules._fields})
 
     def _patched(

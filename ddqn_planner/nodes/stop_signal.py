@@ -37,6 +37,7 @@ class StopSignal:
             signal.signal(number, self._on_signal)
 
         def wait() -> None:
+            """Wait for the first signal, and let the main thread obey it."""
             os.read(pipe_end, 1)
             # The executor looks at the flag after each callback; a task wakes it.
             self.has_come = True

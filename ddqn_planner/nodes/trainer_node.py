@@ -130,6 +130,7 @@ class TrainerNode(LearningNode):
         return map_file
 
     def _map_rules(self) -> MapRules:
+        """Return how to read a map, by the node's parameters."""
         return MapRules(
             occupied_threshold=self.value("occupied_threshold"),
             allow_unknown=self.value("allow_unknown"),
@@ -184,6 +185,7 @@ class TrainerNode(LearningNode):
             return Answer(False, f"no recorded episodes ({error}); call ~/start first")
 
         def publish_next() -> None:
+            """Publish the next beginning of an episode, or end the replay."""
             try:
                 self.publish_episode(recording.frame, next(beginnings))
             except (StopIteration, OSError):
