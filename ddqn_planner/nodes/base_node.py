@@ -62,21 +62,26 @@ class BaseNode(Node):
             self.answer_with(service, self._on_set_parameters)
 
     def _declare(self, parameters: Parameters) -> None:
-        """Declare parameters with the values of the command line and of its files."""
+        """Declare parameters with the values of the command line and of its files.
+
+        Values that nothing reads are logged.
+        """
+        # The values given, by parameter; also those that the node does not have.
         overrides = {
             parameter.name: parameter.value
             for parameter in self.handle.get_parameters(Parameter).values()
         }
         known_names = {*parameters, *self.list_parameters([], 0).names}
         self._warn_of_unread(overrides, known_names)
-        self._qualities = [name for name in overrides if name.startswith(QOS)]
-        values = read_all(
-            parameters,
-            {name: overrides[name] for name in parameters if name in overrides},
-        )
+        self._quality_overrides = [name for name in overrides if name.startswith(QOS)]
+        values_given = {
+            name: overrides[name] for name in parameters if name in overrides
+        }
+        values = read_all(parameters, values_given)
         for name, declared in parameters.items():
             value = values.get(name, declared.default)
-            # With the override, rclpy ends with its own error for a whole number.
+            # If rclpy read the override itself, a whole number for a parameter with a
+            # fraction would be its error.
             self.declare_parameter(
                 name, value, declared.descriptor(), ignore_override=True
             )
@@ -98,16 +103,16 @@ class BaseNode(Node):
         for warning in unread_sections(sys.argv, known_names, node):
             self.get_logger().warning(warning)
 
-    def tell_unread_qualities(self) -> None:
+    def warn_of_unread_qualities(self) -> None:
         """Warn of parameters ``qos_overrides`` that no subscription has read.
 
         To be called once, after all subscriptions were created.
         """
         known_names = self.list_parameters([], 0).names
         node = self.get_fully_qualified_name()
-        for warning in unread_qualities(self._qualities, known_names, node):
+        for warning in unread_qualities(self._quality_overrides, known_names, node):
             self.get_logger().warning(warning)
-        self._qualities = []
+        self._quality_overrides = []
 
     def _on_jump(self, jump: TimeJump) -> None:
         """Warn that ROS's clock was set back, and forget what depends on its time."""

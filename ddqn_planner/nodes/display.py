@@ -45,7 +45,7 @@ class Picture(NamedTuple):
         plan = self.outcome.plan
         grid = None if request is None else request.grid
         planner = None if self.is_empty else self.outcome.planner
-        # For bodies each plan's outlines are shown, for cells the field of a goal.
+        # Of a robot with a body the plan is shown, of others the field of the goal.
         path = plan if isinstance(plan, PosePlan) else None
         move_rule = request.move_rule if isinstance(request, PlanRequest) else None
         return planner, grid, plan.goal, self.outcome.goal, path, move_rule

@@ -171,7 +171,7 @@ class ManagedNode(BaseNode):
         self._publish_event(change.start, change.transition_state)
         self._publish_event(change.transition_state, change.goal)
         if label == "configure":
-            super().tell_unread_qualities()
+            super().warn_of_unread_qualities()
 
     def _publish_event(self, start: str, goal: str) -> None:
         """Tell subscribers that the node went from a start state to a goal state."""
@@ -196,7 +196,7 @@ class ManagedNode(BaseNode):
             self.shutdown()
         super().destroy_node()
 
-    def tell_unread_qualities(self) -> None:
+    def warn_of_unread_qualities(self) -> None:
         """Do nothing: a node without subscriptions logs them once it is configured."""
 
     async def prepare(self, transition: str) -> bool:
@@ -218,7 +218,7 @@ class ManagedNode(BaseNode):
 
     def deactivate(self) -> None:
         """Stop answering requests, and end the bond with the lifecycle manager."""
-        if self._heartbeat_timer is None:
+        if self._heartbeat_timer is None:  # there is no bond
             return
         self.destroy_timer(self._heartbeat_timer)
         self._heartbeat_timer = None
@@ -321,15 +321,18 @@ class ManagedNode(BaseNode):
         return f"when {self.state}"
 
     def _form_bond(self) -> None:
-        """Let a lifecycle manager see that the process lives."""
+        """Publish from now on that the process lives, for a lifecycle manager.
+
+        Without the package bond, log that instead.
+        """
         try:
             from bond.msg import Status
         except ImportError:
             remedy = f"{apt_install('bond')}, or set bond_timeout to 0.0 in its manager"
             self.get_logger().info(f"no bond: bond is not installed; {remedy}")
             return
-        # As bondpy does, without a subscription: the topic has the bonds of all nodes,
-        # each ten times per second.
+        # As bondpy does, except for its subscription: the topic has the heartbeats of
+        # all nodes' bonds, each ten times per second.
         self._heartbeat = Status(
             id=self.get_name(), instance_id=str(uuid4()), active=True
         )

@@ -373,7 +373,7 @@ class MapSource:
         received.time = self.arrivals.note()
 
     def use_waiting_map(self) -> None:
-        """Plan on the newer map that waits, if one waits, unless it still has to."""
+        """Plan on the map that waits from now on, unless it has to wait for longer."""
         received = self._waiting_map
         if received is None:
             return

@@ -55,7 +55,7 @@ def spin_until_shutdown(
             _warn_of_unread_arguments()
         node = make_node()
         if isinstance(node, BaseNode):
-            node.tell_unread_qualities()
+            node.warn_of_unread_qualities()
     except (
         NameValidationException,
         ParameterException,
