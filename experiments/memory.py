@@ -34,7 +34,7 @@ def measure_layers(fixture: ros.MapFixture) -> None:
     layers = [
         value.nbytes for value in vars(grid).values() if isinstance(value, np.ndarray)
     ]
-    patches = field.costs.patch.nbytes if field.costs is not None else 0
+    patches = field.costs.patch_number.nbytes if field.costs is not None else 0
     cells = grid.occupancy.size
     sizes = {
         "message": cells,

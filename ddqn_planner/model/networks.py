@@ -12,8 +12,8 @@ from ddqn_planner.grid import LENGTHS, MOVES, OCCUPIED, UNKNOWN, Cell, GridMap, 
 from ddqn_planner.model.certificate import MOVE_RULES, Certificate, certify
 from ddqn_planner.model.move_costs import (
     CENTRE,
+    COST_CODES,
     MAX_MULTIPLIER,
-    VALUES,
     MoveCosts,
     every_patch,
     legal_in_patches,
@@ -295,7 +295,7 @@ class PropagationQNetwork(QNetwork):
         if key not in self._proved:
             self._proved[key] = self._proved_costs(move_rule, with_costs, timed)
         costs = self._proved[key]
-        return None if costs is None else costs.on(grid)
+        return None if costs is None else costs.on_map(grid)
 
     def _proved_costs(
         self, move_rule: MoveRule, with_costs: bool, timed: bool
@@ -336,7 +336,7 @@ class PropagationQNetwork(QNetwork):
         return costs._replace(
             terms=term_2AL.ravel() + half,
             highest=costs.highest * highest,
-            low=_least_multipliers(term_2AL),
+            least_by_cost_code=_least_multipliers(term_2AL),
         )
 
     def _price_terms(self, move_rule: MoveRule) -> Array:
@@ -346,7 +346,7 @@ class PropagationQNetwork(QNetwork):
         """
         weight_AI = self.tensors["prices.weight"]
         occupied_9A, cost_9A, unknown_9A = weight_AI[:, :27].T.reshape(3, 9, -1)
-        term_9AL = np.empty((9, len(MOVES), VALUES), dtype=np.float32)
+        term_9AL = np.empty((9, len(MOVES), COST_CODES), dtype=np.float32)
         term_9AL[..., 0] = unknown_9A
         term_9AL[..., 1:-1] = cost_9A[..., None] * (np.arange(OCCUPIED) / 100)
         term_9AL[..., -1] = occupied_9A
@@ -370,7 +370,7 @@ class PropagationQNetwork(QNetwork):
         if self.uses_costs and grid.cost is not None and not timed:
             patch_C, patch_P9 = unique_patches(grid.occupancy, grid.cost)
         table_PA = self._costs_of(patch_P9, move_rule, timed)
-        return MoveCosts.of_table(table_PA).on(grid, patch_C)
+        return MoveCosts.of_table(table_PA).on_map(grid, patch_C)
 
     def _costs_of(
         self, patch_P9: NDArray[np.int8], move_rule: MoveRule, timed: bool

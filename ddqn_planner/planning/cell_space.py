@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place, inlined, inner, specialised
 from ddqn_planner.grid import MOVES
-from ddqn_planner.model.move_costs import MARGIN, VALUES, MoveCosts
+from ddqn_planner.model.move_costs import COST_CODES, MARGIN, MoveCosts
 from ddqn_planner.planning.queues import (
     Buckets,
     advance_buckets,
@@ -57,7 +57,7 @@ LOWEST_BIT = np.array(
 )
 # Unsigned, as numba then looks for no index that counts from the end.
 ONE, ACTIONS, TERMS_OF_ACTION, TERMS_AFTER = np.array(
-    [1, 8, VALUES, 8 * VALUES], np.uint64
+    [1, 8, COST_CODES, 8 * COST_CODES], np.uint64
 )
 
 
@@ -76,9 +76,9 @@ class Known(NamedTuple):
 class StepCosts(NamedTuple):
     """The part of `MoveCosts` that compiled code uses."""
 
-    patch: NDArray[Any]
+    patch_number: NDArray[Any]
     table: NDArray[np.float32]
-    value: NDArray[np.uint8]
+    cost_code: NDArray[np.uint8]
     terms: NDArray[np.float32]
     multiplier: NDArray[np.float32]
     width: int
@@ -87,9 +87,9 @@ class StepCosts(NamedTuple):
 def step_costs(costs: MoveCosts) -> StepCosts:
     """Return the part of some costs that compiled code uses."""
     return StepCosts(
-        costs.patch,
+        costs.patch_number,
         costs.table,
-        costs.value,
+        costs.cost_code,
         costs.terms,
         costs.multiplier,
         costs.width,
@@ -118,14 +118,16 @@ def cost_of(cell: int, action: int, costs: Any) -> Any:
     """Return the cost of a move, infinite if it is not possible. See `MoveCosts`."""
     begin = np.uint64(cell)
     end = np.uint64(cell + MOVE_Y[action] * costs.width + MOVE_X[action])
-    cost = costs.table[ACTIONS * np.uint64(costs.patch[begin]) + np.uint64(action)]
+    cost = costs.table[
+        ACTIONS * np.uint64(costs.patch_number[begin]) + np.uint64(action)
+    ]
     if costs.multiplier.size > 0:
         # One of them as float64, so that the sum is no float32.
         return cost * (np.float64(costs.multiplier[begin]) + costs.multiplier[end]) / 2
     if costs.terms.size > 0:
         first = np.uint64(action) * TERMS_OF_ACTION
-        term_of_begin = costs.terms[first + costs.value[begin]]
-        cost *= term_of_begin + costs.terms[first + TERMS_AFTER + costs.value[end]]
+        term_of_begin = costs.terms[first + costs.cost_code[begin]]
+        cost *= term_of_begin + costs.terms[first + TERMS_AFTER + costs.cost_code[end]]
     return np.float64(cost)
 
 
@@ -156,15 +158,15 @@ def _expand_cell(
     # which the processor would often predict wrong.
     cheaper_by = np.uint64(0)
     term_after = TERMS_AFTER + np.uint64(
-        costs.value[cell] if costs.terms.size > 0 else 0
+        costs.cost_code[cell] if costs.terms.size > 0 else 0
     )
     for number in range(8):
         action = np.uint64(number)
         previous = cell - space.offset[action]
-        step = costs.table[ACTIONS * np.uint64(costs.patch[previous]) + action]
+        step = costs.table[ACTIONS * np.uint64(costs.patch_number[previous]) + action]
         if costs.terms.size > 0:
             first = TERMS_OF_ACTION * action
-            term = costs.terms[first + costs.value[previous]]
+            term = costs.terms[first + costs.cost_code[previous]]
             step *= term + costs.terms[first + term_after]
         cost_before = distance[previous] if distance[previous] > 0 else np.inf
         cheaper_by |= np.uint64(cost_from_cell + step < cost_before) << action
@@ -254,12 +256,12 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
 
 def _space_toward(start: int, costs: MoveCosts) -> CellSpace:
     """Return the space with lower bounds toward a start; with bounds of 0 for cell 0."""
-    rounded_down = costs.least * (1 - 1e-7) if start else 0.0
+    rounded_down = costs.least_multiplier * (1 - 1e-7) if start else 0.0
     bound = LowerBound(
         start_x=start % costs.width,
         start_y=start // costs.width,
-        straight=costs.straight * rounded_down,
-        diagonal=costs.diagonal * rounded_down,
+        straight=costs.cheapest_straight * rounded_down,
+        diagonal=costs.cheapest_diagonal * rounded_down,
     )
     offset = (MOVE_Y * costs.width + MOVE_X).astype(np.uint64)
     return CellSpace(step_costs(costs), bound, offset)
@@ -327,8 +329,8 @@ def _rows_around(
     opened: NDArray[np.int32], start: int, costs: MoveCosts
 ) -> tuple[int, int]:
     """Return the first row of the map to read before a field grows, and their end."""
-    height = costs.patch.size // costs.width - 2
-    if not start or costs.rows is None or not opened.size:
+    height = costs.patch_number.size // costs.width - 2
+    if not start or costs.rows_read is None or not opened.size:
         return 0, height
     cells = start, int(opened.min()), int(opened.max())
     rows = [cell // costs.width - 1 for cell in cells]
@@ -337,7 +339,7 @@ def _rows_around(
 
 def _read_rows(costs: MoveCosts, first_row: int, end_row: int) -> Closable | None:
     """Read rows of the map; return the cells that may be closed, None for all."""
-    cells = costs.read(first_row, end_row)
+    cells = costs.read_rows(first_row, end_row)
     return None if cells is None else Closable(*cells)
 
 

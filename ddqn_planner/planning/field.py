@@ -169,7 +169,7 @@ class DistanceField(QField):
 
     def _goals_alone(self) -> Known:
         """Return what is known before any growth."""
-        cells = self.costs.patch.size
+        cells = self.costs.patch_number.size
         distance = np.zeros(cells)
         mark = np.zeros(cells, np.uint8)
         roots = np.array([self._number(goal) for goal in self.goals], np.int32)
@@ -242,7 +242,7 @@ class DistanceField(QField):
         limit = most_repaired if start is None else REPAIRED
         with old._lock:
             # A repair may look at any cell, also where the older field read no rows.
-            self.costs.read(0, self.grid.height)
+            self.costs.read_rows(0, self.grid.height)
             known = old._take_known()
             repaired = cell_space.take_back(known, self.costs, changed, limit)
             while repaired is None:
@@ -261,7 +261,7 @@ class DistanceField(QField):
         Moves of the neighbours may differ, too. On the map's border there are none.
         """
         width = self.costs.width
-        end = self.costs.patch.size - width - 1
+        end = self.costs.patch_number.size - width - 1
         offsets = (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel()  # (9,)
         numbers = (offsets[:, None] + self._number(cells.T)).astype(np.int32)  # (9, N)
         inside = np.sort(numbers[(numbers > width) & (numbers < end)])
@@ -279,7 +279,8 @@ class DistanceField(QField):
     def q(self) -> NDArray[np.float32]:  # type: ignore[override]
         """(8, H, W) float32: Q(s, a); -inf where no path to the goal begins with the action."""
         return self._layer(
-            cell_space.write_q, np.full((8, self.costs.patch.size), -np.inf, np.float32)
+            cell_space.write_q,
+            np.full((8, self.costs.patch_number.size), -np.inf, np.float32),
         )
 
     @cached_property
@@ -291,7 +292,8 @@ class DistanceField(QField):
     def value(self) -> NDArray[np.float32]:
         """(H, W) float32: the greatest Q of a legal move, and at the goal the greatest of all."""
         value = self._layer(
-            cell_space.write_value, np.full(self.costs.patch.size, -np.inf, np.float32)
+            cell_space.write_value,
+            np.full(self.costs.patch_number.size, -np.inf, np.float32),
         )
         greatest = value.max()
         for x, y in self.goals:
@@ -302,7 +304,7 @@ class DistanceField(QField):
     def policy(self) -> NDArray[np.int8]:
         """(H, W) int8: the action of a rollout in each cell; -1 without one."""
         return self._layer(
-            cell_space.write_policy, np.full(self.costs.patch.size, -1, np.int8)
+            cell_space.write_policy, np.full(self.costs.patch_number.size, -1, np.int8)
         )
 
     @property
@@ -310,7 +312,7 @@ class DistanceField(QField):
         """Memory, bytes: 9 per cell for what is known, and that of its arrays."""
         known = self._known  # None while another thread computes it
         opened = 0 if known is None else known.opened.nbytes
-        return 9 * self.costs.patch.size + opened + super().nbytes
+        return 9 * self.costs.patch_number.size + opened + super().nbytes
 
 
 def _is_final(known: Known, number: int) -> bool:
@@ -390,7 +392,7 @@ class FieldCache:
             boxes = grid.patches_since(field.grid)
             if (
                 boxes is not None
-                and (costs := field.costs.after(grid, boxes)) is not None
+                and (costs := field.costs.on_changed_map(grid, boxes)) is not None
             ):
                 return costs
         return self.network.move_costs(grid, rule)

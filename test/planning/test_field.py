@@ -154,7 +154,7 @@ def propagate_values(
     """Return Q(s, a) toward a goal, given the costs of each patch: (8, H, W)."""
     grid = GridMap(np.zeros(patch_id.shape))
     patch_C = np.pad(patch_id, 1, constant_values=len(cost_PA)).ravel()
-    costs = MoveCosts.of_table(cost_PA).on(grid, patch_C)
+    costs = MoveCosts.of_table(cost_PA).on_map(grid, patch_C)
     return DistanceField((goal,), grid, costs, MoveRule.ROBOT_SAFE).q
 
 
@@ -318,7 +318,7 @@ def test_a_map_made_of_others_is_as_new(
         costs, new = (one.fields.costs(grid, rule) for one in (planner, new_planner()))
         assert costs is not None
         assert new is not None
-        for layer in ("patch", "value", "multiplier"):
+        for layer in ("patch_number", "cost_code", "multiplier"):
             np.testing.assert_array_equal(getattr(costs, layer), getattr(new, layer))
         if data.draw(st.booleans(), label="compare"):
             assert_same(
@@ -359,9 +359,9 @@ def test_no_move_costs_more_than_the_highest_or_less_than_the_least(
     exact = move_costs(grid.cost_multiplier)
     legal = grid.legal_moves(rule)
     assert exact.max(initial=0, where=legal) <= 1.01 * costs.highest
-    for first, bound in ((0, costs.straight), (1, costs.diagonal)):
+    for first, bound in ((0, costs.cheapest_straight), (1, costs.cheapest_diagonal)):
         least = exact[first::2].min(initial=np.inf, where=legal[first::2])
-        assert 1.01 * least >= costs.least * bound
+        assert 1.01 * least >= costs.least_multiplier * bound
 
 
 @pytest.mark.parametrize("slowness", [None, np.full((31, 31), 3)])
@@ -611,7 +611,7 @@ def test_few_rows_of_a_large_map_are_read(monkeypatch: pytest.MonkeyPatch) -> No
     assert planner.plan(grid, (500, 500), (560, 500)).path.size
     (field,) = planner.fields._kept
     assert isinstance(field, DistanceField)
-    rows = field.costs.rows
+    rows = field.costs.rows_read
     assert rows is not None
     assert 0 < rows.first < 500 < rows.end < side
     assert rows.end - rows.first < 300
@@ -619,7 +619,7 @@ def test_few_rows_of_a_large_map_are_read(monkeypatch: pytest.MonkeyPatch) -> No
     planner.plan(grid.with_patch([[True]], 505, 500), (500, 500), (560, 500))
     (field,) = planner.fields._kept
     assert isinstance(field, DistanceField)
-    assert field.costs.rows is None
+    assert field.costs.rows_read is None
     # Around a wall, it has to look on.
     wall = np.zeros((side, side), np.bool_)
     wall[1:, 530] = True
