@@ -18,11 +18,17 @@ Float64: TypeAlias = NDArray[np.float64]
 
 # Shapes: P = patterns of occupied cells around a free one, 256 for each rule, A = 8
 # actions, F = filters, I = inputs, C = 18 inputs for costs and unknown cells, U =
-# outputs of a layer, B = a batch, V = 101 values of a free cell: the costs 0 to 99, and
-# last unknown.
+# outputs of a layer, B = a batch of decisions or patches, V = 101 values of a free
+# cell: the costs 0 to 99, and last unknown.
 
 MOVE_RULES: Final = (MoveRule.ROBOT_SAFE, MoveRule.CORNER_CUTTING)
+# The inputs of a network that observes costs: whether each cell of the patch is
+# occupied (9), its cost, 0 to 0.99 (9), whether it is unknown (9), and the rule (1).
+OCCUPIED_INPUTS = slice(0, 9)
 COSTS = slice(9, 27)  # the inputs for costs and unknown cells
+RULE_INPUTS = slice(27, None)
+# The numbers that the planner adds for a multiplier: 28 inputs, a bias, and the 1.
+TERMS_OF_MULTIPLIER = COSTS.stop + 3
 NO_CERTIFICATE = (
     "nothing can be proved: the moves depend on the whole map, not on 3x3 patches"
 )
@@ -107,7 +113,13 @@ def _percent(error: float) -> str:
 def certify(
     network: PatchNetwork, move_rules: Sequence[MoveRule] = MOVE_RULES
 ) -> Certificate:
-    """Prove which moves a network takes for possible; bound its costs' errors."""
+    """Prove which moves a network takes for possible; bound its costs' errors.
+
+    A decision is whether an action is possible where the cells of a 3x3 patch are
+    occupied so, under a rule. It is proved if it is right for all costs of the free
+    cells, and for all unknown cells among them.
+    """
+    # Here P = the 512 patches of each rule; then only the patterns with a free centre.
     every_P9 = every_patch()
     features = [network.features(every_P9, rule) for rule in move_rules]
     legal_PA = np.concatenate([legal_in_patches(every_P9, rule) for rule in move_rules])
@@ -116,7 +128,7 @@ def certify(
     if network.sizes["filters"] > MAX_FILTERS:
         return Certificate(decisions, decisions, 0, 0.0, math.inf)
     with np.errstate(over="ignore", invalid="ignore"):  # a broken model may overflow
-        # Of all patches of a rule at once, as in the planner: so the floats are equal.
+        # All patches of a rule at once, as in the planner: so the floats are equal.
         tries_PA = np.concatenate([network.tries(inputs) for inputs in features])
         tries = float(tries_PA[legal_PA].max())
         feature_PI = np.concatenate(features)[is_free_P]
@@ -138,10 +150,14 @@ def certify(
 
 
 class Margins(NamedTuple):
-    """How far each logit is on its right side of 0, at least, for all costs."""
+    """Lower bounds of the distance of each logit from 0 on its right side.
 
-    margin: Float64  # (P, A)
-    # How much the bound grows with each cost and unknown cell, of which it is a sum.
+    A logit is the number of which the network computes an action's probability. It
+    should be above 0 for a legal action and below 0 for any other.
+    """
+
+    margin: Float64  # (P, A): for all costs and unknown cells; above 0 if proved
+    # How much the bound grows with each input for a cost or an unknown cell.
     gain: Float64  # (C, P, A)
 
 
@@ -152,106 +168,168 @@ def _count_wrong(
     margins: Margins,
     open_PA: NDArray[np.bool_],
 ) -> int:
-    """Return how many open decisions are wrong for the costs of the least margin."""
+    """Return how many open decisions are wrong for the costs of the least margin.
+
+    The network itself is asked, with one example of costs for each open decision.
+
+    Parameters
+    ----------
+    network : PatchNetwork
+    feature_PI : (P, I) float32
+        The inputs of each pattern.
+    legal_PA : (P, A) bool
+    margins : Margins
+    open_PA : (P, A) bool
+        The decisions that are not proved; B of them.
+    """
     pattern_B, action_B = np.nonzero(open_PA)
     # The margin is least where each free cell has the cost 0, the greatest cost, or is
-    # unknown.
-    gain_29B = margins.gain.reshape(-1, 9, *legal_PA.shape)[:, :, pattern_B, action_B]
+    # unknown: (3, 9, B), what these add for each cell of the patch. A network that does
+    # not observe costs has (1, 9, B), and its examples have costs of 0.
+    gain_29PA = margins.gain.reshape(-1, 9, *legal_PA.shape)
+    gain_29B = gain_29PA[:, :, pattern_B, action_B]
     gain_39B = np.pad(gain_29B, ((1, 0), (0, 0), (0, 0)))  # a cost of 0 adds nothing
     value_3 = np.array([0, OCCUPIED - 1, UNKNOWN], np.int8)
     worst_B9 = value_3[gain_39B.argmin(axis=0)].T
-    occupied_B9 = feature_PI[pattern_B, :9] > 0
+    occupied_B9 = feature_PI[pattern_B, OCCUPIED_INPUTS] > 0
     example_B9 = np.where(occupied_B9, OCCUPIED, worst_B9)
     example_BI = network.features(example_B9, MOVE_RULES[0])
-    example_BI[:, 27:] = feature_PI[pattern_B, 27:]  # the rule of the pattern
+    # The pattern was made for its own move rule.
+    example_BI[:, RULE_INPUTS] = feature_PI[pattern_B, RULE_INPUTS]
     success_BA = network.success(example_BI)
-    possible_B = success_BA[np.arange(len(action_B)), action_B] > 0.5
-    return int(np.count_nonzero(possible_B != legal_PA[pattern_B, action_B]))
+    is_possible_B = success_BA[np.arange(len(action_B)), action_B] > 0.5
+    is_legal_B = legal_PA[pattern_B, action_B]
+    return int(np.count_nonzero(is_possible_B != is_legal_B))
 
 
 def logit_margins(
     network: PatchNetwork, feature_PI: Float32, legal_PA: NDArray[np.bool_]
 ) -> Margins:
-    """Bound how far each logit is on its right side of 0."""
-    # Two lines enclose a ReLU, so two linear functions enclose a logit (CROWN, Zhang et
-    # al. 2018). With one slope for both lines, one product gives the bounds of a hidden
-    # layer (Fast-Lin, Weng et al. 2018).
+    """Bound how far each logit is on its right side of 0.
+
+    Parameters
+    ----------
+    network : PatchNetwork
+    feature_PI : (P, I) float32
+        The inputs of each pattern; those for costs and unknown cells are 0.
+    legal_PA : (P, A) bool
+        Which actions are legal: their logits should be above 0.
+    """
     tensors = {
         name: tensor.astype(np.float64) for name, tensor in network.tensors.items()
     }
-    # Copies, as arrays in another order than the rest are slow.
-    weight_IF = tensors["convolution.weight"].T.copy()
-    hidden_FF = tensors["hidden.weight"].T.copy()
-    base_PF = feature_PI @ weight_IF + tensors["convolution.bias"]
-    low_PF, high_PF = _extremes(weight_IF[COSTS, None], feature_PI)
-    first = _Lines(base_PF + low_PF, base_PF + high_PF)
+    first, second = _lines_of_layers(tensors, feature_PI)
 
-    # With the upper line's slope for both lines, only their distance differs.
-    base_PF = (first.slope * base_PF) @ hidden_FF + tensors["hidden.bias"]
-    weight_CPF = (first.slope * weight_IF[COSTS, None]) @ hidden_FF
-    low_PF, high_PF = _extremes(weight_CPF, feature_PI)
-    low_PF += first.distance @ np.minimum(hidden_FF, 0)
-    high_PF += first.distance @ np.maximum(hidden_FF, 0)
-    second = _Lines(base_PF + low_PF, base_PF + high_PF)
-
-    # Back from the logits, each with its right sign: a positive weight multiplies at
-    # least its lower line.
+    # Two lines enclose a ReLU, so two linear functions enclose a logit (CROWN, Zhang et
+    # al. 2018). From the logits, each with its right sign, back through the layers:
+    # logit >= bound + weight @ the layer's ReLUs.
     sign_AP = np.where(legal_PA, 1.0, -1.0).T
     bound_AP = sign_AP * tensors["moves.bias"][:, None]
     weight_APF = sign_AP[..., None] * tensors["moves.weight"][:, None]
     for layer, lines in (("hidden", second), ("convolution", first)):
+        # Each ReLU is replaced by a line: with a negative weight by the line above it,
+        # with a positive weight by the line below.
         bound_AP += (np.minimum(weight_APF, 0) * lines.distance).sum(axis=2)
         weight_APF *= np.where(weight_APF > 0, lines.lower_slope, lines.slope)
+        # The lines' inputs are the layer's outputs.
         bound_AP += weight_APF @ tensors[f"{layer}.bias"]
         weight_APF = weight_APF @ tensors[f"{layer}.weight"]
-    weight_API = weight_APF  # after the first layer, by inputs
+    weight_API = weight_APF  # after the first layer, the weights of the inputs
+
     bound_AP += (weight_API * feature_PI).sum(axis=2)
     gain_CPA = weight_API[..., COSTS].transpose(2, 1, 0)
-    low_PA, _ = _extremes(gain_CPA, feature_PI)
+    least_sum_PA, _ = _extremes(gain_CPA, feature_PI)
     greatest_of_input = [
         ("convolution", np.ones_like(feature_PI[0])),
         ("hidden", first.greatest),
         ("moves", second.greatest),
     ]
     rounding_A = _rounding_error(network, greatest_of_input)
-    return Margins(bound_AP.T + low_PA - rounding_A, gain_CPA)
+    return Margins(bound_AP.T + least_sum_PA - rounding_A, gain_CPA)
+
+
+def _lines_of_layers(
+    tensors: dict[str, Float64], feature_PI: Float32
+) -> tuple[_Lines, _Lines]:
+    """Return the lines around the ReLUs of the convolution and of the hidden layer.
+
+    The inputs of a ReLU are bounded by the least and greatest sums for all costs and
+    unknown cells. With one slope for both lines around a ReLU, one product gives the
+    bounds of the hidden layer (Fast-Lin, Weng et al. 2018).
+    """
+    # Copies, as products with transposed arrays are slow.
+    weight_IF = tensors["convolution.weight"].T.copy()
+    hidden_FF = tensors["hidden.weight"].T.copy()
+    base_PF = feature_PI @ weight_IF + tensors["convolution.bias"]  # without costs
+    least_PF, greatest_PF = _extremes(weight_IF[COSTS, None], feature_PI)
+    first = _Lines(base_PF + least_PF, base_PF + greatest_PF)
+
+    # With the upper line's slope for both lines, only their distance differs.
+    base_PF = (first.slope * base_PF) @ hidden_FF + tensors["hidden.bias"]
+    weight_CPF = (first.slope * weight_IF[COSTS, None]) @ hidden_FF
+    least_PF, greatest_PF = _extremes(weight_CPF, feature_PI)
+    least_PF += first.distance @ np.minimum(hidden_FF, 0)
+    greatest_PF += first.distance @ np.maximum(hidden_FF, 0)
+    second = _Lines(base_PF + least_PF, base_PF + greatest_PF)
+    return first, second
 
 
 class _Lines:
-    """Lines around ReLUs of bounded inputs.
+    """Lines around the ReLUs of a layer, whose inputs are bounded.
 
-    Above a ReLU lies slope * x + distance, and below it slope * x.
+    Above a ReLU of x lies slope * x + distance. Below it lies slope * x, and also
+    lower_slope * x, which fits better.
     """
 
-    def __init__(self, low_PF: Float64, high_PF: Float64) -> None:
-        above = np.maximum(high_PF, 0)
-        below = np.minimum(low_PF, 0)
-        self.slope = above / np.maximum(above - below, np.finfo(np.float64).tiny)
-        self.distance = -below * self.slope
-        # Below the ReLU lies this line, too: its slope is 0 or 1, as fits better.
-        self.lower_slope = (high_PF > -low_PF).astype(np.float64)
-        self.greatest = above.max(axis=0).astype(np.float32)
+    def __init__(self, least_PF: Float64, greatest_PF: Float64) -> None:
+        """Take the least and the greatest input of each ReLU."""
+        greatest_output_PF = np.maximum(greatest_PF, 0)
+        below_0_PF = np.minimum(least_PF, 0)
+        # The upper line leads from (least, 0) to (greatest, greatest) if these lie on
+        # both sides of 0. The tiny divisor stands for 0 where no input is above 0.
+        width_PF = greatest_output_PF - below_0_PF
+        self.slope = greatest_output_PF / np.maximum(
+            width_PF, np.finfo(np.float64).tiny
+        )
+        self.distance = -below_0_PF * self.slope
+        self.lower_slope = (greatest_PF > -least_PF).astype(np.float64)  # 0 or 1
+        # (F,): the greatest output of each ReLU for all patterns.
+        self.greatest = greatest_output_PF.max(axis=0).astype(np.float32)
 
 
-def _extremes(
-    weight_CPU: Float64, feature_PI: NDArray[np.float32]
-) -> tuple[Float64, Float64]:
-    """Return the least and greatest weighted sums of costs and unknowns: (P, U)."""
-    # A free cell has a cost of 0 to 1, or it is unknown.
+def _extremes(weight_CPU: Float64, feature_PI: Float32) -> tuple[Float64, Float64]:
+    """Return the least and greatest weighted sums of costs and unknowns: (P, U).
+
+    Parameters
+    ----------
+    weight_CPU : (18, P or 1, U)
+        The weights of the 9 inputs for costs, then of the 9 for unknown cells.
+    feature_PI : (P, I) float32
+        The inputs of each pattern, which tell the occupied cells.
+    """
     cells = len(weight_CPU) // 2
-    choice_29PU = weight_CPU.reshape(2, cells, *weight_CPU.shape[1:])
-    choice_29PU = choice_29PU * (1 - feature_PI.T[:cells, :, None])
-    low_9PU = choice_29PU.min(axis=0, initial=0)
-    high_9PU = choice_29PU.max(axis=0, initial=0)
-    return low_9PU.sum(axis=0), high_9PU.sum(axis=0)
+    is_free_9P1 = 1 - feature_PI.T[:cells, :, None]
+    weight_29PU = weight_CPU.reshape(2, cells, *weight_CPU.shape[1:])
+    # A free cell adds from 0 to the weight of its cost, or the weight for unknown.
+    term_29PU = weight_29PU * is_free_9P1
+    least_9PU = term_29PU.min(axis=0, initial=0)
+    greatest_9PU = term_29PU.max(axis=0, initial=0)
+    return least_9PU.sum(axis=0), greatest_9PU.sum(axis=0)
 
 
 def _multiplier_error(
     network: PatchNetwork, feature_PI: Float32, legal_PA: NDArray[np.bool_]
 ) -> float:
-    """Return the greatest relative error of legal moves' cost multipliers.
+    """Bound the relative error of legal moves' cost multipliers, for all costs.
 
-    All costs of cells count.
+    The network computes a multiplier as 1 + max(0, sum of weighted inputs).
+
+    Parameters
+    ----------
+    network : PatchNetwork
+    feature_PI : (P, I) float32
+        The inputs of each pattern; those for costs and unknown cells are 0.
+    legal_PA : (P, A) bool
     """
     if not network.uses_costs:  # 1 instead of at most the greatest multiplier
         return 1 - 1 / MAX_COST_MULTIPLIER
@@ -260,91 +338,109 @@ def _multiplier_error(
     # Every pair of costs of a move's two cells is tried. The layer should add nothing
     # for the other inputs: their least and greatest sums are enough.
     action_A = np.arange(len(MOVES))
-    cell_2A = CENTRE + np.outer([0, 1], MOVES @ [1, 3])  # of the patch
-    cost_2A = COSTS.start + cell_2A
-    unknown_2A = cost_2A + 9
-    other_IA = weight_IA.copy()
-    for input_2A in (cell_2A, cost_2A, unknown_2A):
-        other_IA[input_2A, action_A] = 0
-    base_PA = feature_PI @ other_IA + bias_A
-    low_PA, high_PA = _extremes(other_IA[COSTS, None], feature_PI)
-    size_A = np.abs(other_IA).sum(axis=0) + np.abs(bias_A)
+    # (2, A): the cell of the 3x3 patch before each move, and the cell after it.
+    cell_2A = CENTRE + np.outer([0, 1], MOVES @ [1, 3])
+    cost_input_2A = COSTS.start + cell_2A
+    unknown_input_2A = cost_input_2A + 9
+    other_weight_IA = weight_IA.copy()
+    for input_2A in (cell_2A, cost_input_2A, unknown_input_2A):
+        other_weight_IA[input_2A, action_A] = 0
+    base_PA = feature_PI @ other_weight_IA + bias_A
+    least_PA, greatest_PA = _extremes(other_weight_IA[COSTS, None], feature_PI)
+    size_A = np.abs(other_weight_IA).sum(axis=0) + np.abs(bias_A)
     errors = [0.0]
     for cuts_corners in (False, True):
         legal_of_rule_PA = legal_PA & (feature_PI[:, -1:] == cuts_corners)
         for action in np.flatnonzero(legal_of_rule_PA.any(axis=0)):
-            legal_P = legal_of_rule_PA[:, action]
+            is_legal_P = legal_of_rule_PA[:, action]
             other_inputs = _OtherInputs(
-                low=float((base_PA + low_PA)[legal_P, action].min()),
-                high=float((base_PA + high_PA)[legal_P, action].max()),
-                size=float(size_A[action]),
+                least=float((base_PA + least_PA)[is_legal_P, action].min()),
+                greatest=float((base_PA + greatest_PA)[is_legal_P, action].max()),
+                sum_of_sizes=float(size_A[action]),
             )
-            cost_2 = weight_IA[cost_2A[:, action], action]
-            unknown_2 = weight_IA[unknown_2A[:, action], action]
-            errors.append(_error_of_pairs(cost_2, unknown_2, other_inputs))
+            cost_weight_2 = weight_IA[cost_input_2A[:, action], action]
+            unknown_weight_2 = weight_IA[unknown_input_2A[:, action], action]
+            errors.append(
+                _error_of_pairs(cost_weight_2, unknown_weight_2, other_inputs)
+            )
     error = float(np.max(errors))  # NaN if one of them is
     return math.inf if math.isnan(error) else error
 
 
 class _OtherInputs(NamedTuple):
-    """The sum that the layer of multipliers adds for all but the move's two costs."""
+    """What an action's bias and all inputs except those for its two cells add up to."""
 
-    low: float
-    high: float
-    size: float  # the greatest sum of the terms' sizes
+    least: float  # for all legal patterns, costs and unknown cells
+    greatest: float
+    sum_of_sizes: float  # the sum of the weights' and the bias's absolute values
 
 
 def _error_of_pairs(
-    cost_2: Float64, unknown_2: Float64, other_inputs: _OtherInputs
+    cost_weight_2: Float64, unknown_weight_2: Float64, other_inputs: _OtherInputs
 ) -> float:
-    """Return the greatest relative error of a multiplier for all values of two cells.
+    """Bound the relative error of an action's multiplier, for all pairs of cell values.
+
+    A move leads from a cell before to a cell after it. Each of the two is free with a
+    cost of 0 to 99, or unknown: V = 101 values. The multiplier should be 1 for two
+    cells of cost 0 and grow with their mean cost, where unknown counts like 100.
 
     Parameters
     ----------
-    cost_2 : (2,)
-        The weights of the inputs for the costs of the cell before a move and of the cell
-        after it. These inputs are 0 to 0.99.
-    unknown_2 : (2,)
-        The weights of the inputs that say that the cell before, or after, is unknown.
+    cost_weight_2 : (2,)
+        The weights of the inputs for the costs of the cell before and the cell after.
+        The input for a cost is the cost / 100.
+    unknown_weight_2 : (2,)
+        The weights of the inputs that are 1 if the cell before, or after, is unknown.
     other_inputs : _OtherInputs
-        The least and the greatest sum of all other inputs, and of their sizes.
+        The bounds of all that is added for other inputs.
     """
-    # (V,), V values of a cell: the costs 0 to 0.99, and last unknown, which costs most.
-    share_V = np.append(np.arange(OCCUPIED) / OCCUPIED, 1.0)
-    before_V = np.append(cost_2[0] * share_V[:-1], unknown_2[0])
-    after_V = np.append(cost_2[1] * share_V[:-1], unknown_2[1])
-    sum_VV = before_V[:, None] + after_V
-    mean_share_VV = (share_V[:, None] + share_V) / 2
+    share_V = _terms_of_values(1.0, 1.0)  # of the greatest surcharge
+    mean_share_VV = (share_V[:, None] + share_V) / 2  # rows: before, columns: after
     true_VV = 1 + (MAX_COST_MULTIPLIER - 1) * mean_share_VV
-    above_VV = 1 + np.maximum(sum_VV + other_inputs.high, 0) - true_VV
-    below_VV = true_VV - 1 - np.maximum(sum_VV + other_inputs.low, 0)
-    # The planner adds them up in float32, and halves of the 1 with them.
-    size_VV = 1 + np.abs(before_V)[:, None] + np.abs(after_V) + other_inputs.size
-    rounding_VV = (COSTS.stop + 3) * ROUNDING * size_VV
-    error_VV = (np.maximum(above_VV, below_VV) + rounding_VV) / true_VV
+
+    before_V = _terms_of_values(cost_weight_2[0], unknown_weight_2[0])
+    after_V = _terms_of_values(cost_weight_2[1], unknown_weight_2[1])
+    sum_VV = before_V[:, None] + after_V
+    greatest_VV = 1 + np.maximum(sum_VV + other_inputs.greatest, 0)
+    least_surcharge_VV = np.maximum(sum_VV + other_inputs.least, 0)
+    excess_VV = greatest_VV - true_VV
+    shortfall_VV = (true_VV - 1) - least_surcharge_VV
+
+    # The planner adds the terms and the 1 in float32, with a rounding error each time.
+    size_of_pair_VV = 1 + np.abs(before_V)[:, None] + np.abs(after_V)
+    size_VV = size_of_pair_VV + other_inputs.sum_of_sizes
+    rounding_VV = TERMS_OF_MULTIPLIER * ROUNDING * size_VV
+    error_VV = (np.maximum(excess_VV, shortfall_VV) + rounding_VV) / true_VV
     return float(error_VV.max())
+
+
+def _terms_of_values(cost_weight: float, unknown_weight: float) -> Float64:
+    """Return what a free cell adds to a sum, for costs 0 to 99, then unknown: (V,)."""
+    share_of_costs = np.arange(OCCUPIED) / OCCUPIED
+    return np.append(cost_weight * share_of_costs, unknown_weight)
 
 
 def _rounding_error(
     network: PatchNetwork, greatest_of_input: Sequence[tuple[str, Float32]]
 ) -> Float32:
-    """Bound the errors of layers that are computed in float32: (U,).
+    """Bound the rounding errors of the last of some layers in float32: (U,).
 
     Parameters
     ----------
     network : PatchNetwork
     greatest_of_input : sequence of (str, (I,))
-        The layers in their order, and how great each of their inputs is at most.
+        The layers in their order, and the greatest value of each input of the layer.
     """
     # In float32, too: so the bound is infinite where the layers may overflow.
-    _, first_I = greatest_of_input[0]
-    error_U = np.zeros_like(first_I)
+    _, greatest_of_first_layer_I = greatest_of_input[0]
+    error_I = np.zeros_like(greatest_of_first_layer_I)  # of the layer's inputs
     for layer, greatest_I in greatest_of_input:
         weight_UI = np.abs(network.tensors[f"{layer}.weight"])
-        inherited_U = weight_UI @ error_U
         bias_U = np.abs(network.tensors[f"{layer}.bias"])
-        sum_U = weight_UI @ greatest_I + inherited_U + bias_U
+        inherited_U = weight_UI @ error_I
+        size_U = weight_UI @ greatest_I + inherited_U + bias_U
         # The greatest multiplier stands for all that is done with the last output.
-        sum_U += MAX_COST_MULTIPLIER
-        error_U = inherited_U + (weight_UI.shape[1] + 2) * ROUNDING * sum_U
-    return error_U
+        size_U += MAX_COST_MULTIPLIER
+        terms = weight_UI.shape[1] + 2
+        error_I = inherited_U + terms * ROUNDING * size_U  # of the next layer's inputs
+    return error_I

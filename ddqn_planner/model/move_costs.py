@@ -294,7 +294,7 @@ class MoveCosts(NamedTuple):
         """Write the patch numbers and cost codes of rows first_row to end_row - 1."""
         if first_row >= end_row:
             return
-        # The rows from the one before to the one after; outside the map all is occupied.
+        # With one row before and one row after; all is occupied outside the map.
         row_before = first_row - 1
         occupied = np.ones((end_row + 1 - row_before, self.width), np.bool_)
         first_inside = max(row_before, 0)
@@ -376,8 +376,8 @@ def _least_cost(occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None) -> 
     rows_at_once = max(1, LARGE // occupancy.shape[1] // 8)
     for first in range(0, len(occupancy), rows_at_once):
         rows = slice(first, first + rows_at_once)
-        # As uint8 the cost of an unknown cell is 255 instead of -1. The map has a cost of
-        # 0 for its occupied cells.
+        # As uint8 the cost of an unknown cell is 255 instead of -1. In the array of costs
+        # an occupied cell has 0.
         costs = cost[rows].view(np.uint8) + occupancy[rows] * np.uint8(OCCUPIED)
         least_cost = min(least_cost, int(costs.min()))
         if least_cost == 0:
@@ -448,7 +448,7 @@ def patches(
 def unique_patches(
     occupancy: NDArray[np.bool_], cost: NDArray[np.int8]
 ) -> tuple[NDArray[Any], NDArray[np.int8]]:
-    """Return the patch number of each cell, (C,), and the patches P that differ, (P, 9).
+    """Return the patch number of each cell, (C,), and the patches by number, (P, 9).
 
     The cells C are those of the padded map; those outside the map have the number P.
     """
@@ -469,7 +469,8 @@ def every_patch() -> NDArray[np.int8]:
     """
     number_P1 = np.arange(2**9)[:, None]
     is_occupied_P9 = (number_P1 & 2 ** np.arange(9)) != 0
-    return (is_occupied_P9 * OCCUPIED).astype(np.int8)
+    patch_P9: NDArray[np.int8] = (is_occupied_P9 * OCCUPIED).astype(np.int8)
+    return patch_P9
 
 
 def legal_in_patches(
