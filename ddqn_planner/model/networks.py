@@ -14,6 +14,7 @@ from ddqn_planner.model.move_costs import (
     CENTRE,
     COST_CODES,
     MAX_MULTIPLIER,
+    OCCUPIED_CODE,
     MoveCosts,
     every_patch,
     legal_in_patches,
@@ -26,7 +27,7 @@ Array: TypeAlias = NDArray[np.float32]
 # Shapes: A = 8 actions, B = a batch, I and O = inputs and outputs of a layer, P =
 # patches, F = filters. In the paper's network, L = windows of the convolution, U =
 # outputs of the layer after it, C = cells, with one more that stands for all outside
-# the map. In cost multipliers, L = the values of a cell, see `move_costs`.
+# the map. In cost multipliers, L = the codes of a cell's cost, see `move_costs`.
 
 # A move of at least this probability counts as one that always succeeds: the sigmoid
 # function never reaches 1, and the difference must not decide between paths.
@@ -107,7 +108,7 @@ class QNetwork:
 def observation_background(
     occupancy: NDArray[np.bool_], goal: Cell
 ) -> NDArray[np.float32]:
-    """Return the part of the observation without the robot: (H * W,)."""
+    """Return the value of each cell in the observation without the robot: (H * W,)."""
     background = np.where(occupancy, OBSTACLE, FREE).astype(np.float32)
     background[goal[1], goal[0]] = GOAL
     return background.ravel()
@@ -142,7 +143,7 @@ class PaperQNetwork(QNetwork):
         return shape == (self.sizes["height"], self.sizes["width"])
 
     def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Array:
-        """Evaluate a robot in each cell: Q(s, a) toward one goal, (8, H, W).
+        """Return Q(s, a) of a robot in each cell toward one goal: (8, H, W).
 
         The move rule does not matter: the network was trained for one.
         """
@@ -152,43 +153,71 @@ class PaperQNetwork(QNetwork):
             name: self.tensors[name].astype(np.float64)
             for name in self.shapes(self.sizes)
         }
-        kernel_9F = weights["convolution.weight"].reshape(-1, 9).T
-        bias_F = weights["convolution.bias"]
-        has_hidden = self.sizes["hidden_units"] > 0
-        layer = "hidden" if has_hidden else "fully_connected"
-        # The cells of a window, and their values without the robot; 0 outside the map.
-        cell_L9 = window_cells(grid.occupancy.shape)
-        background_C = np.append(observation_background(grid.occupancy, goal), 0.0)
-        value_L9 = background_C[cell_L9]
-        layer_LFU = weights[f"{layer}.weight"]  # (U, F * L) in the file
-        layer_LFU = layer_LFU.reshape(-1, len(bias_F), len(cell_L9)).T.copy()
-        sum_LF = value_L9 @ kernel_9F + bias_F
-        feature_LF = np.maximum(sum_LF, 0)
-        output_U = weights[f"{layer}.bias"] + np.tensordot(feature_LF, layer_LFU, 2)
-        # Each window is seen with a robot in each of its cells. The changes add up.
-        robot_L9F = (ROBOT - value_L9)[..., None] * kernel_9F
-        feature_L9F = np.maximum(sum_LF[:, None] + robot_L9F, 0)
-        change_L9U = (feature_L9F - feature_LF[:, None]) @ layer_LFU
-        output_CU = np.tile(output_U, (len(background_C), 1))
-        for place in range(9):
-            output_CU[cell_L9[:, place]] += change_L9U[:, place]
-        if has_hidden:
-            last_AU = weights["fully_connected.weight"]
+        has_hidden_layer = self.sizes["hidden_units"] > 0
+        layer = "hidden" if has_hidden_layer else "fully_connected"
+        output_CU = _outputs_by_robot_cell(grid, goal, weights, layer)
+        if has_hidden_layer:
             hidden_CU = np.maximum(output_CU, 0)
-            output_CU = hidden_CU @ last_AU.T + weights["fully_connected.bias"]
+            last_UA = weights["fully_connected.weight"].T
+            output_CU = hidden_CU @ last_UA + weights["fully_connected.bias"]
+        q_CA = output_CU[:-1]  # without the cell that stands for all outside the map
         with np.errstate(over="ignore"):
-            q_AC: Array = output_CU[:-1].T.astype(np.float32)
+            q_AC: Array = q_CA.T.astype(np.float32)
         return q_AC.reshape(-1, *grid.occupancy.shape)
 
 
-def window_cells(shape: tuple[int, int]) -> NDArray[np.int64]:
-    """Return the cells of each window of the convolution, (L, 9).
+def _outputs_by_robot_cell(
+    grid: GridMap, goal: Cell, weights: Mapping[str, NDArray[np.float64]], layer: str
+) -> NDArray[np.float64]:
+    """Return the outputs of the layer after the convolution by robot's cell: (C, U).
 
-    The number H * W stands for all cells outside the map.
+    The layer is linear, so its output is that for the observation without a robot, plus
+    the changes in the few windows of the convolution that contain the robot.
+
+    Parameters
+    ----------
+    grid : GridMap
+    goal : (x, y)
+    weights : mapping of str to float64 array
+        The network's tensors, by their names.
+    layer : str
+        The name of the layer.
+    """
+    kernel_9F = weights["convolution.weight"].reshape(-1, 9).T
+    bias_F = weights["convolution.bias"]
+    cell_L9 = window_cells(grid.occupancy.shape)
+    # The layer's weights have the shape (U, F * L) in the file.
+    weight_UFL = weights[f"{layer}.weight"].reshape(-1, len(bias_F), len(cell_L9))
+    weight_LFU = weight_UFL.T.copy()
+
+    # Without the robot. Cells outside the map have the value 0.
+    background_C = np.append(observation_background(grid.occupancy, goal), 0.0)
+    value_L9 = background_C[cell_L9]
+    sum_LF = value_L9 @ kernel_9F + bias_F
+    feature_LF = np.maximum(sum_LF, 0)
+    output_U = weights[f"{layer}.bias"] + np.tensordot(feature_LF, weight_LFU, 2)
+
+    # With a robot in each of the 9 cells of each window.
+    increase_L9F = (ROBOT - value_L9)[..., None] * kernel_9F
+    feature_L9F = np.maximum(sum_LF[:, None] + increase_L9F, 0)
+    change_L9U = (feature_L9F - feature_LF[:, None]) @ weight_LFU
+    output_CU = np.tile(output_U, (len(background_C), 1))
+    for place in range(9):
+        # No cell of the map lies at the same place of two windows.
+        output_CU[cell_L9[:, place]] += change_L9U[:, place]
+    return output_CU
+
+
+def window_cells(shape: tuple[int, int]) -> NDArray[np.int64]:
+    """Return the numbers y * W + x of the cells of each window, (L, 9).
+
+    A window of the convolution is a square of 3x3 cells around every second cell of
+    every second row. The number H * W stands for all cells outside the map.
     """
     cells = shape[0] * shape[1]
     padded = np.pad(np.arange(cells).reshape(shape), 1, constant_values=cells)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))[::2, ::2]
+    windows_around_cells = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
+    windows = windows_around_cells[::2, ::2]
     cell_L9: NDArray[np.int64] = windows.reshape(-1, 9)
     return cell_L9
 
@@ -234,10 +263,10 @@ class PropagationQNetwork(QNetwork):
 
     @classmethod
     def features(cls, patch_B9: NDArray[np.int8], move_rule: MoveRule) -> Array:
-        """Return which cells of patches are occupied, (B, 9), see `patches`.
+        """Return the inputs of the network for patches, see `patches`: (B, I).
 
-        With costs, the costs of the cells follow, 0..1, then which cells are unknown,
-        and the rule: (B, 28).
+        Without costs I = 9: whether each cell is occupied. With costs I = 28: then each
+        cell's cost, 0 to 0.99, whether it is unknown, and whether corners are cut.
         """
         occupied_B9 = patch_B9 == OCCUPIED
         if not cls.uses_costs:
@@ -251,7 +280,7 @@ class PropagationQNetwork(QNetwork):
         return feature_BI
 
     def success(self, feature_BI: Array) -> Array:
-        """Return p(s, a) in 0..1: (B, 8), given features (B, I)."""
+        """Return the probability p(s, a) that a move succeeds, 0..1: (B, 8)."""
         hidden_BF = np.maximum(self._layer("convolution", feature_BI), 0)
         hidden_BF = np.maximum(self._layer("hidden", hidden_BF), 0)
         # The sigmoid function, without overflow.
@@ -261,13 +290,13 @@ class PropagationQNetwork(QNetwork):
     def tries(self, feature_BI: Array) -> Array:
         """Return how many tries a move takes, 1/p: (B, 8).
 
-        From a p of `CERTAIN` on it is 1; where p is at most 1/2, or NaN, infinite.
+        It is 1 for a p of `CERTAIN` or more, and infinite if p is at most 1/2, or NaN:
+        then the move counts as impossible.
         """
         p_BA = self.success(feature_BI)
         p_BA = np.where(p_BA >= CERTAIN, np.float32(1), p_BA)
-        tries_BA: Array = np.where(
-            p_BA > 0.5, 1 / np.maximum(p_BA, 0.5), np.float32(np.inf)
-        )
+        finite_tries_BA = 1 / np.maximum(p_BA, 0.5)
+        tries_BA: Array = np.where(p_BA > 0.5, finite_tries_BA, np.float32(np.inf))
         return tries_BA
 
     def multiplier(self, feature_BI: Array) -> Array:
@@ -288,24 +317,34 @@ class PropagationQNetwork(QNetwork):
         return self._certificates[rules]
 
     def move_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts | None:
-        """Return the costs of a map's moves if exactly the legal moves are possible."""
-        timed = grid.slowness is not None
-        with_costs = self.uses_costs and grid.cost is not None and not timed
-        key = move_rule, with_costs, timed
+        """Return the costs of a map's moves, or None if other than legal are possible.
+
+        Where the map has expected times, its slowness replaces its costs.
+        """
+        has_times = grid.slowness is not None
+        with_costs = self.uses_costs and grid.cost is not None and not has_times
+        key = move_rule, with_costs, has_times
         if key not in self._proved:
-            self._proved[key] = self._proved_costs(move_rule, with_costs, timed)
+            self._proved[key] = self._proved_costs(move_rule, with_costs, has_times)
         costs = self._proved[key]
         return None if costs is None else costs.on_map(grid)
 
     def _proved_costs(
-        self, move_rule: MoveRule, with_costs: bool, timed: bool
+        self, move_rule: MoveRule, with_costs: bool, has_times: bool
     ) -> MoveCosts | None:
-        """Return the costs of moves without what depends on the map."""
+        """Return costs for any map, or None unless exactly legal moves are possible.
+
+        Parameters
+        ----------
+        move_rule : MoveRule
+        with_costs, has_times : bool
+            Whether the costs, or the expected times, of a map's cells count.
+        """
         patch_P9 = every_patch()
         legal_PA = legal_in_patches(patch_P9, move_rule)
         if with_costs:
             return self._sums_of_prices(move_rule, legal_PA)
-        table_PA = self._costs_of(patch_P9, move_rule, timed)
+        table_PA = self._costs_of(patch_P9, move_rule, has_times)
         table_PA[patch_P9[:, CENTRE] == OCCUPIED] = np.inf
         is_right = np.array_equal(np.isfinite(table_PA), legal_PA)
         return MoveCosts.of_table(table_PA) if is_right else None
@@ -313,16 +352,24 @@ class PropagationQNetwork(QNetwork):
     def _sums_of_prices(
         self, move_rule: MoveRule, legal_PA: NDArray[np.bool_]
     ) -> MoveCosts | None:
-        """Return costs as sums over a move's two cells, if proved to be such sums."""
+        """Return costs as sums over a move's two cells, or None if they are none.
+
+        Parameters
+        ----------
+        move_rule : MoveRule
+        legal_PA : (512, 8) bool
+            Which moves are legal, by patch number.
+        """
         if not self.certificate(move_rule).proved:
             return None
         term_9AL = self._price_terms(move_rule)
         action_A = np.arange(len(MOVES))
         # (A,): the cell of the patch of 3 x 3 to which each move leads.
         target_A = CENTRE + MOVES @ [1, 3]
+        # The terms of the cell before a move, and of the cell after it.
         term_2AL = np.stack([term_9AL[CENTRE], term_9AL[target_A, action_A]])
         # No move leads to an occupied cell: its term has no meaning.
-        term_2AL[..., -1] = term_2AL[..., -2]
+        term_2AL[..., OCCUPIED_CODE] = term_2AL[..., OCCUPIED_CODE - 1]
         other_9AL = term_9AL.copy()
         other_9AL[CENTRE] = 0
         other_9AL[target_A, action_A] = 0
@@ -340,62 +387,73 @@ class PropagationQNetwork(QNetwork):
         )
 
     def _price_terms(self, move_rule: MoveRule) -> Array:
-        """Return the terms of the cost multipliers minus 1, by cell, action and value.
+        """Return what a cell of the patch adds to a cost multiplier: (9, 8, L).
 
-        The layer is linear, so its output is a sum over the patch's cells: (9, 8, L).
+        The indices are the cell, the action and the code of the cell's cost. The layer
+        is linear, so a multiplier is 1 plus the sum of these terms over the cells.
         """
         weight_AI = self.tensors["prices.weight"]
-        occupied_9A, cost_9A, unknown_9A = weight_AI[:, :27].T.reshape(3, 9, -1)
+        cells_weight_AI = weight_AI[:, :27]  # without the weight of the move rule
+        occupied_9A, cost_9A, unknown_9A = cells_weight_AI.T.reshape(3, 9, -1)
+        share_of_costs = np.arange(OCCUPIED) / 100  # of the costs 0 to 99
         term_9AL = np.empty((9, len(MOVES), COST_CODES), dtype=np.float32)
         term_9AL[..., 0] = unknown_9A
-        term_9AL[..., 1:-1] = cost_9A[..., None] * (np.arange(OCCUPIED) / 100)
-        term_9AL[..., -1] = occupied_9A
-        # All other terms are those of the centre.
+        term_9AL[..., 1:OCCUPIED_CODE] = cost_9A[..., None] * share_of_costs
+        term_9AL[..., OCCUPIED_CODE] = occupied_9A
+        # The terms that do not depend on a cell count with the centre.
         rule_A = weight_AI[:, 27] * move_rule.cuts_corners
         term_9AL[CENTRE] += (self.tensors["prices.bias"] + rule_A)[:, None]
         return term_9AL
 
     def believed_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts:
-        """Return the costs that the network gives a map's moves, right or not.
+        """Return the costs of a map's moves as the network predicts them, right or wrong.
 
-        Q is minus the cost of the cheapest path. The network predicts for each patch the
-        probability p that a move succeeds: a move counts as possible where p > 1/2, and
-        is tried until it succeeds. The progress and detour terms of the paper's reward
-        (section 4.2) do not count, as they add up to a constant along a path.
+        A move counts as possible if the network predicts that it succeeds with a
+        probability above 1/2, and it is tried until it succeeds: its cost is its length
+        times its tries and its multiplier. The progress and detour terms of the paper's
+        reward (section 4.2) add up to a constant along a path, so they are left out.
         """
-        timed = grid.slowness is not None
-        # Without costs, each patch that can occur has its number; no cell names it.
-        patch_C = None
-        patch_P9 = every_patch()
-        if self.uses_costs and grid.cost is not None and not timed:
-            patch_C, patch_P9 = unique_patches(grid.occupancy, grid.cost)
-        table_PA = self._costs_of(patch_P9, move_rule, timed)
-        return MoveCosts.of_table(table_PA).on_map(grid, patch_C)
+        has_times = grid.slowness is not None
+        if self.uses_costs and grid.cost is not None and not has_times:
+            # A row of the table for each patch that occurs on the map.
+            patch_number, patch_P9 = unique_patches(grid.occupancy, grid.cost)
+            table_PA = self._costs_of(patch_P9, move_rule, has_times)
+            return MoveCosts.of_table(table_PA).on_map(grid, patch_number)
+        # Without costs there are 512 patches, whose numbers are read from the map.
+        table_PA = self._costs_of(every_patch(), move_rule, has_times)
+        return MoveCosts.of_table(table_PA).on_map(grid)
 
     def _costs_of(
-        self, patch_P9: NDArray[np.int8], move_rule: MoveRule, timed: bool
+        self, patch_P9: NDArray[np.int8], move_rule: MoveRule, has_times: bool
     ) -> Array:
         """Return each move's cost, infinite if it is not possible: (P, 8).
 
-        If `timed`, the cost is the length times the tries, without a multiplier.
+        For a map with times the cost is the length times the tries, without the
+        multiplier, which follows from the times.
         """
         costs = []
         for batch_B9 in np.split(patch_P9, range(BATCH, len(patch_P9), BATCH)):
             feature_BI = self.features(batch_B9, move_rule)
             multiplier_BA = np.minimum(self.multiplier(feature_BI), MAX_MULTIPLIER)
             cost_BA = LENGTHS * self.tries(feature_BI)
-            cost_BA *= 1 if timed else multiplier_BA
-            # Comparisons with NaN are false, and NumPy's minimum and maximum keep it.
+            if not has_times:
+                cost_BA *= multiplier_BA
+            # A multiplier of a broken model may be NaN: then the comparison is false.
             costs.append(np.where(multiplier_BA >= 1, cost_BA, np.inf))
         return np.concatenate(costs, dtype=np.float32)
 
 
 def _least_multipliers(term_2AL: Array) -> Array:
-    """Return the least multiplier on a map by the least value of its cells: (L,)."""
-    # A cell of the map has the least value, a greater one, or it is unknown.
-    from_greatest_2AL = np.minimum.accumulate(term_2AL[..., ::-1], axis=2)
-    least_known_2AL = from_greatest_2AL[..., ::-1]
-    least_2AL = np.minimum(term_2AL[..., :1], least_known_2AL)
+    """Return the least multiplier on a map by the least cost code of its cells: (L,).
+
+    `term_2AL` has the terms of the cell before a move and of the cell after it, by
+    action and cost code.
+    """
+    # A cell of such a map has the least code, a greater code, or 0 for unknown.
+    greatest_first_2AL = term_2AL[..., ::-1]
+    least_known_2AL = np.minimum.accumulate(greatest_first_2AL, axis=2)[..., ::-1]
+    unknown_2A1 = term_2AL[..., :1]
+    least_2AL = np.minimum(unknown_2A1, least_known_2AL)
     least_L: Array = 1 + least_2AL.sum(axis=0).min(axis=0)
     return least_L
 
