@@ -376,8 +376,8 @@ def _least_cost(occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None) -> 
     rows_at_once = max(1, LARGE // occupancy.shape[1] // 8)
     for first in range(0, len(occupancy), rows_at_once):
         rows = slice(first, first + rows_at_once)
-        # As uint8 the cost of an unknown cell is 255 instead of -1. The layer of costs has
-        # 0 in occupied cells.
+        # As uint8 the cost of an unknown cell is 255 instead of -1. The costs of
+        # occupied cells are 0.
         costs = cost[rows].view(np.uint8) + occupancy[rows] * np.uint8(OCCUPIED)
         least_cost = min(least_cost, int(costs.min()))
         if least_cost == 0:

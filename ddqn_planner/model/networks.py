@@ -406,7 +406,7 @@ class PropagationQNetwork(QNetwork):
         return term_9AL
 
     def believed_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts:
-        """Return the costs of a map's moves as the network predicts them, right or wrong.
+        """Return the costs of a map's moves as predicted, also where they are wrong.
 
         A move counts as possible if the network predicts that it succeeds with a
         probability above 1/2, and it is tried until it succeeds: its cost is its length

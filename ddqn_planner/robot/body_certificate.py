@@ -22,8 +22,9 @@ class BodyCertificate:
     cells: int  # that they sweep, all together
     weak: int  # swept cells that do not forbid their primitive by themselves
     forbidden: int  # primitives that are forbidden by cells which they do not sweep
-    margin: float  # least distance of a logit from 0, over its threshold; not above 0
-    # if the network is wrong
+    # The least distance of a logit from 0 on its right side, as a share of the unit's
+    # threshold. It is 0 or less if the network is wrong.
+    margin: float
 
     @property
     def proved(self) -> bool:
@@ -64,30 +65,30 @@ def certify_body(
     unit_P : (P,) int64
         The unit of each primitive.
     """
-    # No weight is negative, so more occupied cells never make a primitive possible.
-    # So every pattern is decided by each swept cell alone, and by all cells together
-    # that are not swept. In float32 too a sum is not less than its terms, and its
-    # relative error is bounded.
+    # No weight is negative, so more occupied cells never make a primitive possible. So
+    # two cases prove all patterns: each swept cell alone must exceed the threshold, and
+    # all cells that are not swept must stay below it together. In float32 too a sum is
+    # not less than its terms, and its relative error is bounded.
     weight_USS = np.maximum(weight_USS.astype(np.float64), 0)
     threshold_U = threshold_U.astype(np.float64)
-    primitives_U = np.bincount(unit_P)
+    primitives_U = np.bincount(unit_P)  # the number of primitives of each unit
 
-    # By how much each cell exceeds the threshold alone: above 0 where swept.
+    # By how much each cell alone exceeds the threshold: it should, where it is swept.
     excess_USS = weight_USS - threshold_U[:, None, None]
     weak_U = (swept_USS & (excess_USS <= 0)).sum(axis=(1, 2))
     least_excess_U = excess_USS.min(axis=(1, 2), where=swept_USS, initial=np.inf)
 
-    # How far all cells that are not swept stay below the threshold: above 0.
+    # By how much all cells that are not swept stay below the threshold: they should.
     sum_U = weight_USS.sum(axis=(1, 2), where=~swept_USS)
     greatest_sum_U = sum_U * (1 + weight_USS[0].size * ROUNDING)
-    rest_U = threshold_U - greatest_sum_U
+    slack_U = threshold_U - greatest_sum_U
 
-    margin_U = np.minimum(rest_U, least_excess_U)
+    margin_U = np.minimum(slack_U, least_excess_U)
     margin_U /= np.maximum(np.abs(threshold_U), SMALLEST_THRESHOLD)
     return BodyCertificate(
         primitives=len(unit_P),
         cells=int(primitives_U @ swept_USS.sum(axis=(1, 2))),
         weak=int(primitives_U @ weak_U),
-        forbidden=int(primitives_U @ (rest_U <= 0)),
+        forbidden=int(primitives_U @ (slack_U <= 0)),
         margin=float(margin_U.min()),
     )

@@ -79,7 +79,7 @@ def read_footprint(footprint: Any, padding: float = 0.0) -> Corners:
 
 
 def _check_polygon(corners: Corners, text: str) -> None:
-    """Raise a ValueError, with the text of the footprint, if it is no polygon."""
+    """Raise a ValueError, with a footprint's text, if its corners form no polygon."""
     if len(corners) < 3:
         problem = f"the footprint {text} has fewer than three or more points that"
         raise ValueError(f"{problem} differ; {REMEDY}")
@@ -102,11 +102,16 @@ def _short(footprint: Any) -> str:
 
 
 def _parsed(text: str) -> Any:
-    """Return the number or the nested lists of a text; commas may be left out."""
+    """Return the number or the nested lists of a text; commas may be left out.
+
+    A ValueError says what is wrong with another text.
+    """
     text = text.strip(" \t\r\n'\"")
     if NUMBER.fullmatch(text):
         return float(text)
-    lists: list[list[Any]] = [[]]  # those that are open, the innermost at the end
+    # The lists whose brackets are open, the innermost at the end. The first list stands
+    # for the text itself.
+    lists: list[list[Any]] = [[]]
     position = 0
     while position < len(text):
         token = _token_at(text, position)
@@ -131,7 +136,7 @@ def _parsed(text: str) -> Any:
 
 
 def _token_at(text: str, position: int) -> re.Match[str]:
-    """Return the bracket, comma or number that begins at a position of a text."""
+    """Return a match of `TOKEN` at a position of a text: a bracket, comma or number."""
     token = TOKEN.match(text, position)
     if token is None:
         beginning = text[position : position + 20]
@@ -140,11 +145,12 @@ def _token_at(text: str, position: int) -> re.Match[str]:
 
 
 def _is_scalar(value: Any) -> bool:
+    """Return whether a footprint is a radius, and not a list or array of points."""
     return not isinstance(value, (list, tuple)) and np.ndim(value) == 0
 
 
 def _around_circle(value: Any) -> Corners:
-    """Return the polygon around a circle of some radius."""
+    """Return the corners of a polygon around the circle of a radius, in metres."""
     if isinstance(value, np.ndarray):
         value = value[()]
     remedy = f"0.001 to {MAX_DISTANCE:g} metres"
@@ -156,7 +162,7 @@ def _around_circle(value: Any) -> Corners:
 
 
 def _points(value: Any) -> Corners:
-    """Return points as an array, without those that repeat the one before."""
+    """Return points as an array (K, 2), without those that repeat the point before."""
     points = numbers("the points", value)
     if points.ndim != 2 or points.shape[1] != 2:
         raise ValueError(
@@ -175,7 +181,7 @@ def _points(value: Any) -> Corners:
 
 
 def _without_repeats(points: Corners) -> Corners:
-    """Return points without those that repeat the one before, around the polygon."""
+    """Return a polygon's corners without those that repeat the corner before."""
     corners: list[NDArray[np.float64]] = []
     for point in points:
         if not corners or math.dist(point, corners[-1]) > SAME_CORNER:
@@ -198,36 +204,45 @@ def _cross(first: Points, second: Points) -> NDArray[np.float64]:
 
 
 def _sides_cross(corners: Corners) -> bool:
-    """Return whether a side leads from one side of another to its other side."""
+    """Return whether two sides of a polygon cross.
+
+    Sides that only meet in a corner, touch, or lie on one line do not cross.
+    """
     starts = corners
     ends = np.roll(corners, -1, axis=0)
-    # (K, K): for each side (column), the ends of which sides (rows) it parts.
-    # Sides that meet in a corner, touch, or lie on one line do not part their ends.
-    parted = _side_of(starts, starts, ends) * _side_of(ends, starts, ends) < 0
-    return bool((parted & parted.T).any())
+    # (K, K): whether the ends of a side (row) lie to the left and to the right of the
+    # line through another side (column).
+    is_parted = _side_of(starts, starts, ends) * _side_of(ends, starts, ends) < 0
+    return bool((is_parted & is_parted.T).any())
 
 
 def _side_of(points: Points, starts: Points, ends: Points) -> NDArray[np.float64]:
-    """Return where points (rows) lie beside lines (columns): (N, K).
+    """Return on which side of each of K lines each of N points lies: (N, K).
 
-    It is 1 to the left, -1 to the right, and 0 on the line.
+    A line leads from a start (K, 2) to an end. The value is 1 for a point to the left,
+    -1 to the right, and 0 for one on the line.
     """
     lines = ends - starts  # (K, 2)
     to_points = points[:, None] - starts  # (N, K, 2)
-    area = _cross(lines, to_points)
+    product = _cross(lines, to_points)  # the distance times the length of the line
     tolerance = 1e-9 * np.hypot(lines[:, 0], lines[:, 1])
-    return np.where(np.abs(area) <= tolerance, 0, np.sign(area))
+    return np.where(np.abs(product) <= tolerance, 0, np.sign(product))
 
 
 def _padded(corners: Corners, padding: float) -> Corners:
-    """Return a polygon of which each side moved outward; sharp corners are cut."""
-    sides = np.roll(corners, -1, axis=0) - corners
+    """Return a polygon whose sides lie `padding` metres further out.
+
+    A sharp corner is cut: it becomes two corners.
+    """
+    next_corners = np.roll(corners, -1, axis=0)
+    sides = next_corners - corners
     directions = sides / np.hypot(sides[:, 0], sides[:, 1])[:, None]
-    double_area = float(_cross(corners, np.roll(corners, -1, axis=0)).sum())
+    directions_before = np.roll(directions, 1, axis=0)  # of the side before each corner
+    double_area = float(_cross(corners, next_corners).sum())
     orientation = math.copysign(1, double_area)  # 1: counter-clockwise
     padded: list[NDArray[np.float64]] = []
     for corner, direction_in, direction_out in zip(
-        corners, np.roll(directions, 1, axis=0), directions, strict=True
+        corners, directions_before, directions, strict=True
     ):
         offsets = _corner_offsets(direction_in, direction_out, orientation)
         padded += [corner + padding * offset for offset in offsets]
@@ -239,7 +254,7 @@ def _corner_offsets(
     direction_out: NDArray[np.float64],
     orientation: float,
 ) -> list[NDArray[np.float64]]:
-    """Return where a corner moves if its sides move outward by 1.
+    """Return by how much a corner moves if the sides of its polygon move outward by 1.
 
     Parameters
     ----------
@@ -258,13 +273,16 @@ def _corner_offsets(
     cosine = math.hypot(total[0], total[1]) / 2
     is_concave = _cross(direction_in, direction_out) * orientation < 0
     if cosine > MIN_COSINE or is_concave:
+        # The moved sides meet at a distance of 1 / cosine from the corner, and the
+        # length of `outward` is 2 * cosine.
         outward = _turned_outward(total, orientation)
         return [outward / (2 * max(cosine, SMALLEST_COSINE) ** 2)]
-    # The cut is as far beyond the corner as the sides move.
+    # The middle of the cut is as far beyond the corner as the sides move, 1. The cut is
+    # perpendicular to the way there.
     difference = direction_in - direction_out
     middle_of_cut = difference / math.hypot(difference[0], difference[1])
-    half_cut = -_turned_outward(middle_of_cut, orientation)
-    half_cut = half_cut * (1 - cosine) / math.sqrt(1 - cosine**2)
+    along_cut = -_turned_outward(middle_of_cut, orientation)
+    half_cut = along_cut * (1 - cosine) / math.sqrt(1 - cosine**2)
     return [middle_of_cut - half_cut, middle_of_cut + half_cut]
 
 
@@ -277,7 +295,10 @@ def _turned_outward(
 
 
 def _is_padded(padded: Corners, corners: Corners, padding: float) -> bool:
-    """Return whether a polygon contains all points within the padding of another."""
+    """Return whether the outline of a padded polygon keeps the padding everywhere.
+
+    `corners` are those of the polygon without padding.
+    """
     if _sides_cross(padded):
         return False
     if inside(padded, corners).any() or not inside(corners, padded).all():
@@ -290,9 +311,11 @@ def _distances(points: Points, corners: Corners) -> NDArray[np.float64]:
     """Return how far points (N, 2) are from each side of a polygon, (N, K)."""
     sides = np.roll(corners, -1, axis=0) - corners  # (K, 2)
     to_points = points[:, None] - corners  # (N, K, 2)
+    # The nearest point of a side lies at a share of it: 0 is its begin and 1 its end.
     dot_products = (to_points * sides).sum(axis=2)
-    share_of_side = (dot_products / (sides * sides).sum(axis=1)).clip(0, 1)
-    from_nearest = to_points - share_of_side[..., None] * sides
+    squared_lengths = (sides * sides).sum(axis=1)
+    shares = (dot_products / squared_lengths).clip(0, 1)
+    from_nearest = to_points - shares[..., None] * sides
     distances: NDArray[np.float64] = np.hypot(
         from_nearest[..., 0], from_nearest[..., 1]
     )
@@ -301,17 +324,23 @@ def _distances(points: Points, corners: Corners) -> NDArray[np.float64]:
 
 def inside(points: Points, corners: Corners) -> NDArray[np.bool_]:
     """Return which points (N, 2) lie in a polygon: its outline leads around them."""
-    winding = np.zeros(len(points), dtype=np.int64)
+    # The winding number: sides that cross the ray from a point to the right upward,
+    # minus those that cross it downward.
+    winding_number = np.zeros(len(points), dtype=np.int64)
     x, y = points.T
     ends = np.roll(corners, -1, axis=0)
-    for (x0, y0), (x1, y1) in zip(corners, ends, strict=True):
-        if y0 == y1:
+    for (start_x, start_y), (end_x, end_y) in zip(corners, ends, strict=True):
+        if start_y == end_y:
             continue
-        crosses_row = (y0 > y) != (y1 > y)
-        x_of_side = x0 + (y - y0) / (y1 - y0) * (x1 - x0)
-        direction = 1 if y1 > y0 else -1
-        winding += np.where(crosses_row & (x < x_of_side), direction, 0)
-    is_inside: NDArray[np.bool_] = winding != 0
+        crosses_line = (start_y > y) != (end_y > y)  # the horizontal line of the ray
+        share_of_side = (y - start_y) / (end_y - start_y)
+        x_of_crossing = start_x + share_of_side * (end_x - start_x)
+        crosses_ray = crosses_line & (x < x_of_crossing)
+        if end_y > start_y:
+            winding_number += crosses_ray
+        else:
+            winding_number -= crosses_ray
+    is_inside: NDArray[np.bool_] = winding_number != 0
     return is_inside
 
 
@@ -327,10 +356,12 @@ def outline(corners: Corners, spacing: float) -> Points:
 def placed(corners: Corners, poses: Poses) -> NDArray[np.float64]:
     """Return the corners (K, 2) of a body at poses (N, 3), in metres: (N, K, 2)."""
     x, y, yaw = poses.T[..., None]  # (N, 1) each
-    u, v = corners.T  # (K,) each
+    ahead, left = corners.T  # (K,) each: in the robot's own frame
     cos = np.cos(yaw)
     sin = np.sin(yaw)
-    return np.stack([cos * u - sin * v + x, sin * u + cos * v + y], axis=-1)
+    corner_x = cos * ahead - sin * left + x  # (N, K)
+    corner_y = sin * ahead + cos * left + y
+    return np.stack([corner_x, corner_y], axis=-1)
 
 
 # The cells that a body sweeps
@@ -339,33 +370,37 @@ def placed(corners: Corners, poses: Poses) -> NDArray[np.float64]:
 def swept_cells(corners: Corners, motions: Motions) -> NDArray[np.bool_]:
     """Return the cells that the body touches on each primitive: (P, S, S) bool.
 
-    The robot starts in the middle, at S // 2. All cells within `MARGIN` of the body
-    count, so that those between two poses count, too.
+    The index is (primitive, y, x); the robot starts in the middle, x = y = S // 2. All
+    cells within `MARGIN` of the body count, so that cells that the body touches between
+    two poses count, too.
 
     Raises
     ------
     ValueError
         If a primitive sweeps cells that are too far away.
     """
-    body = corners / motions.resolution
+    body = corners / motions.resolution  # in cells
     radius = float(np.hypot(body[:, 0], body[:, 1]).max())
     reach = _reach(radius, motions)
     edge = outline(body, MARGIN)
     side = 2 * reach + 1
     swept = np.zeros((len(motions.poses), side, side), dtype=np.bool_)
     for mask, poses in zip(swept, motions.poses, strict=True):
-        # The inside of the body passes a cell no sooner than its outline does.
+        # Between two poses the body reaches no cell that its outline does not touch. So
+        # the outline needs many poses, and the inside needs few.
         _mark_touched(mask, edge, dense_poses(poses, MARGIN, radius))
         _mark_covered(mask, body, poses)
     return swept
 
 
 def _reach(radius: float, motions: Motions) -> int:
-    """Return how many cells to a side a body of some radius (cells) may sweep."""
-    distances = []
-    for poses in motions.poses:
-        distances.append(float(np.hypot(poses[:, 0], poses[:, 1]).max()))
-    reach = math.ceil(radius + max(distances)) + 1
+    """Return to how many cells on each side a body may sweep on its motions.
+
+    The body's radius is in cells. A ValueError if it sweeps too many.
+    """
+    poses = np.concatenate(motions.poses)
+    distances = np.hypot(poses[:, 0], poses[:, 1])
+    reach = math.ceil(radius + float(distances.max())) + 1
     if reach > MAX_REACH:
         problem = f"the body sweeps {reach} cells to a side; at most {MAX_REACH} can be"
         remedy = f"give a coarser resolution than {motions.resolution} m"
@@ -374,7 +409,17 @@ def _reach(radius: float, motions: Motions) -> int:
 
 
 def _mark_touched(mask: NDArray[np.bool_], edge: Points, poses: Poses) -> None:
-    """Mark the cells within `MARGIN` of the outline of a body at some poses."""
+    """Set the cells of a mask within `MARGIN` of a body's outline at one of some poses.
+
+    Parameters
+    ----------
+    mask : (S, S) bool
+        By y and x; the robot starts in the middle.
+    edge : (M, 2) float64
+        Points of the outline in the robot's own frame, in cells.
+    poses : (N, 3) float64
+    """
+    # A point is near the cells that contain the corners of a square around it.
     square = MARGIN * np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)])
     reach = len(mask) // 2
     for x, y, yaw in poses:
@@ -386,7 +431,16 @@ def _mark_touched(mask: NDArray[np.bool_], edge: Points, poses: Poses) -> None:
 
 
 def _mark_covered(mask: NDArray[np.bool_], body: Points, poses: Poses) -> None:
-    """Mark the cells whose centres lie inside a body at some poses."""
+    """Set the cells of a mask whose centres lie inside a body at one of some poses.
+
+    Parameters
+    ----------
+    mask : (S, S) bool
+        By y and x; the robot starts in the middle.
+    body : (K, 2) float64
+        The corners in the robot's own frame, in cells.
+    poses : (N, 3) float64
+    """
     reach = len(mask) // 2
     coordinates = np.arange(-reach, reach + 1.0)
     centres = np.stack(np.meshgrid(coordinates, coordinates), axis=-1).reshape(-1, 2)

@@ -99,14 +99,16 @@ def make_motions(
 ) -> Motions:
     """Make the primitives of a robot.
 
-    It drives ahead, behind and in bends. A differential robot turns on the spot; an
-    omnidirectional one also drives sideways and diagonally.
+    Every robot drives straight ahead and behind, and in bends to the next heading on
+    each side. All robots except cars also turn on the spot. An omnidirectional robot
+    also drives straight sideways and diagonally.
 
     Parameters
     ----------
     motion : Motion
+        A car is `Motion.ACKERMANN`.
     turning_radius : float
-        In metres, 0 to 100 cells; of a car at least one cell.
+        Metres: at most the length of 100 cells, and for a car at least that of one.
     resolution : float
         Metres per cell.
 
@@ -119,9 +121,13 @@ def make_motions(
     cell_size = _cell_size("the resolution", resolution)
     radius = _radius_in_cells(motion, turning_radius, cell_size)
     angles = np.arctan2(DIRECTIONS[:, 1], DIRECTIONS[:, 0]) % (2 * math.pi)
+    relative_headings: tuple[int, ...] = (AHEAD,)
+    if motion is Motion.OMNIDIRECTIONAL:
+        relative_headings = (AHEAD, *SIDEWAYS, *DIAGONALLY)
     primitives: list[Primitive] = []
     for heading in range(HEADINGS):
-        primitives += _straight_primitives(motion, heading, angles, cell_size)
+        for relative_heading in relative_headings:
+            primitives += _straight(heading, relative_heading, angles, cell_size)
         for end in ((heading - 1) % HEADINGS, (heading + 1) % HEADINGS):
             bend = _driven_ahead(heading, end, _bend(heading, end, angles, radius))
             primitives += [bend, _driven_behind(bend)]
@@ -131,12 +137,14 @@ def make_motions(
 
 
 def _cell_size(name: str, metres: Any) -> float:
+    """Return a number of metres per cell; `name` is what an error calls it."""
     smallest, largest = CELL_SIZES
     remedy = f"metres per cell, {smallest:g} to {largest:g}"
     return as_number(name, metres, smallest, largest, remedy)
 
 
 def _radius_in_cells(motion: Motion, turning_radius: float, cell_size: float) -> float:
+    """Return a turning radius in metres as cells; a ValueError if it is not allowed."""
     metres = as_number(
         "the turning radius", turning_radius, 0, math.inf, "metres, 0 or more"
     )
@@ -156,39 +164,52 @@ def _radius_in_cells(motion: Motion, turning_radius: float, cell_size: float) ->
     return radius
 
 
-def _straight_primitives(
-    motion: Motion, heading: int, angles: Float64, cell_size: float
+def _straight(
+    heading: int, relative_heading: int, angles: Float64, cell_size: float
 ) -> list[Primitive]:
-    """Return short and long steps in all directions that the robot can drive."""
-    relative_headings: tuple[int, ...] = (AHEAD,)
-    if motion is Motion.OMNIDIRECTIONAL:
-        relative_headings = (AHEAD, *SIDEWAYS, *DIAGONALLY)
+    """Return a short and a long straight step in one direction, with a fixed heading.
+
+    A step ahead comes with the same step behind. Diagonal steps are short only.
+
+    Parameters
+    ----------
+    heading : int
+        The robot's heading.
+    relative_heading : int
+        The direction of the steps: by how many headings it lies to the left of ahead.
+    angles : (16,) float64
+        The yaw of each heading, radians.
+    cell_size : float
+        Metres per cell.
+    """
+    step = DIRECTIONS[(heading + relative_heading) % HEADINGS]  # (2,) cells
+    counts = [1]
+    if relative_heading not in DIAGONALLY:
+        stride = round(STRIDE / cell_size / math.hypot(*step))
+        counts.append(max(stride, 2))
     primitives = []
-    for relative_heading in relative_headings:
-        step = DIRECTIONS[(heading + relative_heading) % HEADINGS]
-        counts = [1]
-        if relative_heading not in DIAGONALLY:
-            stride = round(STRIDE / cell_size / math.hypot(*step))
-            counts.append(max(stride, 2))
-        for count in counts:
-            poses = _line(np.zeros(2), step * count, float(angles[heading]))
-            primitive = _driven_ahead(heading, heading, poses)
-            if relative_heading == AHEAD:
-                primitives += [primitive, _driven_behind(primitive)]
-            else:
-                cost = BEHIND * primitive.cost
-                primitives.append(primitive._replace(cost=cost))
+    for count in counts:
+        poses = _line(np.zeros(2), step * count, float(angles[heading]))
+        primitive = _driven_ahead(heading, heading, poses)
+        if relative_heading == AHEAD:
+            primitives += [primitive, _driven_behind(primitive)]
+        else:
+            primitives.append(primitive._replace(cost=BEHIND * primitive.cost))
     return primitives
 
 
 def _driven_ahead(start: int, end: int, poses: Poses) -> Primitive:
+    """Return the primitive along poses: its cost is its length in cells.
+
+    `start` and `end` are the headings of the first and the last pose.
+    """
     steps = np.diff(poses[:, :2], axis=0)
     length = float(np.hypot(steps[:, 0], steps[:, 1]).sum())
     return Primitive(start, end, poses, cost=length)
 
 
 def _driven_behind(primitive: Primitive) -> Primitive:
-    """Return the reverse of a primitive, from the cell where that one ends."""
+    """Return a primitive's reverse, moved so that it begins in the origin."""
     last_x, last_y, _ = primitive.poses[-1]
     return Primitive(
         start=primitive.end,
@@ -201,6 +222,10 @@ def _driven_behind(primitive: Primitive) -> Primitive:
 def _turn_on_the_spot(
     start: int, end: int, angles: Float64, cell_size: float
 ) -> Primitive:
+    """Return the primitive that turns from one heading to another in the origin.
+
+    `angles` has the yaw of each heading; `cell_size` is in metres.
+    """
     turn = float(turn_between(angles[start], angles[end]))
     count = math.ceil(abs(turn) / ANGLE) + 1
     yaw = angles[start] + turn * np.linspace(0, 1, count)
@@ -209,9 +234,12 @@ def _turn_on_the_spot(
 
 
 def _line(start: NDArray[Any], end: NDArray[Any], yaw: float) -> Poses:
-    """Return poses on a line from one point (2,) to another."""
+    """Return poses on a line from one point (2,) to another, in cells, with a yaw.
+
+    Two poses are at most `SPACING` apart; a line of length 0 has one pose.
+    """
     length = math.hypot(*np.subtract(end, start))
-    count = math.ceil(length / SPACING - 1e-9) + 1
+    count = math.ceil(length / SPACING - 1e-9) + 1  # 1e-9: despite rounding
     points = np.linspace(start, end, count)
     return np.column_stack([points, np.full(count, yaw)])
 
@@ -219,64 +247,94 @@ def _line(start: NDArray[Any], end: NDArray[Any], yaw: float) -> Poses:
 def _bend(start: int, end: int, angles: Float64, radius: float) -> Poses:
     """Return the shortest path to a neighbouring heading that ends in a cell's centre.
 
-    It is a line, an arc and a line, of which one line has the length 0. The arc touches
-    both lines at the same distance from their intersection: its tangents.
+    It is a line, an arc and a line, and the shorter line has the length 0. The two
+    lines would meet in a corner; the arc leaves the first line as far before the corner
+    as it joins the last line after it. This distance, a tangent of the arc's circle, is
+    radius * tan(turn / 2).
+
+    Parameters
+    ----------
+    start, end : int
+        The first and the last heading.
+    angles : (16,) float64
+        The yaw of each heading, radians.
+    radius : float
+        The least radius of the arc, in cells. It is at least 1 cell here.
     """
     turn = float(turn_between(angles[start], angles[end]))
-    tan_of_half = math.tan(abs(turn) / 2)
+    tangent_per_radius = math.tan(abs(turn) / 2)
     yaws = angles[[start, end]]
     directions = np.array([np.cos(yaws), np.sin(yaws)])  # (2, 2), in columns
-    min_tangent = max(radius, 1.0) * tan_of_half
-    (first_tangent, last_tangent), end_cell = _nearest_end(directions, min_tangent)
+    min_tangent = max(radius, 1.0) * tangent_per_radius
+    bend_end = _nearest_end(directions, min_tangent)
 
-    arc_tangent = min(first_tangent, last_tangent)
-    arc_start = (first_tangent - arc_tangent) * directions[:, 0]
-    arc = _arc(arc_start, float(angles[start]), turn, arc_tangent / tan_of_half)
+    # The arc takes all of the shorter side of the corner, and as much of the longer.
+    tangent = min(bend_end.before_corner, bend_end.after_corner)
+    arc_start = (bend_end.before_corner - tangent) * directions[:, 0]
+    arc_radius = tangent / tangent_per_radius
+    arc = _arc(arc_start, float(angles[start]), turn, arc_radius)
     first_line = _line(np.zeros(2), arc[0, :2], arc[0, 2])
-    last_line = _line(arc[-1, :2], end_cell, arc[-1, 2])
+    last_line = _line(arc[-1, :2], bend_end.cell, arc[-1, 2])
     return np.concatenate([first_line[:-1], arc, last_line[1:]])
 
 
 def _arc(start: Float64, start_yaw: float, turn: float, radius: float) -> Poses:
-    """Return poses on an arc from a point (2,) that turns by an angle."""
-    count_by_angle = math.ceil(abs(turn) / ANGLE)
-    count_by_length = math.ceil(abs(turn) * radius / SPACING)
-    count = max(count_by_angle, count_by_length) + 1
+    """Return poses on an arc from a point (2,) and a yaw on, which turns by an angle.
+
+    The radius is in cells, angles are in radians; a turn above 0 leads to the left.
+    """
+    parts_by_angle = math.ceil(abs(turn) / ANGLE)
+    parts_by_length = math.ceil(abs(turn) * radius / SPACING)
+    count = max(parts_by_angle, parts_by_length) + 1
     yaw = start_yaw + turn * np.linspace(0, 1, count)  # (N,)
     side = math.copysign(1, turn)  # 1: the centre lies to the left
     to_centre = np.array([-math.sin(start_yaw), math.cos(start_yaw)]) * side
     centre = start + radius * to_centre
     from_centre = np.column_stack([np.sin(yaw), -np.cos(yaw)]) * side  # (N, 2)
-    return np.column_stack([centre + radius * from_centre, yaw])
+    points = centre + radius * from_centre
+    return np.column_stack([points, yaw])
 
 
-def _nearest_end(
-    directions: Float64, min_tangent: float
-) -> tuple[Float64, NDArray[np.int64]]:
-    """Return the nearest end of a bend: its tangents (2,), and its cell (2,).
+class _BendEnd(NamedTuple):
+    """Where a bend ends, and the lengths of lines that meet in a corner, in cells."""
+
+    before_corner: float  # along the first heading
+    after_corner: float  # along the last heading
+    cell: NDArray[np.int64]  # (2,), from the cell where the bend begins
+
+
+def _nearest_end(directions: Float64, min_length: float) -> _BendEnd:
+    """Return the end for which the lines before and after the corner are shortest.
 
     Parameters
     ----------
     directions : (2, 2) float64
         The unit vectors of the first and the last heading, in columns.
-    min_tangent : float
-        Cells that the bend leads along each of them, at least.
+    min_length : float
+        The least length of each line, in cells.
     """
-    max_distance = math.ceil(4 * min_tangent) + 6
+    max_distance = math.ceil(4 * min_length) + 6
     coordinates = range(-max_distance, max_distance + 1)
     cells = np.array(list(product(coordinates, repeat=2)))  # (N, 2)
-    tangents = np.linalg.solve(directions, cells.T).T  # (N, 2): cells = sum of both
-    possible = (tangents >= min_tangent - 1e-9).all(axis=1)
-    lengths = np.where(possible, tangents.sum(axis=1), np.inf)
-    nearest = lengths.argmin()
-    return tangents[nearest], cells[nearest]
+    # The lengths of the two lines that lead to each cell: directions @ lengths.
+    lengths = np.linalg.solve(directions, cells.T)  # (2, N)
+    is_possible = (lengths >= min_length - 1e-9).all(axis=0)
+    total_length = np.where(is_possible, lengths.sum(axis=0), np.inf)
+    nearest = total_length.argmin()
+    before_corner, after_corner = lengths[:, nearest].tolist()
+    return _BendEnd(before_corner, after_corner, cells[nearest])
 
 
 def _motions(
     cell_size: float, angles: Float64, primitives: Sequence[Primitive]
 ) -> Motions:
-    """Return primitives as arrays, sorted by their headings."""
-    in_order = sorted(primitives, key=lambda primitive: primitive[:2])
+    """Return primitives as arrays, sorted by their first and last headings.
+
+    `cell_size` is in metres; `angles` has the yaw of each heading, radians.
+    """
+    in_order = sorted(
+        primitives, key=lambda primitive: (primitive.start, primitive.end)
+    )
     offsets = [np.rint(primitive.poses[-1, :2]) for primitive in in_order]
     return Motions(
         resolution=cell_size,
@@ -290,18 +348,18 @@ def _motions(
 
 
 def dense_poses(poses: Poses, spacing: float, lever: float) -> Poses:
-    """Return poses with others between them.
+    """Return poses (N, 3) with more poses between them, so that a body moves in steps.
 
-    Between two of them, a point moves by at most `spacing`, if it is no farther than
-    `lever` from the robot's origin.
+    From one pose to the next, each point of the body moves by at most `spacing` if it
+    lies at most `lever` from the robot's origin. Lengths have the unit of the poses.
     """
     parts = [poses[:1]]
     for pose, next_pose in pairwise(poses):
-        step = next_pose - pose
-        movement = math.hypot(step[0], step[1]) + lever * abs(step[2])
-        count = max(math.ceil(movement / spacing - 1e-9), 1)
-        share = np.linspace(0, 1, count + 1)[1:, None]
-        parts.append(pose + share * step)
+        dx, dy, turn = next_pose - pose
+        movement = math.hypot(dx, dy) + lever * abs(turn)
+        steps = max(math.ceil(movement / spacing - 1e-9), 1)  # 1e-9: despite rounding
+        shares = np.linspace(0, 1, steps + 1)[1:]  # without the pose itself
+        parts.append(pose + shares[:, None] * (next_pose - pose))
     return np.concatenate(parts)
 
 
@@ -326,6 +384,7 @@ def read_lattice(file: str | Path) -> Motions:
 
 
 def _json_of(content: bytes) -> Any:
+    """Return the value that a JSON text stands for; a ValueError if it is no JSON."""
     try:
         return json.loads(content)
     except RecursionError:
@@ -336,7 +395,10 @@ def _json_of(content: bytes) -> Any:
 
 
 def _field(owner: object, field: str, owner_name: str) -> Any:
-    """Return a field of an object in a lattice's JSON."""
+    """Return a field of an object in a lattice's JSON; a ValueError if it lacks it.
+
+    `owner_name` is what the error calls the object.
+    """
     if not isinstance(owner, dict) or field not in owner:
         raise ValueError(f"{owner_name} has no {field}; {GENERATOR_REMEDY}")
     return owner[field]
@@ -394,7 +456,19 @@ def _angles(values: Any) -> Float64:
 def _primitive(
     name: str, primitive: object, cell_size: float, angles: Float64
 ) -> Primitive:
-    """Return a primitive of a lattice's JSON."""
+    """Return a primitive of a lattice's JSON.
+
+    Parameters
+    ----------
+    name : str
+        What errors call the primitive.
+    primitive : object
+        The value in the list of primitives, which should be a dict.
+    cell_size : float
+        Metres per cell.
+    angles : (16,) float64
+        The yaw of each heading, radians.
+    """
     start = _heading("start_angle_index", name, primitive)
     end = _heading("end_angle_index", name, primitive)
     length = as_number(
@@ -404,12 +478,15 @@ def _primitive(
         MAX_DISTANCE,
         f"metres, 0 to {MAX_DISTANCE:g}",
     )
-    poses = _poses(f"the poses of {name}", _field(primitive, "poses", name))
-    poses = poses / (cell_size, cell_size, 1)
+    metric_poses = _poses(f"the poses of {name}", _field(primitive, "poses", name))
+    poses = metric_poses / (cell_size, cell_size, 1)
     poses = _from_heading_to_heading(poses, angles[start], angles[end])
     _check_end(name, poses)
-    turn = float(np.abs(np.diff(poses[:, 2])).sum())
-    cost = length / cell_size or turn * TURN / cell_size
+    metres = length
+    if length == 0:  # a turn on the spot
+        turn = float(np.abs(np.diff(poses[:, 2])).sum())
+        metres = turn * TURN
+    cost = metres / cell_size
     distance = float(np.hypot(poses[-1, 0], poses[-1, 1])) * cell_size
     if length < MIN_LENGTH_SHARE * distance or cost < MIN_COST:
         raise ValueError(
@@ -420,12 +497,16 @@ def _primitive(
 
 
 def _heading(field: str, name: str, primitive: object) -> int:
+    """Return a field of a lattice's primitive that is a heading, 0 to 15."""
     value = _field(primitive, field, name)
     return as_whole(f"{field} of {name}", value, 0, HEADINGS - 1)
 
 
 def _from_heading_to_heading(poses: Poses, start_yaw: float, end_yaw: float) -> Poses:
-    """Return poses with exact yaws at both ends, and no jumps by whole turns."""
+    """Return poses with these yaws at both ends, and no jumps by whole turns.
+
+    The last yaw of `poses` itself is changed.
+    """
     poses[-1, 2] = end_yaw
     start_pose = np.array([0, 0, start_yaw])
     if np.abs(poses[0] - start_pose).max() > SAME_POSE:  # only old files begin with it
@@ -459,5 +540,6 @@ def _poses(name: str, values: Any) -> Float64:
 
 
 def _check_column(name: str, column: Float64, unit: str, limit: float) -> None:
+    """Raise a ValueError unless all numbers lie within -limit to limit."""
     remedy = f"{unit}, {-limit:g} to {limit:g}"
     numbers(name, column, between=(-limit, limit), whole=False, remedy=remedy)

@@ -25,7 +25,11 @@ class Units(NamedTuple):
 
 
 def units_of(motions: Motions) -> Units:
-    """Return the units of primitives: those that turn into each other share one."""
+    """Return the units of primitives: quarter turns of each other share a unit.
+
+    The poses of a unit are those of its first primitive, turned back so that its first
+    heading lies in the first quarter.
+    """
     turns = motions.start // HEADINGS_PER_QUARTER
     unit_of_primitive: list[int] = []
     poses_of_units: list[Poses] = []
@@ -41,7 +45,7 @@ def units_of(motions: Motions) -> Units:
 
 
 def _turned_back(poses: Poses, quarter_turns: int) -> Poses:
-    """Return poses turned clockwise around the origin."""
+    """Return poses (N, 3) turned clockwise around the origin by some quarter turns."""
     x, y, yaw = poses.T
     for _ in range(quarter_turns):
         x, y = y, -x
@@ -49,6 +53,7 @@ def _turned_back(poses: Poses, quarter_turns: int) -> Poses:
 
 
 def _first_same(poses_of_units: list[Poses], poses: Poses) -> int | None:
+    """Return the index of the first unit with the same poses, or None."""
     for unit, unit_poses in enumerate(poses_of_units):
         if _are_same(poses, unit_poses):
             return unit
@@ -56,8 +61,8 @@ def _first_same(poses_of_units: list[Poses], poses: Poses) -> int | None:
 
 
 def _are_same(first_poses: Poses, second_poses: Poses) -> bool:
-    """Return whether poses are the same but for rounding and whole turns."""
+    """Return whether poses (N, 3) are the same except for rounding and whole turns."""
     if len(first_poses) != len(second_poses):
         return False
-    x, y, yaw = (first_poses - second_poses).T
-    return bool(np.abs([x, y, turn_between(0, yaw)]).max() < SAME)
+    dx, dy, dyaw = (first_poses - second_poses).T
+    return bool(np.abs([dx, dy, turn_between(0, dyaw)]).max() < SAME)
