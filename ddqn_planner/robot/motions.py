@@ -355,11 +355,12 @@ def dense_poses(poses: Poses, spacing: float, lever: float) -> Poses:
     """
     parts = [poses[:1]]
     for pose, next_pose in pairwise(poses):
-        dx, dy, turn = next_pose - pose
+        change = next_pose - pose
+        dx, dy, turn = change.tolist()
         movement = math.hypot(dx, dy) + lever * abs(turn)
         steps = max(math.ceil(movement / spacing - 1e-9), 1)  # 1e-9: despite rounding
         shares = np.linspace(0, 1, steps + 1)[1:]  # without the pose itself
-        parts.append(pose + shares[:, None] * (next_pose - pose))
+        parts.append(pose + shares[:, None] * change)
     return np.concatenate(parts)
 
 
