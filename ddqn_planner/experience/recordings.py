@@ -3,7 +3,7 @@
 import csv
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -106,18 +106,22 @@ def read_recording(
     elif (path / RECORD).is_file():
         recording = Recording(RECORD, list(read_drives(path / RECORD)))
     elif path.suffix.lower() == ".csv":
-        recording = _divided(path, path.name, read_csv(path))
+        recording = _divided_into_drives(path, path.name, read_csv(path))
     else:
-        name, samples = read_mcap(_files_of(path), topic, frame, robot_frame)
-        recording = _divided(path, name, samples)
+        name, samples = read_mcap(_mcap_files_of(path), topic, frame, robot_frame)
+        recording = _divided_into_drives(path, name, samples)
     if not recording.drives:
         raise ValueError(f"{path} holds no drive; drive on")
     _check_on_map(path, recording.drives, grid)
     return recording
 
 
-def _divided(path: Path, name: str, samples: Sequence[Sample]) -> Recording:
-    """Divide the poses of a recording into drives."""
+def _divided_into_drives(path: Path, name: str, samples: Sequence[Sample]) -> Recording:
+    """Divide the poses of a recording into drives.
+
+    `path` and `name`, which the poses come from, are for the words of an error: a
+    ValueError if the times of the poses run backwards or stand still.
+    """
     finite = [sample for sample in samples if all(map(math.isfinite, sample))]
     elapsed = np.diff([sample.seconds for sample in finite])
     if len(elapsed):
@@ -155,12 +159,14 @@ def _check_on_map(path: Path, drives: Sequence[Drive], grid: GridMap) -> None:
     )
 
 
-def _files_of(path: Path) -> Sequence[Path]:
-    """Return the MCAP files of a bag in the order of their numbers.
+def _mcap_files_of(path: Path) -> Sequence[Path]:
+    """Return the MCAP files of a bag, a file or a folder, in the order of their numbers.
 
-    A path that does not exist is returned too: opening it says so.
+    A path that does not exist is returned too: opening it says so. A ValueError if
+    there is no MCAP file.
     """
     if path.is_dir():
+        # The number is the end of a name, without leading zeros.
         files = sorted(
             path.glob("*.mcap"), key=lambda file: (len(file.name), file.name)
         )
@@ -231,37 +237,49 @@ def read_mcap(
     bag = _Bag(frame, robot_frame)
     for path in paths:
         bag.read(path)
-    poses = {
-        source: samples
-        for source, samples in bag.poses.items()
-        if topic in ("", source.topic)
-    }
+    samples_of_source = bag.samples_of_source
+    if topic:
+        samples_of_source = {
+            source: samples
+            for source, samples in samples_of_source.items()
+            if source.topic == topic
+        }
     remedy = "give --topic, --frame or --robot-frame"
-    if not poses:
+    if not samples_of_source:
         raise ValueError(
             f"{paths[0]} has no poses in the frame {frame!r} (topics, and their "
             f"frames: {bag.topics_in_words()}); {remedy}"
         )
-    best = max(poses, key=lambda source: len(poses[source]))
-    names = _robots(poses, best)
-    if len(names) > 1:
+    best = max(samples_of_source, key=lambda source: len(samples_of_source[source]))
+    robots = _robots_of(samples_of_source, best)
+    if len(robots) > 1:
         raise ValueError(
-            f"{paths[0]} has poses of several robots: {', '.join(names)}; {remedy}"
+            f"{paths[0]} has poses of several robots: {', '.join(robots)}; {remedy}"
         )
-    return best.name, poses[best]
+    return best.name, samples_of_source[best]
 
 
-def _robots(poses: Mapping[PoseSource, list[Sample]], best: PoseSource) -> list[str]:
-    """Return the names of the robots whose poses these seem to be."""
+def _robots_of(
+    samples_of_source: Mapping[PoseSource, list[Sample]], best: PoseSource
+) -> list[str]:
+    """Return the names of the sources that seem to be of different robots.
+
+    The first robot is that of the source `best`. A source whose poses lie elsewhere at
+    the same times is of another robot.
+    """
     robots = {best._replace(dated_by="")}
-    for source, samples in poses.items():
-        if _are_apart(samples, poses[best]):
+    for source, samples in samples_of_source.items():
+        if _are_apart(samples, samples_of_source[best]):
             robots.add(source._replace(dated_by=""))
     return [robot.name for robot in sorted(robots)]
 
 
 def _are_apart(samples: Sequence[Sample], reference: Sequence[Sample]) -> bool:
-    """Return whether poses are those of another robot than the poses of reference."""
+    """Return whether samples are those of another robot than the reference samples.
+
+    They are if most lie more than DISTANCE_OF_ROBOTS from where the reference robot was
+    at the same time. Too few samples are of no robot.
+    """
     if len(samples) < SMALLEST_SHARE * len(reference):
         return False
     times, x, y = np.array(sorted(samples)).T
@@ -273,20 +291,26 @@ def _are_apart(samples: Sequence[Sample], reference: Sequence[Sample]) -> bool:
 
 
 class _Bag:
-    """The poses of robots in the files of a bag."""
+    """The poses of robots in the files of a bag.
+
+    `frame` is that of the map. `robot_frame` is that of the robot, or empty for any
+    frame that ends in ``base_link``, and for topics of poses.
+    """
 
     def __init__(self, frame: str, robot_frame: str) -> None:
         self.frame = frame
         self.robot_frame = robot_frame
-        self.poses: dict[PoseSource, list[Sample]] = defaultdict(list)
-        self._frames: dict[str, set[str]] = defaultdict(set)  # by topic
-        # By topic, the last transform of each frame.
+        self.samples_of_source: dict[PoseSource, list[Sample]] = defaultdict(list)
+        self._frames_of_topic: dict[str, set[str]] = defaultdict(set)
+        # Of each topic of transforms: the last transform of each frame, by its name.
         self._trees: dict[str, dict[str, Transform]] = defaultdict(dict)
 
     def topics_in_words(self) -> str:
         """Return the topics of poses and transforms with their frames, for an error."""
-        topics = sorted(self._frames)
-        words = [f"{topic} in {sorted(self._frames[topic])}" for topic in topics]
+        words = [
+            f"{topic} in {sorted(frames)}"
+            for topic, frames in sorted(self._frames_of_topic.items())
+        ]
         return ", ".join(words) or "none"
 
     def read(self, path: Path) -> None:
@@ -307,52 +331,55 @@ class _Bag:
                 ) from error
 
     def _add(self, message_type: str, topic: str, message: Any) -> None:
+        """Add the poses of a message; one of another type is left out."""
         if message_type in POSE_TYPES:
             self._add_pose(topic, message)
         elif message_type == TRANSFORM_TYPE:
-            self._add_transforms(topic.removesuffix("_static"), message)
+            # Static transforms belong to the tree of the topic beside them.
+            self._add_transforms(topic.removesuffix("_static"), message.transforms)
 
     def _add_pose(self, topic: str, message: Any) -> None:
+        """Add the pose of a message of one of the POSE_TYPES, if it is in `frame`."""
         frame: str = message.header.frame_id
-        self._frames[topic].add(frame)
+        self._frames_of_topic[topic].add(frame)
         if frame.lstrip("/") != self.frame or self.robot_frame:
             return
         # With covariance, the pose lies one level deeper.
         pose = getattr(message.pose, "pose", message.pose)
         sample = Sample(_seconds(message), pose.position.x, pose.position.y)
-        self.poses[PoseSource(topic)].append(sample)
+        self.samples_of_source[PoseSource(topic)].append(sample)
 
-    def _add_transforms(self, topic: str, message: Any) -> None:
-        """Add a message's transforms to the tree of its topic, and the poses they give.
+    def _add_transforms(self, topic: str, transforms: Sequence[Any]) -> None:
+        """Add TransformStamped messages to the tree of `topic`, and poses of robots.
 
-        A robot has a pose by each transform between it and the map frame, at the times of
-        that transform.
+        Each transform between a robot and the map frame gives a pose of the robot, at
+        the time of the transform. The poses by one transform are a source of their own:
+        see `PoseSource.dated_by`.
         """
         tree = self._trees[topic]
-        # First all names, so that they are known also if a transform cannot be used.
-        for stamped in message.transforms:
-            self._frames[topic].add(stamped.child_frame_id)
-        for stamped in message.transforms:
-            transform = _planar(stamped)
+        for message in transforms:
+            self._frames_of_topic[topic].add(message.child_frame_id)
+            transform = _planar(message)
             if transform is None:
                 continue
-            child: str = stamped.child_frame_id.lstrip("/")
+            child: str = message.child_frame_id.lstrip("/")
             tree[child] = transform
-            for robot in self._robots_in(tree):
-                position = _position_of(robot, tree, self.frame, child)
-                if position is None:  # the transform does not lead to the map frame
+            for robot in tree:
+                if not self._is_robot(robot):
                     continue
-                sample = Sample(_seconds(stamped), *position)
-                self.poses[PoseSource(topic, robot, child)].append(sample)
+                chain = _chain(robot, self.frame, tree)
+                if child in chain:
+                    x, y = _position_by(chain, tree)
+                    source = PoseSource(topic, robot, child)
+                    sample = Sample(_seconds(message), x, y)
+                    self.samples_of_source[source].append(sample)
 
-    def _robots_in(self, tree: Mapping[str, Transform]) -> Iterator[str]:
-        """Yield the frames of robots among the frames of a tree."""
-        for name in tree:
-            if self.robot_frame:
-                if name == self.robot_frame:
-                    yield name
-            elif name.rpartition("/")[2] == BASE:
-                yield name
+    def _is_robot(self, frame: str) -> bool:
+        """Return whether a frame is that of a robot whose poses are wanted."""
+        if self.robot_frame:
+            return frame == self.robot_frame
+        name = frame.rpartition("/")[2]
+        return name == BASE
 
 
 def _seconds(stamped: Any) -> float:
@@ -361,10 +388,13 @@ def _seconds(stamped: Any) -> float:
 
 
 def _planar(stamped: Any) -> Transform | None:
-    """Return a transform in the plane; None for one without a rotation, as in tf2."""
+    """Return a TransformStamped message in the plane.
+
+    None if its quaternion is no rotation, as tf2 leaves such a transform out.
+    """
     shift = stamped.transform.translation
-    turn = stamped.transform.rotation
-    rotation = Rotation(turn.x, turn.y, turn.z, turn.w)
+    quaternion = stamped.transform.rotation
+    rotation = Rotation(quaternion.x, quaternion.y, quaternion.z, quaternion.w)
     if not rotation.is_rounded:
         return None
     parent: str = stamped.header.frame_id.lstrip("/")
@@ -373,22 +403,36 @@ def _planar(stamped: Any) -> Transform | None:
     return Transform(parent, shift.x, shift.y, cos, sin)
 
 
-def _position_of(
-    robot: str, tree: Mapping[str, Transform], frame: str, changed: str
-) -> tuple[float, float] | None:
-    """Return where a robot is in a frame, if the changed transform tells."""
+def _chain(robot: str, frame: str, tree: Mapping[str, Transform]) -> list[str]:
+    """Return the frames from a robot's up to the last one below `frame`.
+
+    The transforms of these frames in `tree` lead from the robot to `frame`. The list is
+    empty if the tree does not lead there.
+    """
+    chain: list[str] = []
+    name = robot
+    while name != frame:
+        # Frames may form a circle.
+        if name not in tree or name in chain:
+            return []
+        chain.append(name)
+        name = tree[name].parent
+    return chain
+
+
+def _position_by(
+    chain: Sequence[str], tree: Mapping[str, Transform]
+) -> tuple[float, float]:
+    """Return where the origin of the first frame of a chain lies: x and y, in metres.
+
+    They are in the parent frame of the last frame of the chain; see `_chain`.
+    """
     x = 0.0
     y = 0.0
-    name = robot
-    chain: set[str] = set()
-    # Frames may form a circle.
-    while name != frame and name in tree and name not in chain:
-        chain.add(name)
-        name, shift_x, shift_y, cos, sin = tree[name]
+    for name in chain:
+        _, shift_x, shift_y, cos, sin = tree[name]
         turned_x = cos * x - sin * y
         turned_y = cos * y + sin * x
         x = shift_x + turned_x
         y = shift_y + turned_y
-    if name == frame and changed in chain:
-        return x, y
-    return None
+    return x, y
