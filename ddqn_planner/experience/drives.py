@@ -88,8 +88,8 @@ class Drive(NamedTuple):
     """A drive that has ended: N samples, in the frame of the map."""
 
     outcome: DriveEnd
-    seconds: Float64
-    positions: Float64
+    seconds: Float64  # (N,): the time of each sample
+    positions: Float64  # (N, 2): x and y, metres
 
     @property
     def metres(self) -> float:
@@ -101,12 +101,13 @@ class Drive(NamedTuple):
         return float(np.hypot(dx, dy).sum())
 
     def teach(self, experience: Experience, grid: GridMap | None = None) -> Learned:
-        """Let experience learn from it; where the robot gave up, moves fail.
+        """Let `experience` learn from this drive; where the robot gave up, moves fail.
 
-        With a map, its time is also compared with the expected time, which tells how
-        sure expected times are.
+        With a map, `experience` also compares the drive's time with the expected time,
+        and so learns how sure expected times are.
         """
         if grid is not None:
+            # Times are expected on the last map of `apply`.
             experience.apply(grid)
         learned = experience.record(self.seconds, self.positions)
         if self.outcome is DriveEnd.ABORTED and learned.is_possible:
@@ -115,54 +116,63 @@ class Drive(NamedTuple):
         return learned
 
     def row(self, number: int) -> bytes:
-        """Return its row of ``episodes.csv``; the first one has the number 1."""
+        """Return the row of this drive in ``episodes.csv``.
+
+        `number` counts the drives of the file, from 1.
+        """
         start = self.seconds[0]
-        elapsed = (self.seconds - start).tolist()
-        samples = " ".join(
-            f"{seconds:.3f}:{x:.3f}:{y:.3f}"
-            for seconds, (x, y) in zip(elapsed, self.positions.tolist(), strict=True)
-        )
+        elapsed = self.seconds - start
+        rows = np.column_stack([elapsed, self.positions]).tolist()  # (N, 3)
+        samples = " ".join(f"{seconds:.3f}:{x:.3f}:{y:.3f}" for seconds, x, y in rows)
         measures = f"{start:.3f},{elapsed[-1]:.3f},{self.metres:.3f}"
         return f"{number},{self.outcome.value},{measures},{samples}\r\n".encode()
 
 
 def read_drives(path: str | Path) -> Iterator[Drive]:
-    """Yield the drives in the complete rows of an ``episodes.csv``.
+    """Yield the drives of an ``episodes.csv``; rows that are no drive are left out.
 
     An OSError says why the file cannot be read.
     """
-    ends = {end.value.encode(): end for end in DriveEnd}
+    outcomes = {end.value.encode(): end for end in DriveEnd}
     for line in read_rows(as_path(path)):
         row = ROW.fullmatch(line)
-        if row is None or row["outcome"] not in ends:
+        if row is None or row["outcome"] not in outcomes:
             continue
         numbers = [sample.split(b":") for sample in row["samples"].split()]
         samples = np.array(numbers, dtype=np.float64)  # (N, 3): seconds, x, y
+        # The file has seconds from the start of the drive.
         seconds = samples[:, 0] + float(row["start"])
-        yield Drive(ends[row["outcome"]], seconds, samples[:, 1:])
+        yield Drive(outcomes[row["outcome"]], seconds, samples[:, 1:])
 
 
 class DriveRecorder:
-    """Divides a robot's poses into drives, and calls `on_drive` with each."""
+    """Divides a robot's poses into drives, and calls `on_drive` with each drive.
+
+    A drive begins when the robot has moved by more than STAND_DISTANCE.
+    """
 
     def __init__(self, on_drive: Callable[[Drive], None]) -> None:
         self._on_drive = on_drive
-        self.goal: tuple[float, float] | None = None
+        self.goal: tuple[float, float] | None = None  # x and y, metres
         self.forget()
 
     def forget(self) -> None:
-        """Forget the drive that is under way, and where the robot is."""
+        """Forget the current drive, and where the robot is."""
         self._samples: list[Sample] = []  # of the drive; empty before it begins
-        self._last: Sample | None = None
-        self._stands: Sample | None = None  # the first pose where the robot stands
+        self._last: Sample | None = None  # the last pose
+        # The first pose from which the robot has moved no farther than STAND_DISTANCE.
+        self._stand: Sample | None = None
 
     @property
     def position(self) -> tuple[float, float] | None:
-        """Where the robot is, metres."""
+        """Where the robot is: x and y, metres. None before the first pose."""
         return self._last.position if self._last is not None else None
 
     def add(self, seconds: float, x: float, y: float) -> None:
-        """Add a pose; a ValueError if its numbers are not finite or too large."""
+        """Add a pose, which may begin or end a drive.
+
+        A ValueError if its numbers are not finite or too large.
+        """
         sample = Sample(seconds, x, y)
         if not all(abs(value) < LATEST for value in sample):  # NaN fails too
             raise ValueError(
@@ -172,42 +182,46 @@ class DriveRecorder:
         if self._last is not None and seconds < self._last.seconds - JUMP:
             self.end()
             self.forget()
-        if self._stands is None or _distance(self._stands, sample) > STAND_DISTANCE:
+        if self._stand is None or _distance(self._stand, sample) > STAND_DISTANCE:
+            self._stand = sample
             if self._last is not None and not self._samples:
-                self._samples.append(self._last)
-            self._stands = sample
+                self._samples.append(self._last)  # a drive begins there
         self._last = sample
         if self._samples:
-            self._continue(sample, self._stands)
+            self._continue(sample, self._stand)
 
-    def _continue(self, sample: Sample, stands: Sample) -> None:
-        """Add a pose to the drive, and end the drive if it is over."""
+    def _continue(self, sample: Sample, stand: Sample) -> None:
+        """Add a pose to the drive, and end the drive if it is over.
+
+        `stand` is the first pose from which the robot has not moved since.
+        """
         recorded = self._samples[-1]
-        if (
-            _distance(recorded, sample) >= SAMPLE_DISTANCE
-            or abs(sample.seconds - recorded.seconds) >= SAMPLE_PERIOD
-        ):
+        is_far = _distance(recorded, sample) >= SAMPLE_DISTANCE
+        is_late = abs(sample.seconds - recorded.seconds) >= SAMPLE_PERIOD
+        if is_far or is_late:
             self._samples.append(sample)
-        stood = abs(sample.seconds - stands.seconds)
+        stood = abs(sample.seconds - stand.seconds)
         if stood >= STAND_PERIOD and self._is_at_goal:
             self.end(DriveEnd.ARRIVED)
         elif stood >= PAUSE:
             self.end(DriveEnd.PAUSED)
         elif len(self._samples) >= MOST_SAMPLES:
             self.end(DriveEnd.CUT)
-            self._samples.append(sample)
+            self._samples.append(sample)  # the next drive begins at once
 
     @property
     def _is_at_goal(self) -> bool:
+        """Whether the robot and its goal are known, and the robot is near the goal."""
         if self.position is None or self.goal is None:
             return False
         return math.dist(self.position, self.goal) <= ARRIVAL_DISTANCE
 
     def set_goal(self, x: float, y: float) -> None:
-        """Take a new goal; the same one again changes nothing."""
-        if (x, y) != self.goal:
-            self.end(DriveEnd.ARRIVED if self._is_at_goal else DriveEnd.NEW_GOAL)
-            self.goal = x, y
+        """Take a new goal, metres, and end the drive; the same goal changes nothing."""
+        if (x, y) == self.goal:
+            return
+        self.end(DriveEnd.ARRIVED if self._is_at_goal else DriveEnd.NEW_GOAL)
+        self.goal = x, y
 
     def abort(self) -> None:
         """End the drive because the robot gave up, also before it drove off."""
@@ -216,14 +230,19 @@ class DriveRecorder:
         self.end(DriveEnd.ABORTED)
 
     def end(self, outcome: DriveEnd = DriveEnd.STOPPED) -> None:
-        """End the drive, if there is one; the robot has to drive off again."""
+        """End the drive, if there is one; the next begins when the robot moves.
+
+        `on_drive` is called if the robot came SHORTEST far, or gave up.
+        """
         samples = np.array(self._samples).reshape(-1, 3)  # (N, 3): seconds, x, y
         self._samples = []
-        self._stands = self._last
+        self._stand = self._last
         positions = samples[:, 1:]
         dx, dy = (positions - positions[:1]).T
-        extent = np.hypot(dx, dy).max(initial=0)
-        if extent >= SHORTEST or (outcome is DriveEnd.ABORTED and len(samples)):
+        distance_from_start = np.hypot(dx, dy).max(initial=0)
+        has_driven = distance_from_start >= SHORTEST
+        has_failed = outcome is DriveEnd.ABORTED and len(samples) > 0
+        if has_driven or has_failed:
             self._on_drive(Drive(outcome, samples[:, 0], positions))
 
 
@@ -233,7 +252,18 @@ def _distance(first: Sample, second: Sample) -> float:
 
 
 class DriveFolder(WorkFolder):
-    """Records a robot's drives in a folder, and keeps there what they teach."""
+    """Records a robot's drives in a folder, and saves there what they teach.
+
+    Parameters
+    ----------
+    folder : path
+        It is made if it is missing, and locked until it is closed.
+    nominal_speed, robot_width : float
+        See `Experience`.
+    older : str
+        A file with older experience, or a folder with one. A new folder begins with
+        this experience; empty for none.
+    """
 
     def __init__(
         self,
@@ -242,7 +272,6 @@ class DriveFolder(WorkFolder):
         robot_width: float,
         older: str = "",
     ) -> None:
-        # A new folder begins with the older experience, if there is one.
         consequence = "the recording continues, and saving is tried again"
         super().__init__(folder, [LOCK], "drives", "records", consequence)
         self.record_path = self.folder / RECORD
@@ -258,12 +287,15 @@ class DriveFolder(WorkFolder):
             self.callback(self._record.close)
             if self.record_path.stat().st_size == 0:
                 self._record.append(HEADER)
-            if is_new:  # learn anew from the drives that it holds
+            if is_new:  # learn anew from the drives that the folder holds
                 for drive in read_drives(self.record_path):
                     drive.teach(self.experience)
 
     def _loaded(self, source: str | Path) -> Experience:
-        """Load experience; a ValueError if it is that of another kind of robot."""
+        """Load the experience of a file or folder.
+
+        A ValueError if it is that of another kind of robot.
+        """
         saved = Experience.load(source)
         options = {
             "nominal_speed": self.experience.nominal_speed,
@@ -278,7 +310,10 @@ class DriveFolder(WorkFolder):
         return saved
 
     def add(self, drive: Drive, grid: GridMap | None = None) -> Learned:
-        """Record a drive, learn from it, and save; return what it taught."""
+        """Record a drive, learn from it, and save; return what the drive taught.
+
+        With a map, the drive's time is compared with the expected one: `Drive.teach`.
+        """
         self.drives += 1
         self._record.append(drive.row(self.drives))
         learned = drive.teach(self.experience, grid)
@@ -286,7 +321,11 @@ class DriveFolder(WorkFolder):
         return learned
 
     def forget(self) -> Path | None:
-        """Forget all that was learned; return the backup, if there was a file."""
+        """Forget all that was learned, but not the recorded drives.
+
+        The file of the experience is renamed: its new path is returned, or None if
+        there was no file.
+        """
         backup = None
         if self.experience_path.exists():
             backup = self.folder / "experience_forgotten.npz"
@@ -303,7 +342,10 @@ class DriveFolder(WorkFolder):
 
 
 def _cut_incomplete_row(path: Path) -> int:
-    """Cut the incomplete last row that a crash left; return the last drive's number."""
+    """Cut the incomplete last row that a crash left; return the last drive's number.
+
+    Without a file, or without a drive in the file, the number is 0.
+    """
     content = read_file(path, MAX_RECORD_BYTES) if path.exists() else b""
     complete = content[: content.rfind(b"\n") + 1]
     if complete != content:
