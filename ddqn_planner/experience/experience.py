@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.experience.evidence import FARTHEST, Evidence
-from ddqn_planner.experience.places import Float32, Float64
+from ddqn_planner.experience.places import Float32, Float64, Places
 from ddqn_planner.experience.posterior import Posterior
 from ddqn_planner.experience.prior import Prior
 from ddqn_planner.experience.visits import (
@@ -56,9 +56,9 @@ OPTIONS = {
 
 LATEST = 1e12  # seconds of a clock: a pose of a later time is not believed
 # Times the nominal speed: a robot that usually drives faster is not believed.
-MOST_SPEED = 10.0
+LARGEST_USUAL_SPEED = 10.0
 # Times the usual speed: a faster move is not believed.
-MOST_OF_USUAL_SPEED = 3
+LARGEST_SPEED = 3
 # Of the log speed: the steps in which the fastest move that a map knows of changes.
 FAST_STEP = 0.1
 
@@ -91,26 +91,29 @@ class Learned(NamedTuple):
 class Experience:
     """How long driving takes at places of the world, learned from poses of a robot.
 
-    A place has a slowness, that is seconds over those at nominal speed, and
-    perhaps a wait, in seconds a passage. The log slowness is a Gaussian Markov
-    random field over the free places of a map: near places are alike, but not through walls. What
-    nobody drove is expected to be as slow as what was driven, or as `prior` foretells from the map.
-    All is kept by places of the world: maps may grow, shift or come in another resolution.
+    A place has a slowness, that is seconds over those at nominal speed, and perhaps a
+    wait, in seconds per passage. The log slowness is a Gaussian Markov random field
+    over the free places of a map: near places are alike, but not through walls. Places
+    that nobody drove are expected to be as slow as those that were driven, or as
+    `prior` predicts from the map. All is kept by places of the world: maps may grow,
+    shift or come in another resolution.
 
-    Evidence fades with the time that the robot drives, and at once where places have changed.
+    Evidence fades with the time that the robot drives, and at once where places have
+    changed.
 
     Parameters
     ----------
     nominal_speed : float
-        Metres per second in the open, 0.001 to 1,000: a first guess, see `learned_speed`. A drive
-        whose median speed is more than 10 times that teaches nothing, nor does one that is never
-        faster than a hundredth of it.
+        Metres per second in the open, 0.001 to 1,000: a first guess, see
+        `learned_speed`. A drive whose median speed is more than 10 times the nominal
+        speed teaches nothing, nor does a drive that is never faster than a hundredth of
+        the nominal speed.
     robot_width : float
         Metres, 0.01 to 100: the size of a place is half of it.
     half_life : float
         Seconds of driving, 1 to 1e12, after which evidence counts half.
     max_pause : float
-        Seconds, 0.1 to 1e6: a robot that stands for longer waits for nothing, which is left out.
+        Seconds, 0.1 to 1e6. A longer stand is no wait on the way, and is left out.
     """
 
     def __init__(
@@ -125,9 +128,12 @@ class Experience:
         self.half_life = _as_option("half_life", half_life)
         self.max_pause = _as_option("max_pause", max_pause)
         self.evidence = Evidence(self.nominal_speed, self.robot_width, self.half_life)
-        # The file that holds this experience, less what is new.
-        self._synchronised: tuple[Path | None, int] = None, 0
-        self._news: list[Callable[[Evidence], None]] = []
+        # The file in which this experience was saved or from which it was loaded, and
+        # the checksum of its content then.
+        self._saved_path: Path | None = None
+        self._saved_checksum = 0
+        # All that was learned since then: functions that change evidence.
+        self._unsaved: list[Callable[[Evidence], None]] = []
 
     @property
     def options(self) -> dict[str, float]:
@@ -167,26 +173,26 @@ class Experience:
         window = window_of(poses, self.learned_speed)
         speeds = speeds_of(poses, window)
         usual_speed = float(np.median(speeds)) if len(speeds) else 0.0
-        if usual_speed > self.nominal_speed * MOST_SPEED:
+        if usual_speed > self.nominal_speed * LARGEST_USUAL_SPEED:
             return Learned(0, 0.0, self._too_fast(usual_speed), is_possible=False)
         limits = Limits(
             window=window,
             speed=self.learned_speed,
-            max_speed=max(self.max_speed, MOST_OF_USUAL_SPEED * usual_speed),
+            max_speed=max(self.max_speed, LARGEST_SPEED * usual_speed),
             max_pause=self.max_pause,
         )
         visits = visits_of(poses, self.evidence.side, limits)
         places = len(visits.seconds) + len(visits.waits.seconds)
-        fastest = float(speeds.max(initial=0))
-        if places and fastest < self.nominal_speed / MAX_SLOWNESS:
-            return Learned(0, 0.0, self._too_slow(fastest), is_possible=False)
-        self._learn(partial(Evidence.add, visits=visits))
         if not places:
             return Learned(0, 0.0, self._why_nothing(poses, count))
+        fastest = float(speeds.max(initial=0))
+        if fastest < self.nominal_speed / MAX_SLOWNESS:
+            return Learned(0, 0.0, self._too_slow(fastest), is_possible=False)
+        self._learn(partial(Evidence.add, visits=visits))
         return Learned(places, visits.total_seconds)
 
     def _why_nothing(self, poses: Poses, count: int) -> str:
-        """Return why the possible ones among `count` poses are no drive."""
+        """Return why `poses`, the possible ones of `count` poses, taught nothing."""
         if len(poses.time) < 2:
             return (
                 f"{len(poses.time)} of {count} poses are possible and differ in their "
@@ -211,17 +217,22 @@ class Experience:
         return f"the robot comes no farther than {extent:.2g} m; give a longer drive"
 
     def _too_fast(self, speed: float) -> str:
+        """Return that a robot cannot drive at `speed`, in metres per second."""
         nominal = f"{self.nominal_speed:g}"
         remedy = f"give metres and seconds, or a nominal_speed greater than {nominal}"
         return f"the robot moves at {speed:.3g} m/s; {remedy} m/s"
 
     def _too_slow(self, speed: float) -> str:
+        """Return that a robot never drives at most at `speed`, metres per second."""
         nominal = f"{self.nominal_speed:g}"
         remedy = f"give metres and seconds, or a nominal_speed less than {nominal}"
         return f"the robot moves at most at {speed:.3g} m/s; {remedy} m/s"
 
     def record_failure(self, position: Sequence[float]) -> None:
-        """Learn that the robot failed at a place: it costs a wait of `max_pause`."""
+        """Learn that the robot failed at a place, as if it had waited for `max_pause`.
+
+        `position` is x and y in metres, in the frame of the map.
+        """
         point = numbers(
             "the position",
             position,
@@ -234,25 +245,28 @@ class Experience:
         visits = Visits.of_wait(x, y, self.max_pause)
         self._learn(partial(Evidence.add, visits=visits))
 
-    def _learn(self, step: Callable[[Evidence], None]) -> None:
-        step(self.evidence)
-        if self._synchronised[0] is not None:
-            self._news.append(step)
+    def _learn(self, change: Callable[[Evidence], None]) -> None:
+        """Change the evidence, and remember the change for the next `save`."""
+        change(self.evidence)
+        if self._saved_path is not None:
+            self._unsaved.append(change)
 
     def merge(self, other: Experience) -> None:
-        """Learn all that another experience of a robot of this kind learned; merge each once.
+        """Learn all that another experience of a robot of this kind has learned.
+
+        Merge each experience once: what is merged twice counts twice.
 
         Raises
         ------
         ValueError
-            If the two have other parameters.
+            If the two experiences have different parameters.
         """
-        if not isinstance(other, Experience):
-            raise ValueError(f"the other experience is {other!r}; give an Experience")
         self._check_kind(other)
+        # The other experience may learn more before this change is saved.
         self._learn(partial(Evidence.merge, other=copy.deepcopy(other.evidence)))
 
     def _check_kind(self, other: Experience) -> None:
+        """Raise a ValueError unless another experience has the same parameters."""
         if not isinstance(other, Experience):
             remedy = "give an Experience, as Experience.load returns it"
             raise ValueError(f"the other experience is {reprlib.repr(other)}; {remedy}")
@@ -265,7 +279,7 @@ class Experience:
     @property
     def max_speed(self) -> float:
         """The speed up to which a robot is believed, metres per second."""
-        return 3 * max(self.nominal_speed, self.learned_speed)
+        return LARGEST_SPEED * max(self.nominal_speed, self.learned_speed)
 
     @property
     def learned_speed(self) -> float:
@@ -274,15 +288,19 @@ class Experience:
 
     @property
     def prior(self) -> Prior | None:
-        """What foretells the slowness of places from the map; None if nothing does."""
+        """What predicts the slowness of places from the map; None without a prior."""
         return self.evidence.prior
 
     @prior.setter
     def prior(self, prior: Prior | None) -> None:
         self._learn(partial(Evidence.use_prior, prior=prior))
 
-    def take_over(self, older: Experience) -> None:
-        """Use what older experience solved for its map, which forgets it."""
+    def take_posterior_from(self, older: Experience) -> None:
+        """Take the posterior that older experience has solved, which then has none.
+
+        The next map with the same cells is solved from there, with fewer steps. The
+        experience of another kind of robot keeps its posterior.
+        """
         is_alike = (
             self.robot_width == older.robot_width
             and self.nominal_speed == older.nominal_speed
@@ -292,20 +310,23 @@ class Experience:
             older.evidence.posterior = None
 
     def apply(self, grid: GridMap, exploration: float = 0.0) -> GridMap:
-        """Return a map whose moves cost expected time, so that `Plan.cost` is in seconds.
+        """Return a map whose moves cost expected time: `Plan.cost` is in seconds.
 
         Parameters
         ----------
         grid : GridMap
             The map; its own costs multiply the time.
         exploration : float
-            0 or more. Plans lead where it may be faster: places count as faster by a standard
-            deviation. But no plan is expected to take longer than the best one by more than this
-            share. `Plan.cost` is what is expected.
+            0 to 10. If it is not 0, plans lead where driving may be faster: places count
+            as faster by a standard deviation. But no plan is expected to take longer
+            than the best plan by more than this share of its time. `Plan.cost` is the
+            expected time.
         """
         share = as_number("exploration", exploration, 0, 10, "0 to 10")
         population = self.evidence.population
         posterior = self.evidence.posterior_over(grid)
+        # The log slowness of the fastest place, in steps: fields have to be made anew
+        # when it changes.
         steps = math.floor(population.fastest_log / FAST_STEP + 0.5)
         fastest = FAST_STEP * min(0, steps)
         expected = self._timed(grid, posterior, "expected", 0.0, fastest)
@@ -313,11 +334,14 @@ class Experience:
             return expected
         # (P,): one standard deviation of the log slowness of each place.
         deviation = math.sqrt(population.variance) * posterior.unknown
+        largest_deviation = deviation.max(initial=0)
+        largest = FAST_STEP * math.ceil(largest_deviation / FAST_STEP)
+        bold = self._timed(grid, posterior, "bold", deviation, fastest - largest)
+        # A path whose time is at most that of the best one on this map, in which places
+        # are faster by no more than the share, takes at most so much longer.
         limit = math.log(1 + share)
         limited = np.minimum(deviation, limit)
         safe = self._timed(grid, posterior, "safe", limited, fastest - limit)
-        largest = FAST_STEP * math.ceil(deviation.max(initial=0) / FAST_STEP)
-        bold = self._timed(grid, posterior, "bold", deviation, fastest - largest)
         return expected.with_layers(exploration=Exploration(share, bold, safe))
 
     def _timed(
@@ -328,7 +352,11 @@ class Experience:
         optimism: Float64 | float,
         fastest: float,
     ) -> GridMap:
-        """Return the map with the expected times of places; see `Posterior.paint`."""
+        """Return the map with expected times of moves; for the rest see `Posterior.paint`.
+
+        The map has the slowness over that of the fastest place, and the seconds per cell
+        of the fastest place.
+        """
         slowness = posterior.paint(name, optimism, fastest)
         seconds = grid.resolution / self.nominal_speed * math.exp(fastest)
         return grid.with_layers(slowness=slowness, seconds_per_cell=seconds)
@@ -339,7 +367,10 @@ class Experience:
         return posterior.to_cells(posterior.slowness.astype(np.float32), 1)
 
     def uncertainty(self, grid: GridMap) -> Float32:
-        """Return (H, W) float32: the standard deviation of the log slowness, most if unknown."""
+        """Return (H, W) float32: the standard deviation of the log slowness.
+
+        It is greatest where nothing is known.
+        """
         posterior = self.evidence.posterior_over(grid)
         unknown = posterior.to_cells(posterior.unknown.astype(np.float32), 1)
         return math.sqrt(self.evidence.population.variance) * unknown
@@ -347,8 +378,15 @@ class Experience:
     def expected_time(self, grid: GridMap, cells: Cells) -> ExpectedTime:
         """Return the time that a path takes, with an interval of 90 %.
 
-        The interval follows from how sure the times of its places are, and is widened until it held
-        for 90 % of the last drives.
+        The interval follows from how sure the times of places are, and is widened until
+        90 % of the last drives took a time within their interval.
+
+        Parameters
+        ----------
+        grid : GridMap
+            The map.
+        cells : (K, 2) array
+            The x and y of the path's cells, or of its corners.
 
         Raises
         ------
@@ -378,8 +416,8 @@ class Experience:
     def save(self, path: str | Path) -> None:
         """Save to a file, atomically; an OSError leaves an old file unchanged.
 
-        What the file holds from others is kept: two processes may save to one file. Delete it to
-        begin anew.
+        What the file holds from others is kept: two processes may save to one file.
+        Delete the file to begin anew.
 
         Raises
         ------
@@ -388,21 +426,29 @@ class Experience:
         """
         path = as_path(path).absolute()
         with locked(path):
-            old = read_file(path, MAX_FILE_BYTES) if path.exists() else None
-            if old is not None and self._synchronised != (path, crc32(old)):
-                saved = Experience.load(path)
-                saved._check_kind(self)
-                if self._synchronised[0] == path:
-                    for step in self._news:
-                        step(saved.evidence)
-                else:
-                    saved.merge(self)
-                saved.take_over(self)
-                self.evidence = saved.evidence
+            if path.exists():
+                self._join_content_of(path)
             content = self.to_bytes()
             write_atomically(path, content)
-        self._synchronised = path, crc32(content)
-        self._news = []
+        self._saved_path = path
+        self._saved_checksum = crc32(content)
+        self._unsaved = []
+
+    def _join_content_of(self, path: Path) -> None:
+        """Change the evidence to that of a file, and what is new in this experience."""
+        checksum = crc32(read_file(path, MAX_FILE_BYTES))
+        is_own_file = path == self._saved_path
+        if is_own_file and checksum == self._saved_checksum:
+            return  # nobody else has saved to the file
+        saved = Experience.load(path)
+        saved._check_kind(self)
+        if is_own_file:
+            for change in self._unsaved:
+                change(saved.evidence)
+        else:
+            saved.merge(self)
+        saved.take_posterior_from(self)
+        self.evidence = saved.evidence
 
     def to_bytes(self) -> bytes:
         """Return all as bytes, for a file or a message."""
@@ -439,7 +485,10 @@ class Experience:
 
     @classmethod
     def _from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Experience:
-        """Return the experience in the arrays of a file."""
+        """Return the experience in the arrays of a file, by their names.
+
+        A ValueError, KeyError or TypeError if they are not those of an experience.
+        """
         version = int(arrays["version"])
         if version not in (FIRST_VERSION, VERSION):
             raise ValueError(f"it has version {version}, not {VERSION}")
@@ -480,20 +529,25 @@ class Experience:
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or error
             raise ExperienceFileError(
-                f"{path}: cannot be read ({reason}); give a file that `Experience.save` wrote, or "
-                "delete it to begin anew"
+                f"{path}: cannot be read ({reason}); give a file that "
+                "`Experience.save` wrote, or delete it to begin anew"
             ) from error
-        experience._synchronised = path.absolute(), crc32(content)
+        experience._saved_path = path.absolute()
+        experience._saved_checksum = crc32(content)
         return experience
 
 
 def _as_option(name: str, value: Any) -> float:
+    """Return the value of one of the OPTIONS; a ValueError if it is out of range."""
     lowest, highest, unit = OPTIONS[name]
     return as_number(name, value, lowest, highest, f"{unit}, {lowest:g} to {highest:g}")
 
 
 def _possible(time: Float64, position: Float64) -> Poses:
-    """Return the possible poses, without those that repeat a time."""
+    """Return the possible poses, without those that repeat the time of the last one.
+
+    `time` is (N,), in seconds, and `position` (N, 2), in metres.
+    """
     # Comparisons with NaN are false.
     is_time = np.abs(time) < LATEST
     is_place = (np.abs(position) < FARTHEST).all(axis=1)
@@ -514,15 +568,27 @@ def _arrays_in(data: bytes) -> dict[str, NDArray[Any]]:
         return dict(file)
 
 
-def _converted(table: Float64, driven: Float64 | float, half_life: float) -> Float64:
-    """Return the table of a file of version 1 as one of today.
+def _converted(table: Float64, driven: float, half_life: float) -> Float64:
+    """Return the table of a file of version 1 as a table of today, (N, 7).
 
-    Its columns are weight, sum of the log slowness, failures, x, y, and the seconds
-    that were driven before the last visit.
+    Parameters
+    ----------
+    table : (N, 6) float64
+        The columns are weight, sum of the log slowness, failures, x, y, and the seconds
+        that were driven before the last visit.
+    driven, half_life : float
+        Seconds.
     """
-    weight_and_sum = table[:, :2]
-    position = table[:, 3:5]
-    age = (driven - table[:, 5:]) / half_life  # (N, 1): half-lives since the last visit
-    faded = weight_and_sum * 0.5**age
-    nothing = np.zeros((len(table), 3))  # passages, waits, and predictions
-    return np.hstack([faded, nothing, position])
+    weight, sum_of_log, _, x, y, driven_before = table.T
+    half_lives = (driven - driven_before) / half_life  # since the last visit
+    remaining = 0.5**half_lives
+    nothing = np.zeros(len(table))
+    places = Places(
+        weight=weight * remaining,
+        sum_of_log=sum_of_log * remaining,
+        passages=nothing,
+        waited=nothing,
+        predicted=nothing,
+        position=np.column_stack([x, y]),
+    )
+    return places.table()

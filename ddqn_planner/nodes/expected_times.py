@@ -98,7 +98,7 @@ class ExpectedTimes:
                 return False
             newer = Experience.from_bytes(data)
         if newer is not None and self._experience is not None:
-            newer.take_over(self._experience)
+            newer.take_posterior_from(self._experience)
         self._experience = newer
         self._layout = None if message is None else message.layout
         return True

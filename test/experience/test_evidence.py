@@ -43,7 +43,7 @@ def test_what_is_kept_gives_what_is_computed_anew(
             st.booleans()
         ):  # as a planner does that loads what a trainer saves
             older, kept = kept, Experience.load(file)
-            kept.take_over(older)
+            kept.take_posterior_from(older)
         grid = MAPS[number]
         np.testing.assert_allclose(
             kept.slowness(grid), Experience.load(file).slowness(grid), rtol=CLOSE
