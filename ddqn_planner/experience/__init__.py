@@ -1,4 +1,4 @@
-"""What driving has shown about places: how long they take, and how often moves fail there."""
+"""What driving has shown of places: how long they take, and how often moves fail."""
 
 from ddqn_planner.experience.experience import (
     ExpectedTime,

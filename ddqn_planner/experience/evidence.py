@@ -94,8 +94,8 @@ class Evidence:
         self.driven = 0.0  # seconds
         self.places = Places.none()
         self._row_of_square: dict[Square, int] = {}  # of `places`
-        # Of the last drives: the error, see `ErrorRange`, and the largest surprise, also
-        # in standard deviations.
+        # Of the last drives: the error, see `ErrorRange`, and the largest surprise, see
+        # `_surprises_of`.
         self.errors = deque[float](maxlen=LAST_DRIVES)
         self.surprises = deque[float](maxlen=LAST_DRIVES)
         self.posterior: Posterior | None = None  # over the last map
@@ -152,8 +152,8 @@ class Evidence:
     def _limit_passages(self, rows_of_waits: Int64) -> None:
         """Let each place have at most MOST_PASSAGES, so that the last ones count most.
 
-        Where the robot has just waited, in the rows `rows_of_waits` (W,) of `places`, it
-        has passed at least once.
+        Where the robot has just waited, in the rows `rows_of_waits` (W,) of `places`,
+        it has passed at least once.
         """
         places = self.places
         places.passages[rows_of_waits] = np.maximum(places.passages[rows_of_waits], 1)
@@ -244,7 +244,8 @@ class Evidence:
         self.errors.append(log_of_ratio / deviation)
 
     def error_range(self) -> ErrorRange:
-        """Return the range of the errors of the last drives, and of some assumed ones."""
+        """Return the range of errors of the last drives and ASSUMED_DRIVES more."""
+        # Evenly over a little more than the 90 % of a normal distribution.
         assumed = NORMAL * np.linspace(-1.05, 1.05, ASSUMED_DRIVES)
         errors = np.concatenate([self.errors, assumed])
         low, high = np.quantile(errors, (TAIL, 1 - TAIL)).tolist()

@@ -217,13 +217,13 @@ class Experience:
         return f"the robot comes no farther than {extent:.2g} m; give a longer drive"
 
     def _too_fast(self, speed: float) -> str:
-        """Return that a robot cannot drive at `speed`, in metres per second."""
+        """Return why a drive at `speed`, metres per second, teaches nothing."""
         nominal = f"{self.nominal_speed:g}"
         remedy = f"give metres and seconds, or a nominal_speed greater than {nominal}"
         return f"the robot moves at {speed:.3g} m/s; {remedy} m/s"
 
     def _too_slow(self, speed: float) -> str:
-        """Return that a robot never drives at most at `speed`, metres per second."""
+        """Return why a drive never faster than `speed`, metres per second, is none."""
         nominal = f"{self.nominal_speed:g}"
         remedy = f"give metres and seconds, or a nominal_speed less than {nominal}"
         return f"the robot moves at most at {speed:.3g} m/s; {remedy} m/s"
@@ -317,10 +317,10 @@ class Experience:
         grid : GridMap
             The map; its own costs multiply the time.
         exploration : float
-            0 to 10. If it is not 0, plans lead where driving may be faster: places count
-            as faster by a standard deviation. But no plan is expected to take longer
-            than the best plan by more than this share of its time. `Plan.cost` is the
-            expected time.
+            0 to 10. If it is not 0, plans lead where driving may be faster: places
+            count as faster by a standard deviation. But no plan is expected to take
+            longer than the best plan by more than this share of its time. `Plan.cost`
+            is the expected time.
         """
         share = as_number("exploration", exploration, 0, 10, "0 to 10")
         population = self.evidence.population
@@ -337,8 +337,8 @@ class Experience:
         largest_deviation = deviation.max(initial=0)
         largest = FAST_STEP * math.ceil(largest_deviation / FAST_STEP)
         bold = self._timed(grid, posterior, "bold", deviation, fastest - largest)
-        # A path whose time is at most that of the best one on this map, in which places
-        # are faster by no more than the share, takes at most so much longer.
+        # Where no place counts as faster by more than the share, no plan is expected to
+        # take longer than the best plan by more than the share.
         limit = math.log(1 + share)
         limited = np.minimum(deviation, limit)
         safe = self._timed(grid, posterior, "safe", limited, fastest - limit)
@@ -352,10 +352,11 @@ class Experience:
         optimism: Float64 | float,
         fastest: float,
     ) -> GridMap:
-        """Return the map with expected times of moves; for the rest see `Posterior.paint`.
+        """Return the map with the expected times of moves.
 
-        The map has the slowness over that of the fastest place, and the seconds per cell
-        of the fastest place.
+        The map has the slowness over that of the fastest place, and the seconds per
+        cell of the fastest place. The last three parameters are those of
+        `Posterior.paint`.
         """
         slowness = posterior.paint(name, optimism, fastest)
         seconds = grid.resolution / self.nominal_speed * math.exp(fastest)

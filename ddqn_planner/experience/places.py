@@ -18,14 +18,15 @@ COLUMNS = 7  # of the table in which files hold places
 
 @dataclass
 class Places:
-    """Sums of what was seen at N places."""
+    """Sums of what was seen at N places. The first four fade with time."""
 
-    weight: Float64  # (N,): of the visits; it fades
+    # (N,): the sum of the weights of all visits; a visit of a side's length weighs 1
+    weight: Float64
     sum_of_log: Float64  # (N,): of the log slowness of the visits, times their weights
     passages: Float64  # (N,): the weight of the visits since a robot first waited near
     waited: Float64  # (N,): seconds
     predicted: Float64  # (N,): log slowness, from the prior before the first visit
-    position: Float64  # (N, 2): of the first visit, metres
+    position: Float64  # (N, 2): x and y of the first visit, metres
 
     @classmethod
     def none(cls) -> Places:
@@ -34,13 +35,13 @@ class Places:
 
     @classmethod
     def from_table(cls, table: Float64) -> Places:
-        """Return the places in the rows of a table, (N, 7)."""
+        """Return the places in the rows of a table, (N, 7): the columns of `table`."""
         weight, sum_of_log, passages, waited, predicted, x, y = table.T.copy()
         position = np.column_stack([x, y])
         return cls(weight, sum_of_log, passages, waited, predicted, position)
 
     def table(self) -> Float64:
-        """Return the places as the rows of a table, (N, 7)."""
+        """Return the places as the rows of a table, (N, 7), which files hold."""
         columns = (
             self.weight,
             self.sum_of_log,
@@ -55,7 +56,10 @@ class Places:
         return len(self.weight)
 
     def append(self, predicted: Float64, position: Float64) -> None:
-        """Add places that were not seen yet: (M,) and (M, 2)."""
+        """Add M places that were not seen yet, with sums of 0.
+
+        `predicted` (M,) and `position` (M, 2) are as the attributes.
+        """
         nothing = np.zeros(len(predicted))
         self.weight = np.append(self.weight, nothing)
         self.sum_of_log = np.append(self.sum_of_log, nothing)
@@ -65,7 +69,7 @@ class Places:
         self.position = np.concatenate([self.position, position])
 
     def fade(self, share: float) -> None:
-        """Keep a share of all that was seen."""
+        """Multiply all sums with a share, 0 to 1."""
         self.weight *= share
         self.sum_of_log *= share
         self.passages *= share

@@ -52,29 +52,32 @@ class Population(NamedTuple):
 
 def population_of(places: Places) -> Population:
     """Fit the distribution of the log slowness to places."""
-    counts = places.weight >= SMALLEST_WEIGHT
-    weight = places.weight[counts]  # (M,)
-    log = places.sum_of_log[counts] / weight
+    has_visits = places.weight >= SMALLEST_WEIGHT
+    weight = places.weight[has_visits]  # (M,), as the following arrays
+    mean_log = places.sum_of_log[has_visits] / weight
+    noise = NOISE / weight  # the variance of each mean
     # (M, 2): what the level and the weight of the prior are multiplied with.
-    design = np.column_stack([np.ones(len(log)), places.predicted[counts]])
-    noise = NOISE / weight  # variance of each mean
+    design = np.column_stack([np.ones(len(weight)), places.predicted[has_visits]])
 
     variance = VARIANCE
+    count = len(weight) / ALIKE_PLACES
     for _ in range(ITERATIONS):
-        level, prior_weight = _regression(log, design, variance + noise)
-        residual = log - design @ (level, prior_weight)
+        level, prior_weight = _regression(mean_log, design, variance + noise)
+        residual = mean_log - design @ (level, prior_weight)
+        # The part of each square that is not noise.
         squares = residual**2 - noise
         total = ASSUMED_PLACES * VARIANCE + squares.sum() / ALIKE_PLACES
-        count = ASSUMED_PLACES + len(log) / ALIKE_PLACES
-        variance = float(np.clip(total / count, LEAST_VARIANCE, MOST_VARIANCE))
+        mean_square = total / (ASSUMED_PLACES + count)
+        variance = float(np.clip(mean_square, LEAST_VARIANCE, MOST_VARIANCE))
 
-    surplus = (variance + NOISE) / 2 * len(log) / (FEW_PLACES + len(log))
-    sure = log[weight >= KNOWN_WEIGHT]
+    # Where the log is normal, the log of the mean is half of the variance above it.
+    surplus = (variance + NOISE) / 2 * len(weight) / (FEW_PLACES + len(weight))
+    known_log = mean_log[weight >= KNOWN_WEIGHT]
     open_log = 0.0
     fastest_log = 0.0
-    if len(sure) >= SURE_PLACES:
-        open_log = float(np.quantile(sure, OPEN_QUANTILE))
-        fastest_log = float(np.quantile(sure, FASTEST_QUANTILE))
+    if len(known_log) >= SURE_PLACES:
+        open_log = float(np.quantile(known_log, OPEN_QUANTILE))
+        fastest_log = float(np.quantile(known_log, FASTEST_QUANTILE))
     return Population(level, prior_weight, variance, surplus, open_log, fastest_log)
 
 
@@ -83,6 +86,8 @@ def _regression(
 ) -> tuple[float, float]:
     """Return the level and the weight of the prior, by Bayesian linear regression.
 
+    The log slowness is about `design @ (level, prior_weight)`.
+
     Parameters
     ----------
     log, variances : (M,) float64
@@ -90,18 +95,23 @@ def _regression(
     design : (M, 2) float64
         Ones, and the prediction of the prior.
     """
-    weighted = design.T / variances / ALIKE_PLACES  # (2, M)
+    # (2, M): with the inverse variance of each place, of which ALIKE_PLACES tell as
+    # much as one place alone.
+    weighted = design.T / variances / ALIKE_PLACES
     inverse_variances = INVERSE_VARIANCE_OF_LEVEL, INVERSE_VARIANCE_OF_PRIOR_WEIGHT
     covariance = np.linalg.inv(np.diag(inverse_variances) + weighted @ design)  # (2, 2)
-    # Few places may be slow by chance where the prior says so: its weight is a standard
-    # error less than the places tell, as far as they tell it.
-    variance_of_weight = covariance[1, 1]
-    share_told = 1 - INVERSE_VARIANCE_OF_PRIOR_WEIGHT * variance_of_weight
-    doubt = share_told * math.sqrt(variance_of_weight)
     assumed = [0, INVERSE_VARIANCE_OF_PRIOR_WEIGHT * PRIOR_WEIGHT]
     fitted_weight = float(covariance[1] @ (assumed + weighted @ log))
+    # Few places may be slow by chance where the prior says so: the weight is less than
+    # the fitted one by a standard error, as far as it follows from these places.
+    variance_of_weight = covariance[1, 1]
+    share_of_places = 1 - INVERSE_VARIANCE_OF_PRIOR_WEIGHT * variance_of_weight
+    doubt = share_of_places * math.sqrt(variance_of_weight)
     prior_weight = max(fitted_weight - doubt, 0)
 
-    remaining = weighted[0] @ (log - prior_weight * design[:, 1])
-    level = float(remaining / (INVERSE_VARIANCE_OF_LEVEL + weighted[0].sum()))
+    # The level is fitted again, with this weight.
+    inverse_variances_of_log = weighted[0]  # (M,)
+    remaining_log = log - prior_weight * design[:, 1]
+    sum_of_inverse = INVERSE_VARIANCE_OF_LEVEL + inverse_variances_of_log.sum()
+    level = float(inverse_variances_of_log @ remaining_log / sum_of_inverse)
     return level, prior_weight

@@ -160,10 +160,10 @@ def _check_on_map(path: Path, drives: Sequence[Drive], grid: GridMap) -> None:
 
 
 def _mcap_files_of(path: Path) -> Sequence[Path]:
-    """Return the MCAP files of a bag, a file or a folder, in the order of their numbers.
+    """Return the MCAP files of a bag in the order of their numbers.
 
-    A path that does not exist is returned too: opening it says so. A ValueError if
-    there is no MCAP file.
+    `path` is a file, or a folder with files. A path that does not exist is returned,
+    too: opening it says so. A ValueError if there is no MCAP file.
     """
     if path.is_dir():
         # The number is the end of a name, without leading zeros.

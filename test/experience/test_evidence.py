@@ -254,9 +254,7 @@ def test_a_wait_beside_a_wall_costs_nothing_behind_it() -> None:
     assert at(HALL, experience.slowness(HALL), 5, 5.4) > 10
 
 
-def test_where_robots_wait_at_several_places_they_are_expected_to_wait_elsewhere_too() -> (
-    None
-):
+def test_where_robots_wait_at_several_places_waits_are_expected_elsewhere_too() -> None:
     open_way, one, other = (
         driven(*[drive] * 4).slowness(HALL)[:10].mean()
         for drive in (waited(0.0), waited(20.0), waited(20.0, 4.0))

@@ -59,7 +59,7 @@ def test_places_side_by_side_keep_their_own_slowness(rate: float) -> None:
     noisy = (positions + random.normal(0, 0.02, positions.shape) for _ in range(20))
     slowness = driven(*((seconds, each) for each in noisy)).slowness(HALL)
     of_places = [at(HALL, slowness, place, 5.1) for place in np.arange(3.125, 11, 0.25)]
-    # Neighbours are thought to be alike, and noise puts time of one place into the next.
+    # Neighbours are thought to be alike, and noise moves time of a place to the next.
     assert np.mean(of_places[::2]) < 1.65
     assert np.mean(of_places[1::2]) > 2.5
 
@@ -74,7 +74,7 @@ def test_much_noise_of_the_pose_hides_no_slowness() -> None:
         )
         experience.record(clock, way + random.normal(0, 0.05, way.shape))
     slowness = experience.slowness(HALL)
-    # With twelve seeds 3.97 to 4.04; 3.38 to 3.63 where such noise is averaged over 15 cm.
+    # With twelve seeds 3.97 to 4.04; 3.38 to 3.63 if such noise is averaged over 15 cm.
     assert (
         np.mean([at(HALL, slowness, x, 5.1) for x in np.arange(5.75, 8.3, 0.25)]) > 3.8
     )
@@ -153,7 +153,7 @@ def test_waiting_counts_as_time_and_standing_before_a_drive_does_not() -> None:
     slowness = driven((seconds, positions)).slowness(HALL)
     assert at(HALL, slowness, 7, 5) > 2
     assert max(at(HALL, slowness, x, 5) for x in (2.3, 4, 10, 11.8)) < 1.1
-    # Its first way is too short to tell of the place, where waits are expected as everywhere.
+    # Too short a drive to tell of the place, where waits are expected as everywhere.
     assert at(HALL, slowness, 2, 5) < min(1.2, at(HALL, slowness, 7, 9))
 
 

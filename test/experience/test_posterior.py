@@ -16,7 +16,7 @@ SIDE = 0.25
 
 
 def random_places(random: np.random.Generator, free_cells: np.ndarray) -> Places:
-    """Visits to some of the free cells, (N, 2) of x and y; some of the weights are 0."""
+    """Visits to some of the free cells, (N, 2) of x and y; some have the weight 0."""
     count = random.integers(0, len(free_cells) + 1)
     cells = random.permutation(free_cells)[:count]
     places = Places.none()

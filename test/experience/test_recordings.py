@@ -24,7 +24,8 @@ std_msgs/Header: builtin_interfaces/Time stamp, string frame_id
 builtin_interfaces/Time: int32 sec, uint32 nanosec
 geometry_msgs/Pose: geometry_msgs/Vector position
 geometry_msgs/PoseWithCovariance: geometry_msgs/Pose pose
-geometry_msgs/Transform: geometry_msgs/Vector translation, geometry_msgs/Quaternion rotation
+geometry_msgs/Transform: geometry_msgs/Vector translation, \
+geometry_msgs/Quaternion rotation
 geometry_msgs/TransformStamped: std_msgs/Header header, string child_frame_id, \
 geometry_msgs/Transform transform
 geometry_msgs/Vector: float64 x, float64 y
@@ -211,7 +212,7 @@ def test_poses_of_an_mcap_file_are_learned(
 
 
 def tree(robot: str, y: float, topic: str = "/tf") -> list[Message]:
-    """What a robot sends that drives 10 m along x: few corrections, dated into the future."""
+    """What a robot sends on 10 m along x: few corrections, dated into the future."""
     kind, map_frame = "tf2_msgs/msg/TFMessage", "map"
     odom, footprint, base = (
         f"{robot}{name}" for name in ("odom", "base_footprint", "base_link")
@@ -268,7 +269,7 @@ def test_transforms_with_rounded_rotations_count_and_those_without_do_not(
 
 
 BY_TURNS = zip(tree("", 9.0, "/robot2/tf"), tree("", 1.0, "/robot1/tf"), strict=True)
-# The poses that messages of two robots hold, the messages, and what chooses the second robot.
+# The poses of two robots, their messages, and what chooses the second robot.
 TWO_ROBOTS: dict[str, tuple[list[Message], dict[str, str]]] = {
     "/tf of robot1/base_link, /tf of robot2/base_link": (
         [*tree("robot1/", 1.0), *tree("robot2/", 9.0)],
