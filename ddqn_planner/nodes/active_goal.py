@@ -29,47 +29,50 @@ class Situation(NamedTuple):
     grid: GridMap
     map_header: Header | None
     start: Cell
-    turns: int | None  # the body's yaw in units of TURN_TO_PLAN; None without a body
+    # The yaw of a robot with a body, in units of TURN_TO_PLAN; None without a body.
+    turns: int | None
 
 
 @dataclass
 class ActiveGoal:
     """Decides when to plan again, and what to publish, as docs/nodes.md says."""
 
-    # The last ``goal_pose``, or ``goal_poses``, of which the nearest counts; none at first.
+    # The last ``goal_pose``, or ``goal_poses``: the planner leads to the nearest one.
+    # Empty before the first message.
     poses: Sequence[PoseStamped]
-    period: float  # seconds between looks for a change
+    period: float  # seconds, the parameter ``replan_period``
     # The last outcome whose path was published for this goal.
     followed: Outcome | None = None
-    last: Outcome = UNCHANGED
-    next_look: float = 0.0  # by the steady clock, in seconds
+    last: Outcome = UNCHANGED  # UNCHANGED until there is one
+    period_ends: float = 0.0  # in seconds of the steady clock
 
     @property
     def lacks_pose(self) -> bool:
         """Whether the goal waits for TF or odometry."""
         return bool(self.poses) and self.last.status in ("NO_START", "TF_ERROR")
 
-    def is_look_due(self, lacks_map: bool) -> bool:
-        """Return whether to look for a change, after which the goal may be planned for.
+    def is_check_due(self, lacks_map: bool) -> bool:
+        """Return whether to check now, by `is_due`, if the goal needs a new plan.
 
-        Where a costmap stopped after a plan, its path has to be taken back at once.
+        ``lacks_map`` says that there is no map to plan on. If there was one for the
+        last plan, the costmap has stopped, and the path has to be withdrawn at once.
         """
         costmap_stopped = lacks_map and self.last.request is not None
-        is_period_over = time.monotonic() >= self.next_look
+        is_period_over = time.monotonic() >= self.period_ends
         return bool(self.poses) and (costmap_stopped or is_period_over)
 
-    def schedule_look(self) -> bool:
-        """Return whether a look is due by the period; if so, the next period begins."""
+    def begin_period_if_due(self) -> bool:
+        """Begin the next period if the last one is over; return whether it was."""
         now = time.monotonic()
-        if self.period > 0 and now < self.next_look:
+        if self.period > 0 and now < self.period_ends:
             return False
-        self.next_look = now + self.period
+        self.period_ends = now + self.period
         return True
 
     def is_due(
         self, planner: Planner, request: Request, header: Header, is_period_over: bool
     ) -> bool:
-        """Return whether to plan: the map or the robot's place changed, and it matters.
+        """Return whether the map or the robot's place changed in a way that matters.
 
         Parameters
         ----------
@@ -80,7 +83,8 @@ class ActiveGoal:
             Of the request's map. A map that came again unchanged is planned on, so that
             the diagnostics name the last map.
         is_period_over : bool
-            Whether any change matters, or only one that leaves the robot without a path.
+            If so, any change matters; else only a change that leaves the robot without
+            a path.
         """
         last = self.last
         if last.request is not None:
@@ -92,29 +96,40 @@ class ActiveGoal:
         has_path = last.status == PlanStatus.SUCCEEDED.name
         if not has_path or last.header.frame_id != header.frame_id:
             return True
-        return len(planner.rest_of_path(request)) == 0
+        can_follow_path = len(planner.rest_of_path(request)) > 0
+        return not can_follow_path
 
     def note(self, outcome: Outcome) -> bool:
-        """Keep an outcome; return whether to publish its path, which may be empty."""
+        """Keep an outcome as the last one, and begin the next period.
+
+        Returns
+        -------
+        bool
+            Whether to publish the outcome's path, which may be empty: whether it is new
+            to those who have the last one.
+        """
         last = self.last
         self.last = outcome
-        self.next_look = time.monotonic() + self.period
-        is_same_kind = outcome.status == last.status
-        is_same_frame = outcome.header.frame_id == last.header.frame_id
+        self.period_ends = time.monotonic() + self.period
+        has_same_status = outcome.status == last.status
+        has_same_frame = outcome.header.frame_id == last.header.frame_id
         has_path = len(outcome.plan.path) > 0
-        is_new_path = has_path and outcome.plan.extra_cost is None
-        is_news = is_new_path or not (is_same_kind and is_same_frame)
+        was_kept = outcome.plan.extra_cost is not None  # the rest of the last path
+        is_new_path = has_path and not was_kept
+        is_news = is_new_path or not has_same_status or not has_same_frame
         if is_news and has_path:
             self.followed = outcome
         return is_news
 
 
 def situation_of(request: Request, header: Header | None) -> Situation:
-    """Return the situation in which a request is planned for."""
+    """Return the situation for which a request asks, on the map with a header."""
     turns = None
     if isinstance(request, PoseRequest):
-        turns = round(request.start[2] / TURN_TO_PLAN)
-    return Situation(request.grid, header, request.cells[0], turns)
+        _, _, yaw = request.start
+        turns = round(yaw / TURN_TO_PLAN)
+    start_cell = request.cells[0]
+    return Situation(request.grid, header, start_cell, turns)
 
 
 def with_current_path(request: Request, last: Outcome, frame: str) -> Request:
@@ -124,15 +139,15 @@ def with_current_path(request: Request, last: Outcome, frame: str) -> Request:
     ----------
     request : Request
     last : Outcome
-        Of the path; its model may have been another one.
+        With the path that the robot follows; its map and its model may have been others.
     frame : str
         The frame of the request's map.
 
     Returns
     -------
     Request
-        The same request if the path was in another frame or of another kind, or ended
-        outside the request's map.
+        The same request if the path cannot be kept: it was in another frame, of a model
+        of another kind, or ended outside the request's map.
     """
     if frame != last.header.frame_id:
         return request
@@ -145,10 +160,11 @@ def with_current_path(request: Request, last: Outcome, frame: str) -> Request:
         return request
     if last_request.simplified != request.simplified:
         return request
+    # The cell of the request's map in which cell (0, 0) of the last map lies.
     shift = shift_between(last_request.grid, request.grid)
     if shift is None:
         return request
-    cells = last.plan.path + np.array(shift, np.int32)
+    cells = last.plan.path + np.array(shift, np.int32)  # (N, 2) in the request's map
     x, y = cells[-1].tolist()
     if not request.grid.contains((x, y)):
         return request

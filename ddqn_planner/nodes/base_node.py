@@ -1,11 +1,12 @@
 """What the three nodes share: checked parameters, answered requests, topics."""
 
 import sys
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+import time
+from collections.abc import Callable, Coroutine, Generator, Iterator
+from contextlib import contextmanager
 from copy import copy
-from types import SimpleNamespace
-from typing import Any
+from types import coroutine
+from typing import Any, TypeVar
 
 from rcl_interfaces import msg, srv
 from rclpy.clock import TimeJump
@@ -29,11 +30,15 @@ from ddqn_planner.nodes.overrides import (
     unread_sections,
 )
 from ddqn_planner.nodes.parameter_messages import parameters_from_messages
-from ddqn_planner.nodes.pending_requests import PendingRequests, unless
 from ddqn_planner.nodes.quality import SERVICE_QUALITY, overriding_options
 from ddqn_planner.nodes.topic_problems import topic_problems
 
-STOPPED = False, "the node is being stopped"  # of triggers that wait at a signal
+# The success and the message of triggers that wait when the node is stopped.
+STOPPED = False, "the node is being stopped"
+FAREWELL = 0.1  # seconds after an answer in which the end of its service would lose it
+
+Answer = TypeVar("Answer")
+Refusal = TypeVar("Refusal")
 
 
 class BaseNode(Node):
@@ -49,14 +54,15 @@ class BaseNode(Node):
         reset."""
         self.is_stopping = False
         """A signal has come: requests that wait are to be refused."""
-        self._pending_requests = PendingRequests()
+        self._open_requests = 0  # number of requests that wait for their answers
+        self._farewell_ends = 0.0  # in seconds of the steady clock
         super().__init__(name)
         self._jumps = self.get_clock().create_jump_callback(
             JUMP_BACK, post_callback=self._on_jump
         )
         self._declared = parameters
         self._declare(parameters)
-        self.check_parameters({name: self.value(name) for name in parameters})
+        self.check_parameters(self.values())
         self.add_on_set_parameters_callback(self._check)
         for service in (srv.SetParameters, srv.SetParametersAtomically):
             self.answer_with(service, self._on_set_parameters)
@@ -147,9 +153,9 @@ class BaseNode(Node):
         """Return the value of a parameter."""
         return self.get_parameter(name).value
 
-    def settings(self) -> SimpleNamespace:
-        """Return the values that all parameters have now."""
-        return SimpleNamespace(**{name: self.value(name) for name in self._declared})
+    def values(self) -> dict[str, Any]:
+        """Return the values that all declared parameters have now, by their names."""
+        return {name: self.value(name) for name in self._declared}
 
     def _on_set_parameters(self, request: Any, response: Any) -> Any:
         """Answer a request to set parameters: one by one, or all or none of them.
@@ -183,14 +189,20 @@ class BaseNode(Node):
             if service.srv_type is service_type:
                 service.callback = callback
 
-    def answering(self) -> AbstractContextManager[None]:
-        """Count a request until it is answered; a node that stops waits until then."""
-        return self._pending_requests.counting()
+    @contextmanager
+    def answering(self) -> Iterator[None]:
+        """Count a request as open while the body of the with statement answers it."""
+        self._open_requests += 1
+        try:
+            yield
+        finally:
+            self._open_requests -= 1
+            self._farewell_ends = time.monotonic() + FAREWELL
 
     @property
     def is_answering(self) -> bool:
-        """Return whether a request waits, or its answer may not be sent yet."""
-        return self._pending_requests.are_open
+        """Return whether a request is open, or the last answer may not be sent yet."""
+        return self._open_requests > 0 or time.monotonic() < self._farewell_ends
 
     def refuse_requests(self) -> None:
         """Refuse the requests that wait, as the node is being stopped."""
@@ -220,8 +232,9 @@ class BaseNode(Node):
             _: Trigger.Request, response: Trigger.Response
         ) -> Trigger.Response:
             with self.answering():
-                response.success, response.message = await unless(
-                    await_or_execute(handler), lambda: self.is_stopping and STOPPED
+                response.success, response.message = await unless_refused(
+                    await_or_execute(handler),
+                    lambda: STOPPED if self.is_stopping else None,
                 )
             return response
 
@@ -267,6 +280,36 @@ class BaseNode(Node):
             self.get_logger().warning(problem)
         self._logged_problems = problems
         return problems
+
+
+@coroutine
+def unless_refused(
+    answer: Coroutine[None, None, Answer], refusal: Callable[[], Refusal | None]
+) -> Generator[None, None, Answer | Refusal]:
+    """Await an answer; close its coroutine as soon as there is a refusal instead.
+
+    Parameters
+    ----------
+    answer
+        The coroutine that computes the answer.
+    refusal
+        Returns what to answer instead; something false as long as `answer` may go on.
+
+    Returns
+    -------
+    The answer, or the refusal.
+    """
+    while True:
+        refused = refusal()
+        if refused:
+            answer.close()
+            return refused
+        try:
+            step = answer.send(None)
+        except StopIteration as end:
+            return end.value  # type: ignore[no-any-return]
+        # The executor resumes this coroutine when it wakes the next time.
+        yield step
 
 
 def _refusal(error: Exception) -> msg.SetParametersResult:

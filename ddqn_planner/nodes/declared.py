@@ -3,7 +3,9 @@
 import math
 from array import array
 from collections.abc import Mapping
-from typing import Any, Final, NamedTuple
+from dataclasses import field, fields
+from types import MappingProxyType
+from typing import Any, Final, NamedTuple, TypeVar
 
 from rcl_interfaces import msg
 from rclpy.exceptions import InvalidNamespaceException
@@ -22,15 +24,21 @@ TYPES: Final[dict[type, str]] = {
     bytes: "a list of bytes",
 }
 
+NOTHING_REPLACED: Final[Mapping[str, str]] = MappingProxyType({})
+
+# Of a number its least and greatest value; of a text its choices, or words for them.
+Allowed = tuple[float, float] | list[str] | str
+T = TypeVar("T")
+
 
 class Declared(NamedTuple):
-    """What a user reads of a parameter; a number has a range, a text choices, or words for them."""
+    """The declaration of a parameter, as users read it."""
 
     default: Any
     description: str
-    allowed: tuple[float, float] | list[str] | str = ""
+    allowed: Allowed = ""
     read_only: bool = False
-    replaced: Mapping[str, str] = {}  # choices of older versions, with today's
+    replaced: Mapping[str, str] = NOTHING_REPLACED  # by choices of older versions
 
     @property
     def limits(self) -> str:
@@ -38,52 +46,72 @@ class Declared(NamedTuple):
         if isinstance(self.allowed, tuple):
             form = "{} to {}" if isinstance(self.default, int) else "{:g} to {:g}"
             return form.format(*self.allowed)
-        return (
-            self.allowed if isinstance(self.allowed, str) else f"one of {self.allowed}"
-        )
+        if isinstance(self.allowed, list):
+            return f"one of {self.allowed}"
+        return self.allowed
 
     def descriptor(self) -> msg.ParameterDescriptor:
-        """Return what ROS stores of it, and checks: a number's type and range."""
+        """Return the descriptor that ROS stores, by which it checks ranges."""
         descriptor = msg.ParameterDescriptor(
             description=self.description, read_only=self.read_only
         )
         if not isinstance(self.allowed, tuple):
             descriptor.additional_constraints = self.limits
             return descriptor
-        low, high = map(type(self.default), self.allowed)
-        ends = {"from_value": low, "to_value": high}
-        if isinstance(self.default, int):
+        number_type = type(self.default)
+        low, high = self.allowed
+        ends = {"from_value": number_type(low), "to_value": number_type(high)}
+        if number_type is int:
             descriptor.integer_range = [msg.IntegerRange(**ends)]
         else:
             descriptor.floating_point_range = [msg.FloatingPointRange(**ends)]
         return descriptor
 
     def read(self, name: str, value: Any) -> Any:
-        """Return what a value means, in the type of the default; a ValueError says what to give.
+        """Return a value that a user set, in the type of the default.
 
-        A whole number is a number, and 65.0 is 65. A choice may have capitals and blanks around it.
+        A whole number is a number, and 65.0 is 65. A choice may have capitals, and
+        blanks around it.
+
+        Parameters
+        ----------
+        name : str
+            The parameter's, for errors.
+        value : object
+            As ROS reads it from YAML, from a file, or gets it in a message.
+
+        Raises
+        ------
+        ValueError
+            If the parameter cannot have this value; with the remedy.
         """
-        default_type = type(self.default)
         if isinstance(value, array):  # ROS makes it of a list of numbers
             value = value.tolist()
-        if default_type is list:
-            return self._read_names(name, value)
-        if default_type is float and type(value) is int:
-            value = float(value)
-        if default_type is int and type(value) is float and value.is_integer():
-            value = int(value)
-        if type(value) is not default_type:
+        if isinstance(self.default, list):
+            return self._read_namespaces(name, value)
+        value = self._in_type(value)
+        if type(value) is not type(self.default):
             raise ValueError(f"{name} is {self._shown(value)}; give {self._wanted}")
         if isinstance(self.allowed, tuple):
             return self._read_number(name, value, *self.allowed)
         if isinstance(self.allowed, list):
             return self._read_choice(name, value, self.allowed)
         if self.allowed == NOT_EMPTY and not value.strip():
-            words = self.description[0].lower() + self.description[1:]
-            raise ValueError(f"{name} is {value!r}; name {words}")
+            noun = self.description[0].lower() + self.description[1:]
+            raise ValueError(f"{name} is {value!r}; name {noun}")
+        return value
+
+    def _in_type(self, value: Any) -> Any:
+        """Return a number in the type of the default, if it loses nothing by that."""
+        default_type = type(self.default)
+        if default_type is float and type(value) is int:
+            return float(value)
+        if default_type is int and type(value) is float and value.is_integer():
+            return int(value)
         return value
 
     def _read_choice(self, name: str, value: str, choices: list[str]) -> str:
+        """Return which of the choices a text means; see `read`."""
         choice = value.strip().lower()
         if choice in choices:
             return choice
@@ -93,6 +121,7 @@ class Declared(NamedTuple):
         raise ValueError(f"{name} is {value!r}; give one of {names}")
 
     def _read_number(self, name: str, value: Any, low: float, high: float) -> Any:
+        """Return a number of a range; a bit beyond an end, the end. See `read`."""
         if low <= value <= high:
             return value
         for end in (low, high):
@@ -100,32 +129,29 @@ class Declared(NamedTuple):
                 return type(value)(end)
         raise ValueError(f"{name} is {value}; give {self.limits}")
 
-    def _read_names(self, name: str, values: Any) -> list[str]:
-        """Return the names of a list, without empty ones; ROS has no type for an empty list."""
-        if isinstance(values, str):
-            values = [values]
-        if not isinstance(values, list) or not all(
-            isinstance(value, str) for value in values
-        ):
-            if values:
-                raise ValueError(
-                    f"{name} is {self._shown(values)}; give {self._wanted}"
-                )
-            values = []
-        names = [value.strip().strip("/") for value in values]
-        names = [*dict.fromkeys(filter(None, names))]
-        for space in names:
+    def _read_namespaces(self, name: str, value: Any) -> list[str]:
+        """Return namespaces without empty ones and without slashes; see `read`.
+
+        The list of none is [""], as ROS has no type for an empty list.
+        """
+        namespaces = [value] if isinstance(value, str) else value or []
+        is_list = isinstance(namespaces, list)
+        if not is_list or not all(isinstance(item, str) for item in namespaces):
+            raise ValueError(f"{name} is {self._shown(value)}; give {self._wanted}")
+        stripped = [namespace.strip().strip("/") for namespace in namespaces]
+        unique = [*dict.fromkeys(filter(None, stripped))]
+        for namespace in unique:
             try:
-                validate_namespace(f"/{space}")
+                validate_namespace(f"/{namespace}")
             except InvalidNamespaceException:
-                wrong = f"{name} holds {space!r}, which is no namespace"
-                raise ValueError(
-                    f"{wrong}; give letters, digits and _, such as r1"
-                ) from None
-        return names or [""]
+                problem = f"{name} holds {namespace!r}, which is no namespace"
+                remedy = "give letters, digits and _, such as r1"
+                raise ValueError(f"{problem}; {remedy}") from None
+        return unique or [""]
 
     @property
     def _wanted(self) -> str:
+        """What to give, in words."""
         kind = type(self.default)
         if kind is bool:
             return "true or false"
@@ -148,14 +174,36 @@ class Declared(NamedTuple):
 Parameters = Mapping[str, Declared]
 
 
+def parameter(
+    default: T,
+    description: str,
+    allowed: Allowed = "",
+    read_only: bool = False,
+    replaced: Mapping[str, str] = NOTHING_REPLACED,
+) -> T:
+    """Declare a parameter as a field of a dataclass of settings; see `Declared`."""
+    declaration = Declared(default, description, allowed, read_only, replaced)
+    entry: T = field(default=default, metadata={"declaration": declaration})
+    return entry
+
+
+def declared_by(settings: Any) -> dict[str, Declared]:
+    """Return what the fields of a dataclass of settings declare, by their names."""
+    return {entry.name: entry.metadata["declaration"] for entry in fields(settings)}
+
+
 def read_all(parameters: Parameters, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the values of some parameters mean; a ValueError names all that are wrong."""
-    meant, wrong = {}, []
+    """Return the values of some parameters in the types of their defaults.
+
+    A ValueError names all values that are wrong, with remedies; see `Declared.read`.
+    """
+    typed_values = {}
+    problems = []
     for name, value in values.items():
         try:
-            meant[name] = parameters[name].read(name, value)
+            typed_values[name] = parameters[name].read(name, value)
         except ValueError as error:
-            wrong.append(str(error))
-    if wrong:
-        raise ValueError(" / ".join(wrong))
-    return meant
+            problems.append(str(error))
+    if problems:
+        raise ValueError(" / ".join(problems))
+    return typed_values

@@ -16,8 +16,9 @@ PERIOD = 0.9  # seconds between diagnostics when nothing changes: until the next
 class Diagnostics:
     """Which inputs a node refused and has not accepted since, and why.
 
-    An input is a topic, a parameter's file or a map's zones, by its name. A refusal is
-    logged when its reason changes.
+    An input is a topic, the file of a parameter or the zones of a map, by its name. A
+    refusal is logged when its reason changes. `on_change` is called when there is
+    something new to publish.
     """
 
     def __init__(
@@ -28,13 +29,15 @@ class Diagnostics:
         """The reason of each refusal, by the name of the input."""
         self.publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._on_change = on_change
-        self._due = 0.0  # by the steady clock, in seconds
+        # When to publish the next time, in seconds of the steady clock; 0: at once.
+        self._due = 0.0
 
     @contextmanager
     def receiving(self, input_name: str, is_frequent: bool = False) -> Iterator[None]:
         """Accept an input, or refuse it if the body of the with statement raises.
 
-        Of a frequent input, only the first refusal is logged.
+        A ValueError or a MemoryError of the body ends here. Of a frequent input, only
+        the first refusal is logged.
         """
         try:
             yield
@@ -92,15 +95,15 @@ class PlannerDiagnostics(Diagnostics):
 
     outcome = NO_REQUEST
 
-    def is_due(self) -> bool:
-        """Return whether to publish: somebody listens, and a change or `PERIOD` passed.
+    def begin_period_if_due(self) -> bool:
+        """Begin the next period after a change, or after `PERIOD`.
 
-        From then on the next period counts, whether anything is published or not.
+        Return whether to publish now: the last period is over, and somebody listens.
         """
         if time.monotonic() < self._due:
             return False
         self._due = time.monotonic() + PERIOD
-        self.node.topic_problems()  # which are logged, even if nobody listens
+        self.node.topic_problems()  # logs them, even if nobody listens
         return bool(self.publisher.get_subscription_count() > 0)
 
     def note(self, outcome: Outcome) -> None:
@@ -111,7 +114,7 @@ class PlannerDiagnostics(Diagnostics):
     def log(self, outcome: Outcome, paths: bool = False) -> None:
         """Log why there is no path; with `paths`, also how a path was found.
 
-        Logging takes a sixth of the time of a request.
+        To log a path takes a sixth of the time of a request.
         """
         if not outcome.plan.path.size:
             self.node.get_logger().warning(f"no plan: {outcome.reason}")

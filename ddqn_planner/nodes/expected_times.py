@@ -16,8 +16,8 @@ from ddqn_planner.nodes.outcome import NO_REQUEST, Outcome
 from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.nodes.worker import Worker
 
-# A share of the cells: where more have changed, experience is spread anew over the map,
-# which takes long.
+# Share of a map's cells: if more than these have changed, the experience is spread anew
+# over the map, which takes long.
 CHANGED_SHARE = 0.02
 
 
@@ -47,18 +47,22 @@ class ExpectedTimes:
         self._diagnostics = diagnostics
         self._worker = worker
         self._on_change = on_change
-        self._experience: Experience | None = None
-        # Of the message that the experience came in; it holds the digest.
+        self._experience: Experience | None = None  # in use
+        # The layout of the message in which the experience came; it holds a digest.
         self._layout: MultiArrayLayout | None = None
-        self._experience_of_file: Experience | None = None  # which was set last
-        self._spread_on: GridMap | None = None
-        # The outcome whose description the worker computes, and its answer.
+        # The experience of the file that the parameter names, if it was loaded when
+        # the parameter was set, and is not in use yet.
+        self._experience_of_file: Experience | None = None
+        # The map over which the experience was spread the last time.
+        self._spread_map: GridMap | None = None
+        # The outcome that the worker describes, and the future of its description.
         self._described = NO_REQUEST
         self._description = Future()
         group = MutuallyExclusiveCallbackGroup()  # the callback waits for the worker
-        self._read_file = node.create_guard_condition(self.on_message, group).trigger
+        # Without a message, `on_message` uses the file.
+        self._use_file = node.create_guard_condition(self.on_message, group).trigger
         if node.value("experience"):
-            self._read_file()
+            self._use_file()
         if node.value("follow_trainer"):
             node.create_subscription(
                 UInt8MultiArray,
@@ -69,21 +73,29 @@ class ExpectedTimes:
             )
 
     def use(self, experience: Experience | None) -> None:
-        """Plan by the experience of the file that was set, or by none."""
+        """Plan by the experience of the file that the parameter names now; None: none."""
         self._experience_of_file = experience
-        self._read_file()
+        self._use_file()
 
     async def on_message(self, message: UInt8MultiArray | None = None) -> None:
-        """Plan by the trainer's message, or by the file that is set, or refuse it."""
+        """Plan by a message of the trainer; without one, by the file of the parameter.
+
+        A message or a file without experience is reported, and not used.
+        """
         with self._diagnostics.receiving("experience"):
             is_new: bool = await self._worker.call(self.load, message)
             if is_new:
                 self._on_change()
 
     def load(self, message: UInt8MultiArray | None = None) -> bool:
-        """Use a message, or without one the file that is set; return whether it is new.
+        """Use the experience of a message, or without one of the parameter's file.
 
-        The worker calls it.
+        The worker calls this function.
+
+        Returns
+        -------
+        bool
+            False if the message is the same as the last one.
 
         Raises
         ------
@@ -94,7 +106,7 @@ class ExpectedTimes:
             newer = self._load_file()
         else:
             data = bytes_of("experience", message)
-            if message.layout == self._layout:  # its digest is the same
+            if message.layout == self._layout:
                 return False
             newer = Experience.from_bytes(data)
         if newer is not None and self._experience is not None:
@@ -112,16 +124,23 @@ class ExpectedTimes:
         return Experience.load(file) if experience is None else experience
 
     def apply(self, grid: GridMap) -> GridMap:
-        """Return a map whose moves cost expected time; the same map before a drive."""
+        """Return a map whose moves cost expected time; the same map before a drive.
+
+        On a map that is nearly the same as the last one, the times are the same, too.
+        """
         if self._experience is None or not len(self._experience.evidence.places):
             return grid
-        if self._spread_on is None or not is_like(grid, self._spread_on):
-            self._spread_on = grid
+        if self._spread_map is None or not is_like(grid, self._spread_map):
+            self._spread_map = grid
         exploration: float = self._node.value("exploration")
-        return grid.with_times_of(self._experience.apply(self._spread_on, exploration))
+        map_with_times = self._experience.apply(self._spread_map, exploration)
+        return grid.with_times_of(map_with_times)
 
     def diagnostics_of(self, outcome: Outcome) -> dict[str, str]:
-        """Return what `describe` returns; empty until the worker has computed it."""
+        """Return what `describe` returns; empty until the worker has computed it.
+
+        The first call for an outcome lets the worker begin.
+        """
         if self._experience is None:
             return {}
         if outcome is not self._described:
@@ -136,12 +155,13 @@ class ExpectedTimes:
         return description
 
     def describe(self, outcome: Outcome) -> dict[str, str]:
-        """Return how long a plan takes, unless its map is old or has no times.
+        """Return how long the robot needs for a plan, as lines of the diagnostics.
 
-        The worker calls it.
+        They are empty if the map of the plan is old or has no times. The worker calls
+        this function.
         """
         request = outcome.request
-        grid = self._spread_on
+        grid = self._spread_map
         path = outcome.plan.path
         if self._experience is None or grid is None or request is None:
             return {}
@@ -157,7 +177,7 @@ class ExpectedTimes:
 
 
 def is_like(grid: GridMap, other: GridMap) -> bool:
-    """Return whether two maps have the same place, and nearly the same obstacles."""
+    """Return whether two maps have the same cells, and nearly the same obstacles."""
     if grid.occupancy.shape != other.occupancy.shape:
         return False
     if grid.resolution != other.resolution or grid.origin != other.origin:

@@ -18,7 +18,6 @@ from std_msgs.msg import Header
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.boxes import boxes_of
 from ddqn_planner.grid.inflation import Inflation
-from ddqn_planner.nodes.arrivals import Arrivals
 from ddqn_planner.nodes.base_node import BaseNode
 from ddqn_planner.nodes.conversions import (
     MapRules,
@@ -32,6 +31,7 @@ from ddqn_planner.nodes.expected_times import ExpectedTimes
 from ddqn_planner.nodes.map_updates import REMEDY, MapUpdate, values_of_update
 from ddqn_planner.nodes.outcome import RequestError
 from ddqn_planner.nodes.quality import LATCHED
+from ddqn_planner.nodes.retries import Arrivals
 from ddqn_planner.nodes.ros_packages import apt_install
 from ddqn_planner.nodes.worker import Worker
 

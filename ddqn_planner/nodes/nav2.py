@@ -10,12 +10,14 @@ from nav_msgs.msg import Path
 from rclpy.action.server import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
+from std_msgs.msg import Header
 
 from ddqn_planner.nodes.base_node import BaseNode
 from ddqn_planner.nodes.other_planners import (
     ACTIONS,
     QUEUES,
     GivenUp,
+    GoalAnswer,
     OtherPlanners,
     action_name,
 )
@@ -45,12 +47,53 @@ ERROR_NAMES = {
 }
 
 
-def error_code(status: str, result: Any) -> int:
-    """Return the code of an `Outcome` in an action's Result; 0 if canceled."""
+def error_code(status: str, result_type: Any) -> int:
+    """Return the code of an outcome's status in an action's Result; 0 if canceled.
+
+    The type of the Result has the codes by their names.
+    """
     if status in (PlanStatus.SUCCEEDED.name, CANCELED.status):
         return 0
     name = ERROR_NAMES.get(status, status)
-    return int(getattr(result, name, result.UNKNOWN))
+    return int(getattr(result_type, name, result_type.UNKNOWN))
+
+
+class GoalList(Protocol):
+    """The fields of nav_msgs/msg/Goals, which Nav2 has since Kilted."""
+
+    header: Header
+    goals: Sequence[PoseStamped]
+
+
+class PathGoal(Protocol):
+    """The fields of the actions' Goals; each action has some of the last three."""
+
+    start: PoseStamped
+    use_start: bool
+    planner_id: str
+    goal: PoseStamped
+    viapoints: Sequence[PoseStamped]
+    goals: Sequence[PoseStamped] | GoalList
+
+
+class GoalHandle(Protocol):
+    """The part of rclpy's ServerGoalHandle that is used."""
+
+    request: PathGoal
+    goal_id: Any
+    is_cancel_requested: bool
+
+    def execute(self) -> None:
+        """Let the server execute the goal."""
+
+    def succeed(self) -> None:
+        """End the goal as succeeded."""
+
+    def abort(self) -> None:
+        """End the goal as aborted."""
+
+    def canceled(self) -> None:
+        """End the goal as canceled; a client has asked for that."""
 
 
 class AskOtherPlanner(Protocol):
@@ -59,17 +102,18 @@ class AskOtherPlanner(Protocol):
     def __call__(
         self,
         server: OtherPlanners,
-        handle: Any,
+        handle: GoalHandle,
         given_up: GivenUp,
         is_preempted_there: Callable[[], bool],
-    ) -> Awaitable[Any]:
-        """Return the answer to a goal's handle, or an `Outcome` without an answer."""
+    ) -> Awaitable[GoalAnswer | Outcome]:
+        """Return the answer to a goal, or an outcome; as `OtherPlanners.ask`."""
 
 
 class NavigationServer(NamedTuple):
     """The functions of a node that answer Nav2's requests."""
 
-    refusal: GivenUp  # why goals are rejected now
+    refusal: GivenUp  # returns the outcome if goals are rejected now
+    # Returns the path of a query and its outcome; the second argument gives it up.
     plan: Callable[[PathQuery, GivenUp], Awaitable[tuple[Path, Outcome]]]
     ask_other: AskOtherPlanner
     is_own: Callable[[str], bool]  # whether a planner_id is this planner's
@@ -101,40 +145,50 @@ class PathAction:
         self._has_via_points = hasattr(action_type.Goal, "viapoints")
         self._has_error_msg = hasattr(action_type.Result, "error_msg")
         self._has_last_reached = hasattr(action_type.Result, "last_reached_index")
-        self._newest: Any = None  # goal handle
+        self._newest_goal: GoalHandle | None = None
 
-    def accept(self, goal: Any) -> GoalResponse:
-        """Reject goals while the node refuses them."""
+    def accept(self, goal: PathGoal) -> GoalResponse:
+        """Accept a goal, or reject it while the node refuses goals."""
         return GoalResponse.REJECT if self._server.refusal() else GoalResponse.ACCEPT
 
-    def begin(self, handle: Any) -> None:
-        """Let a goal preempt the one before."""
-        self._newest = handle
+    def begin(self, handle: GoalHandle) -> None:
+        """Execute an accepted goal, and let it preempt the goal before it."""
+        self._newest_goal = handle
         handle.execute()
 
-    async def execute(self, handle: Any) -> Any:
-        """Return the result of a goal, and set the state of its handle."""
+    async def execute(self, handle: GoalHandle) -> Any:
+        """Return the action's Result for a goal, and end the goal by its handle.
+
+        A goal that names another planner has the Result of that planner.
+        """
 
         def given_up() -> Outcome | None:
             if handle.is_cancel_requested:
                 return CANCELED
-            return None if handle is self._newest else PREEMPTED
+            return None if handle is self._newest_goal else PREEMPTED
 
         start_time = time.monotonic()
         path = Path()
         if self._others is not None and self._is_for_other(handle):
-            answer = await self._answer_of_other(self._others, handle, given_up)
+            answer = await self._ask_other(self._others, handle, given_up)
             if not isinstance(answer, Outcome):
-                return answer
+                set_state_of_other(handle, answer.status)
+                return answer.result
             outcome = answer
         else:
             query = self._query(handle.request)
             path, outcome = await self._server.plan(query, given_up)
         seconds = time.monotonic() - start_time
-        set_state(handle, outcome.status == PlanStatus.SUCCEEDED.name)
+        if handle.is_cancel_requested:
+            handle.canceled()
+        elif outcome.status == PlanStatus.SUCCEEDED.name:
+            handle.succeed()
+        else:
+            handle.abort()
         return self._result(path, outcome, seconds)
 
     def _result(self, path: Path, outcome: Outcome, seconds: float) -> Any:
+        """Return the action's Result for a path that took some seconds to plan."""
         result = self._result_type(path=path)
         result.planning_time = Duration(seconds=seconds).to_msg()
         result.error_code = error_code(outcome.status, self._result_type)
@@ -145,58 +199,60 @@ class PathAction:
             result.last_reached_index = outcome.last_reached
         return result
 
-    def _query(self, goal: Any) -> PathQuery:
+    def _query(self, goal: PathGoal) -> PathQuery:
         start = goal.start if goal.use_start else None
         if self._has_goals:
-            return PathQuery(start, poses_of(goal.goals), goal.planner_id)
+            return PathQuery(start, goal_poses(goal.goals), goal.planner_id)
         via_points = [*goal.viapoints] if self._has_via_points else []
         stops = [*via_points, goal.goal]
         return PathQuery(start, stops, goal.planner_id, bool(via_points))
 
-    def _is_for_other(self, handle: Any) -> bool:
+    def _is_for_other(self, handle: GoalHandle) -> bool:
         """Return whether a goal names another planner."""
         return not self._server.is_own(handle.request.planner_id)
 
-    async def _answer_of_other(
-        self, others: OtherPlanners, handle: Any, given_up: GivenUp
-    ) -> Any:
-        """Return another planner's result, or an outcome if it has no result."""
+    async def _ask_other(
+        self, others: OtherPlanners, handle: GoalHandle, given_up: GivenUp
+    ) -> GoalAnswer | Outcome:
+        """Return another planner's answer to a goal, or an outcome without one."""
 
         def is_preempted_there() -> bool:
             # The other server lets the newest goal preempt this one.
-            return self._newest is not handle and self._is_for_other(self._newest)
+            newest = self._newest_goal
+            return (
+                newest is not None
+                and newest is not handle
+                and self._is_for_other(newest)
+            )
 
-        answer = await self._server.ask_other(
+        return await self._server.ask_other(
             others, handle, given_up, is_preempted_there
         )
-        if isinstance(answer, Outcome):
-            return answer
-        is_canceled = answer.status == GoalStatus.STATUS_CANCELED
-        has_succeeded = answer.status == GoalStatus.STATUS_SUCCEEDED
-        set_state(handle, has_succeeded, is_canceled)
-        return answer.result
 
 
-def set_state(handle: Any, has_succeeded: bool, is_canceled: bool = True) -> None:
-    """End a goal: canceled if a client asked for that and it was done, else aborted."""
-    if handle.is_cancel_requested and is_canceled:
+def set_state_of_other(handle: GoalHandle, status: int) -> None:
+    """End a goal as another server has ended it, with a status of its answer.
+
+    rclpy allows `canceled` only if a client asked for that.
+    """
+    if handle.is_cancel_requested and status == GoalStatus.STATUS_CANCELED:
         handle.canceled()
-    elif has_succeeded:
+    elif status == GoalStatus.STATUS_SUCCEEDED:
         handle.succeed()
     else:
         handle.abort()
 
 
-def poses_of(goals: Any) -> Sequence[PoseStamped]:
-    """Return the poses of a sequence, or since Kilted of a nav_msgs/msg/Goals with a header."""
-    if not hasattr(goals, "goals"):
+def goal_poses(goals: Sequence[PoseStamped] | GoalList) -> list[PoseStamped]:
+    """Return the poses of goals; poses of a list without a frame have the list's header."""
+    if isinstance(goals, Sequence):
         return [*goals]
-    return [
-        stamped
-        if stamped.header.frame_id
-        else PoseStamped(header=goals.header, pose=stamped.pose)
-        for stamped in goals.goals
-    ]
+    poses = []
+    for stamped in goals.goals:
+        has_frame = stamped.header.frame_id != ""
+        header = stamped.header if has_frame else goals.header
+        poses.append(PoseStamped(header=header, pose=stamped.pose))
+    return poses
 
 
 def serve_nav2(
@@ -204,8 +260,14 @@ def serve_nav2(
 ) -> None:
     """Create Nav2's actions and service, or log which package is missing.
 
-    ``other_planners`` is the prefix of the actions to which the goals of other planners
-    are sent; empty if there are none.
+    Parameters
+    ----------
+    node : BaseNode
+    server : NavigationServer
+        Answers the requests.
+    other_planners : str
+        The prefix of the actions to which the goals of other planners are sent; empty
+        if there are none.
     """
     try:
         from nav2_msgs.action import ComputePathThroughPoses, ComputePathToPose

@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 from action_msgs.msg import GoalStatus
 from rclpy.action.client import ActionClient
@@ -15,22 +15,44 @@ from ddqn_planner.nodes.clocks import STEADY
 from ddqn_planner.nodes.outcome import Outcome
 from ddqn_planner.nodes.quality import SERVICE_QUALITY
 
-GivenUp = Callable[[], Outcome | None]  # returns why a request is given up now, or None
+# Returns the outcome of a goal that is given up now, else None.
+GivenUp = Callable[[], Outcome | None]
 
-ACTIONS = "compute_path_to_pose", "compute_path_through_poses"
+ACTIONS = ("compute_path_to_pose", "compute_path_through_poses")
 SERVER_WAIT = 1.0  # seconds until a server that was just started is discovered
-ACCEPT_WAIT = 5.0  # seconds in which a server says whether it takes a goal
+ACCEPT_WAIT = 5.0  # seconds in which a server says whether it accepts a goal
 # Seconds until a server is asked for the result again: a new server lacks the goal.
 ASK_PERIOD = 2.0
-# Seconds between two looks whether a goal is given up, or its server is gone.
+# Seconds between two checks whether a goal is given up, or its server is gone.
 TICK = 0.05
 
 # Of an action's services: without these queues, goals are lost like requests.
-QUEUES: dict[str, Any] = {
+QUEUES = {
     f"{service}_service_qos_profile": SERVICE_QUALITY
     for service in ("goal", "cancel", "result")
 }
-INVALID, LOST = "INVALID_PLANNER", "PLANNER_LOST"
+# Statuses of outcomes.
+INVALID = "INVALID_PLANNER"
+LOST = "PLANNER_LOST"
+
+
+class GoalAnswer(Protocol):
+    """The answer of an action server to a goal."""
+
+    status: int  # of action_msgs/msg/GoalStatus
+    result: Any  # the action's Result
+
+
+class SentGoal(Protocol):
+    """The part of rclpy's ClientGoalHandle that is used."""
+
+    accepted: bool
+
+    def get_result_async(self) -> Future:
+        """Return the future of the `GoalAnswer`."""
+
+    def cancel_goal_async(self) -> Future:
+        """Ask the server to cancel the goal."""
 
 
 def action_name(prefix: str, action: str) -> str:
@@ -39,40 +61,62 @@ def action_name(prefix: str, action: str) -> str:
 
 
 def check_prefix(node: BaseNode, prefix: str) -> None:
-    """Raise a ValueError with the remedy if no actions can have this prefix, or only ours."""
-    remedy = "give the prefix to which the actions of Nav2's planner_server are remapped, or ''"
-    for action in ACTIONS if prefix else ():
+    """Raise a ValueError if the parameter ``other_planners`` is no prefix to use.
+
+    No action can have such a name, or the actions are those of the node.
+    """
+    remedy = (
+        "give the prefix to which the actions of Nav2's planner_server are remapped, "
+        "or ''"
+    )
+    if not prefix:
+        return
+    for action in ACTIONS:
+        other_service = f"{action_name(prefix, action)}/_action/send_goal"
         try:
-            moved, ours = (
-                node.resolve_service_name(f"{name}/_action/send_goal")
-                for name in (action_name(prefix, action), action)
-            )
+            other_service = node.resolve_service_name(other_service)
+            own_service = node.resolve_service_name(f"{action}/_action/send_goal")
         except RuntimeError as error:
-            reason, *_ = str(error).split(", at ")
-            raise ValueError(
-                f"other_planners is {prefix!r} ({reason}); {remedy}"
-            ) from None
-        if moved == ours:
-            raise ValueError(
-                f"other_planners is {prefix!r}, which is this node itself; {remedy}"
-            )
+            reason, *_ = str(error).split(", at ")  # without rcl's line of code
+            problem = f"other_planners is {prefix!r} ({reason})"
+            raise ValueError(f"{problem}; {remedy}") from None
+        if other_service == own_service:
+            problem = f"other_planners is {prefix!r}, which is this node itself"
+            raise ValueError(f"{problem}; {remedy}")
 
 
 class OtherPlanners:
-    """The server of one action, to which goals are sent as they are."""
+    """The server of one action, to which goals are sent as they are.
 
-    def __init__(self, node: BaseNode, kind: Any, name: str) -> None:
-        self._node, self._kind, self._name = node, kind, name
+    Parameters
+    ----------
+    node
+        Sends the goals.
+    action_type
+        The type of the action.
+    name
+        The name of the action.
+    """
+
+    def __init__(self, node: BaseNode, action_type: Any, name: str) -> None:
+        self._node = node
+        self._action_type = action_type
+        self._name = name
         self._group = ReentrantCallbackGroup()
-        self._next_look = Future()
-        self._timer = node.create_timer(TICK, self._look, clock=STEADY)
-        self._timer.cancel()  # until somebody waits
-        self._waiting = 0
+        self._next_wake = Future()  # done by `_wake`
+        self._timer = node.create_timer(TICK, self._wake, clock=STEADY)
+        self._timer.cancel()  # it runs while a goal waits
+        self._waiting = 0  # number of goals that wait
         self._connect()
 
     def _connect(self) -> None:
-        options = {"callback_group": self._group, **QUEUES}
-        self._client = ActionClient(self._node, self._kind, self._name, **options)
+        self._client = ActionClient(
+            self._node,
+            self._action_type,
+            self._name,
+            callback_group=self._group,
+            **QUEUES,
+        )
 
     async def ask(
         self,
@@ -81,17 +125,55 @@ class OtherPlanners:
         goal_id: Any,
         given_up: GivenUp,
         is_preempted_there: Callable[[], bool] = lambda: False,
-    ) -> Any:
-        """Return the server's answer, with status and result, or the outcome if there is none.
+    ) -> GoalAnswer | Outcome:
+        """Return the server's answer to a goal, or an outcome if there is none.
 
-        The goal keeps its id. So a goal that comes back to a node in a circle is rejected there.
-        A goal that is given up is canceled, unless `is_preempted_there` says that a newer one preempts it.
+        Parameters
+        ----------
+        planner_id : str
+            The planner that the goal names.
+        goal : message
+            The action's Goal.
+        goal_id : message
+            The UUID of the goal, also at the server. So a goal that comes back to a
+            node in a circle is rejected there.
+        given_up : callable
+            Returns the outcome if the goal is given up now; then it is canceled.
+        is_preempted_there : callable
+            Returns whether a newer goal preempts this one at the server. Then a goal
+            that is given up is not canceled.
         """
         planner = f"the planner {planner_id!r}"
+        sent_goal = await self._send(planner, goal, goal_id, given_up)
+        if isinstance(sent_goal, Outcome):
+            return sent_goal
+        answer = await self._answer(sent_goal, given_up)
+        outcome = given_up()
+        if answer is None and outcome is not None:
+            if not is_preempted_there():
+                sent_goal.cancel_goal_async()
+            return outcome
+        if answer is None or answer.status == GoalStatus.STATUS_UNKNOWN:
+            # rclpy's client ends its node if a goal comes again whose end the client
+            # has not seen.
+            self._client.destroy()
+            self._connect()
+            return Outcome(LOST, f"{planner} ended before it answered; ask again")
+        return answer
+
+    async def _send(
+        self, planner: str, goal: Any, goal_id: Any, given_up: GivenUp
+    ) -> SentGoal | Outcome:
+        """Send a goal as soon as there is a server, and wait until it is accepted.
+
+        Return the accepted goal, or the outcome of a goal that is not. The parameters
+        are as of `ask`; ``planner`` names the planner in reasons.
+        """
         await self._wait(
             lambda: self._client.server_is_ready() or given_up(), SERVER_WAIT
         )
-        if (outcome := given_up()) is not None:
+        outcome = given_up()
+        if outcome is not None:
             return outcome
         if not self._client.server_is_ready():
             remedy = "start Nav2's planner_server with its actions remapped to there"
@@ -99,7 +181,7 @@ class OtherPlanners:
                 INVALID, f"{planner} has no server at {self._name}; {remedy}"
             )
         sending = self._client.send_goal_async(goal, goal_uuid=goal_id)
-        sending.add_done_callback(self._look)
+        sending.add_done_callback(self._wake)
         await self._wait(lambda: sending.done() or given_up(), ACCEPT_WAIT)
         if not sending.done():
             sending.add_done_callback(_cancel)
@@ -107,38 +189,31 @@ class OtherPlanners:
             return given_up() or Outcome(
                 INVALID, f"{silence}; look into its server's log"
             )
-        accepted = sending.result()
-        if not accepted.accepted:
+        sent_goal: SentGoal = sending.result()
+        if not sent_goal.accepted:
             remedy = "is it active, and another node than this?"
             return Outcome(INVALID, f"{planner} was rejected by {self._name}; {remedy}")
-        answer = await self._result(accepted, given_up)
-        if answer is None and (outcome := given_up()) is not None:
-            if not is_preempted_there():
-                accepted.cancel_goal_async()
-            return outcome
-        if answer is None or answer.status == GoalStatus.STATUS_UNKNOWN:
-            # rclpy's client ends its node if a goal that it has not seen ended comes again.
-            self._client.destroy()
-            self._connect()
-            return Outcome(LOST, f"{planner} ended before it answered; ask again")
-        return answer
+        return sent_goal
 
-    async def _result(self, accepted: Any, given_up: GivenUp) -> Any:
-        """Return the server's answer, or None if the goal is given up or the server is gone."""
+    async def _answer(
+        self, sent_goal: SentGoal, given_up: GivenUp
+    ) -> GoalAnswer | None:
+        """Return the answer to a goal; None if it is given up or the server is gone."""
         while True:
-            asking = accepted.get_result_async()
-            asking.add_done_callback(self._look)
+            asking = sent_goal.get_result_async()
+            asking.add_done_callback(self._wake)
 
-            def is_over(asking: Any = asking) -> Any:
+            def is_over(asking: Future = asking) -> object:
                 return asking.done() or given_up() or not self._client.server_is_ready()
 
             if await self._wait(is_over, ASK_PERIOD):
-                return asking.result() if asking.done() else None
+                answer: GoalAnswer | None = asking.result() if asking.done() else None
+                return answer
 
     async def _wait(
-        self, is_over: Callable[[], Any], seconds: float = math.inf
+        self, is_over: Callable[[], object], seconds: float = math.inf
     ) -> bool:
-        """Wait until something is over, or for some seconds; return whether it is."""
+        """Wait until `is_over` returns something true; return False after `seconds`."""
         deadline = time.monotonic() + seconds
         self._waiting += 1
         self._timer.reset()
@@ -146,20 +221,22 @@ class OtherPlanners:
             while not is_over():
                 if time.monotonic() >= deadline:
                     return False
-                await self._next_look
+                await self._next_wake
             return True
         finally:
             self._waiting -= 1
 
-    def _look(self, _: object = None) -> None:
-        """Let who waits look again."""
+    def _wake(self, _: object = None) -> None:
+        """Wake all goals that wait, to check what they wait for."""
         if not self._waiting:
             self._timer.cancel()
-        looked, self._next_look = self._next_look, Future()
-        looked.set_result(None)
+        wake = self._next_wake
+        self._next_wake = Future()
+        wake.set_result(None)
 
 
-def _cancel(sending: Any) -> None:
+def _cancel(sending: Future) -> None:
     """Cancel a goal that is accepted after it was given up."""
-    if sending.result().accepted:
-        sending.result().cancel_goal_async()
+    sent_goal: SentGoal = sending.result()
+    if sent_goal.accepted:
+        sent_goal.cancel_goal_async()

@@ -18,16 +18,27 @@ Request = PlanRequest | PoseRequest
 
 # Seconds in which a new listener hears a first map, odometry or TF, at a load of 20.
 PATIENCE = 5.0
-ALL_GOALS = -1  # as in ComputePathThroughPoses
+ALL_GOALS = -1  # instead of an index, as in ComputePathThroughPoses
+
+# Statuses that another costmap of the same place may change.
+FAILURES = {
+    status.name
+    for status in (
+        PlanStatus.START_OCCUPIED,
+        PlanStatus.GOAL_OCCUPIED,
+        PlanStatus.NO_PATH,
+        PlanStatus.ROLLOUT_TRAPPED,
+    )
+}
 
 
 class PathQuery(NamedTuple):
-    """A query for a path, as a service or an action got it."""
+    """A query for a path, as a service or an action received it."""
 
     start: PoseStamped | None  # None: the robot's pose
-    goals: Sequence[PoseStamped]  # through all of them
+    goals: Sequence[PoseStamped]  # the path leads through all goals, in this order
     planner_id: str = ""
-    has_via_points: bool = False  # all goals but the last
+    has_via_points: bool = False  # all goals but the last are via-points
     tolerance: float | None = None  # metres; None: the parameter's
 
 
@@ -41,8 +52,9 @@ class RequestError(ValueError):
     reason : str
         What is wrong, and what to do.
     listening_since : float
-        When the node began to listen to what is missing, by the steady clock. Just
-        after that the missing message `may_come`.
+        When the node began to listen to a message that is missing, in seconds of the
+        steady clock. A request waits for the message while it `may_come`: for
+        `PATIENCE` from then on. By default it does not wait.
     """
 
     def __init__(
@@ -64,12 +76,17 @@ class Outcome:
     plan: Plan = field(default_factory=lambda: Plan(PlanStatus.NO_PATH))
     goal: PoseStamped | None = None  # in the map's frame
     map_header: Header | None = None  # of the map that it was planned on
-    # Of a disc, between exact poses; empty for a body.
+    # The plan's path between exact poses, for a disc; empty for a robot with a body.
     path: ExactPath = field(default=NO_PATH, compare=False)
-    is_dense: bool = False  # whether its path has a pose at least every cell
-    header: Header = field(default_factory=Header)  # of its path
-    # Of several goals, the index of the goal where the path ends.
+    is_dense: bool = False  # whether the message has a pose at least every cell
+    header: Header = field(default_factory=Header)  # of the message with the path
+    # The index of the goal where a partial path ends.
     last_reached: int = ALL_GOALS
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether the request may succeed on another costmap of the same place."""
+        return self.request is not None and self.status in FAILURES
 
     @property
     def length(self) -> float:

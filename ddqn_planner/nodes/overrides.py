@@ -5,7 +5,7 @@ import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import yaml
 
@@ -23,232 +23,290 @@ MOST_NAMES: Final = 5  # of sections that a warning lists
 class Section(NamedTuple):
     """The parameters of the nodes whose full name a pattern matches."""
 
-    name: str
-    parameters: list[str]
+    pattern: str  # as "/**/planner": ** matches any namespaces, and * one name
+    parameters: list[str]  # names
 
     @property
-    def last(self) -> str:
-        """The part that is the node's own name."""
-        return self.name.rpartition("/")[2]
+    def node_name(self) -> str:
+        """The last part of the pattern, for the node's own name."""
+        return _node_name(self.pattern)
 
     def is_for(self, node: str) -> bool:
-        """Return whether it is for a node, by its full name."""
+        """Return whether the pattern matches the full name of a node."""
         wildcards = {"**": "(/[^/]+)*", "*": "/[^/]+"}
-        tokens = filter(None, self.name.split("/"))
-        pattern = "".join(
+        tokens = filter(None, self.pattern.split("/"))
+        expression = "".join(
             wildcards.get(token, "/" + re.escape(token)) for token in tokens
         )
-        return re.fullmatch(pattern, node) is not None
+        return re.fullmatch(expression, node) is not None
+
+
+class Source(NamedTuple):
+    """A parameter file of the command line, or a setting of -p for a named node."""
+
+    words: str  # what warnings call it
+    sections: list[Section]
+
+
+def _node_name(full_name: str) -> str:
+    return full_name.rpartition("/")[2]
 
 
 def nearest(name: str, names: Iterable[str]) -> str:
-    """Return which of some names is most like another one; empty if none is."""
-    by_lower = {other.casefold(): other for other in names}
-    similar = difflib.get_close_matches(name.casefold(), by_lower, 1, SIMILAR)
-    return by_lower[similar[0]] if similar else ""
+    """Return which of some names is most like another name; empty if none is like it."""
+    names_by_lower = {candidate.casefold(): candidate for candidate in names}
+    similar = difflib.get_close_matches(name.casefold(), names_by_lower, 1, SIMILAR)
+    return names_by_lower[similar[0]] if similar else ""
 
 
-def unread_names(names: Iterable[str], known: Collection[str], node: str) -> str:
-    """Return which parameters a node does not have; empty if it has all."""
-    unknown = [name for name in names if name not in known and not name.startswith(QOS)]
-    if not unknown:
-        return ""
-    similar = [nearest(name, known) for name in unknown]
-    told = ", ".join(
-        f"{name} (the nearest is {other})" if other else name
-        for name, other in zip(unknown, similar, strict=True)
-    )
-    return (
-        f"{node} does not know, and does not read: {told}; --help lists what it knows"
-    )
-
-
-def unread_qualities(
-    names: Iterable[str], names_read: Collection[str], node: str
-) -> list[str]:
-    """Return a sentence for each quality of service of a topic that a node does not read.
+def unread_names(
+    names: Iterable[str], declared_names: Collection[str], node: str
+) -> str:
+    """Return a sentence about the parameters that a node does not have; empty if none.
 
     Parameters
     ----------
     names : iterable of str
         Parameters that a user set.
-    names_read : collection of str
-        Parameters that the node reads.
+    declared_names : collection of str
+        Parameters that the node has.
     node : str
-        The node's name.
+        The node's full name.
     """
-    qualities = [name for name in names_read if name.startswith(QOS)]
+    unknown_names = []
+    for name in names:
+        if name in declared_names or name.startswith(QOS):
+            continue
+        similar_name = nearest(name, declared_names)
+        hint = f" (the nearest is {similar_name})" if similar_name else ""
+        unknown_names.append(f"{name}{hint}")
+    if not unknown_names:
+        return ""
+    listing = ", ".join(unknown_names)
+    problem = f"{node} does not know, and does not read: {listing}"
+    return f"{problem}; --help lists what it knows"
+
+
+def unread_qualities(
+    names: Iterable[str], declared_names: Collection[str], node: str
+) -> list[str]:
+    """Return a sentence about each ``qos_overrides`` parameter that a node does not have.
+
+    The node has such parameters for its subscriptions. Parameters for topics of which
+    ROS itself reads the quality of service are left out.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Parameters that a user set.
+    declared_names : collection of str
+        Parameters that the node has.
+    node : str
+        The node's full name.
+    """
+    declared_qualities = [name for name in declared_names if name.startswith(QOS)]
     problems = []
     for name in names:
-        if not name.startswith(QOS) or name in names_read:
+        if not name.startswith(QOS) or name in declared_names:
             continue
         topic = name.removeprefix(QOS).partition(".")[0]
         if topic in TOPICS_OF_ROS:
             continue
-        nearest_name = nearest(name, qualities)
+        similar_name = nearest(name, declared_qualities)
         remedy = "it reads no such topic"
-        if nearest_name:
-            remedy = f"the nearest is {nearest_name}"
+        if similar_name:
+            remedy = f"the nearest is {similar_name}"
         problems.append(f"{node} has no subscription for {name} now; {remedy}")
     return problems
 
 
 def unread_sections(
-    arguments: Sequence[str], known: Collection[str], node: str
+    arguments: Sequence[str], declared_names: Collection[str], node: str
 ) -> list[str]:
-    """Return which parameter files, and settings of -p, are for other nodes alone."""
-    told = []
+    """Return a sentence about each part of the command line that a node does not read.
+
+    It is a parameter file or a -p that is for other nodes alone, or a section of a file
+    that may be meant for the node, but has another name.
+
+    Parameters
+    ----------
+    arguments : sequence of str
+        The command line.
+    declared_names : collection of str
+        Parameters that the node has.
+    node : str
+        The node's full name.
+    """
+    problems = []
     for source, sections in _sources(arguments):
         if not sections:
             continue
-        own = [section for section in sections if section.is_for(node)]
-        if not own:
-            told.append(f"{source} sets nothing of {node}: {_remedy(sections, node)}")
-        elif all(section.last == "**" for section in own):
-            told += [
-                f"{source}: the section {other.name} is not for {node}; {_rename(other, node)}"
-                for other in sections
-                if other not in own and _is_meant(other, known, node)
-            ]
-    return told
+        own_sections = [section for section in sections if section.is_for(node)]
+        if not own_sections:
+            remedy = _remedy(sections, node)
+            problems.append(f"{source} sets nothing of {node}: {remedy}")
+        elif all(section.node_name == "**" for section in own_sections):
+            for section in sections:
+                if section not in own_sections and _is_meant(
+                    section, declared_names, node
+                ):
+                    problem = f"the section {section.pattern} is not for {node}"
+                    problems.append(f"{source}: {problem}; {_rename(section, node)}")
+    return problems
 
 
-def _is_meant(section: Section, known: Collection[str], node: str) -> bool:
-    """Return whether a section for no other node than this one may have been meant for it."""
-    has_namespace = section.name.count("/") > 1
-    is_similar = nearest(section.last, [node.rpartition("/")[2]]) != ""
-    return (
-        not has_namespace
-        and is_similar
-        and any(name in known for name in section.parameters)
-    )
+def _is_meant(section: Section, declared_names: Collection[str], node: str) -> bool:
+    """Return whether a section that is for no node may be meant for this node.
+
+    It has no namespace, a similar name, and parameters that the node has.
+    """
+    has_namespace = section.pattern.count("/") > 1
+    has_similar_name = nearest(section.node_name, [_node_name(node)]) != ""
+    has_parameters = any(name in declared_names for name in section.parameters)
+    return not has_namespace and has_similar_name and has_parameters
 
 
 def _remedy(sections: Sequence[Section], node: str) -> str:
-    names = [section.name for section in sections]
-    shown = ", ".join(names[:MOST_NAMES]) + ", ..." * (len(names) > MOST_NAMES)
-    name = node.rpartition("/")[2]
-    other = nearest(name, [section.last for section in sections])
+    """Return in words which nodes sections are for, and which section a node needs."""
+    listing = ", ".join(section.pattern for section in sections[:MOST_NAMES])
+    if len(sections) > MOST_NAMES:
+        listing += ", ..."
     remedy = f"add a section {node}: or /**:"
-    if other:
-        remedy = _rename(
-            next(section for section in sections if section.last == other), node
-        )
-    return f"it is for {shown}; {remedy}"
+    node_names = [section.node_name for section in sections]
+    similar_name = nearest(_node_name(node), node_names)
+    if similar_name:
+        similar_section = sections[node_names.index(similar_name)]
+        remedy = _rename(similar_section, node)
+    return f"it is for {listing}; {remedy}"
 
 
 def _rename(section: Section, node: str) -> str:
-    name = node.rpartition("/")[2]
-    if section.last == name:  # in another namespace
-        return f"write {node}: or /**/{name}: instead of {section.name}:"
-    return (
-        f"write {node.removeprefix('/')}: instead of {section.name.removeprefix('/')}:"
-    )
+    """Return how to write the name of a section for a node."""
+    name = _node_name(node)
+    if section.node_name == name:  # in another namespace
+        return f"write {node}: or /**/{name}: instead of {section.pattern}:"
+    old_name = section.pattern.removeprefix("/")
+    return f"write {node.removeprefix('/')}: instead of {old_name}:"
 
 
-def _sources(arguments: Sequence[str]) -> Iterator[tuple[str, list[Section]]]:
-    """Yield each parameter file, and each -p with a node's name, and its sections."""
-    is_for_ros, rest = False, iter(arguments)
-    for argument in rest:
+class Option(NamedTuple):
+    """An argument for ROS that sets parameters."""
+
+    is_file: bool  # of --params-file; else of -p
+    value: str  # the file, or NAME:=VALUE; empty if the command line ends before it
+
+
+def _options(arguments: Sequence[str]) -> Iterator[Option]:
+    """Yield the options of a command line that set parameters."""
+    is_for_ros = False
+    remaining_arguments = iter(arguments)
+    for argument in remaining_arguments:
         if argument in ("--ros-args", "--"):
             is_for_ros = argument == "--ros-args"
-        elif is_for_ros and argument == "--params-file":
-            file = next(rest, "")
-            # ROS has read it before, or has said what is wrong with it.
+        elif is_for_ros and argument in ("--params-file", "-p", "--param"):
+            value = next(remaining_arguments, "")
+            yield Option(argument == "--params-file", value)
+
+
+def _sources(arguments: Sequence[str]) -> Iterator[Source]:
+    """Yield each parameter file, and each -p with the name of a node."""
+    for option in _options(arguments):
+        if option.is_file:
+            # ROS has read the file before, or has said what is wrong with it.
             with suppress(OSError, ValueError, yaml.YAMLError, RecursionError):
-                document = yaml.load(
-                    read_file(Path(file), MAX_FILE_BYTES), Loader=yaml.BaseLoader
-                )
-                yield file, [*_sections(document)]
-        elif is_for_ros and argument in ("-p", "--param"):
-            rule = next(rest, "")
-            target, _, _ = rule.partition(":=")
-            node, colon, parameter = target.rpartition(":")
-            if colon:
-                yield f"-p {rule}", [Section("/" + node.lstrip("/"), [parameter])]
+                text = read_file(Path(option.value), MAX_FILE_BYTES)
+                document = yaml.load(text, Loader=yaml.BaseLoader)
+                yield Source(option.value, [*_sections(document)])
+            continue
+        target, _, _ = option.value.partition(":=")
+        node, colon, parameter = target.rpartition(":")
+        if colon:
+            section = Section("/" + node.lstrip("/"), [parameter])
+            yield Source(f"-p {option.value}", [section])
 
 
-def _sections(tree: Any, name: str = "") -> Iterator[Section]:
-    if not isinstance(tree, dict):
+def _sections(document: object, pattern: str = "") -> Iterator[Section]:
+    """Yield the sections of a YAML document, or of its part below a pattern."""
+    if not isinstance(document, dict):
         return
-    for key, below in tree.items():
+    for key, part in document.items():
         if key == PARAMETERS:
-            yield Section(name, [*_parameters(below)])
+            yield Section(pattern, [*_parameters(part)])
         else:
-            yield from _sections(below, f"{name}/{key.strip('/')}")
+            yield from _sections(part, f"{pattern}/{key.strip('/')}")
 
 
-def _parameters(tree: Any, prefix: str = "") -> Iterator[str]:
-    for key, below in tree.items() if isinstance(tree, dict) else ():
-        if isinstance(below, dict):
-            yield from _parameters(below, f"{prefix}{key}.")
+def _parameters(part: object, prefix: str = "") -> Iterator[str]:
+    """Yield the names of the parameters of a section, with dots between nested keys."""
+    if not isinstance(part, dict):
+        return
+    for key, value in part.items():
+        if isinstance(value, dict):
+            yield from _parameters(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}"
 
 
 def wrong_argument(arguments: Sequence[str]) -> str:
-    """Return which argument or parameter file ROS cannot read, and a remedy; empty if none."""
-    is_for_ros, rest = False, iter(arguments)
-    for argument in rest:
-        wrong = ""
-        if argument in ("--ros-args", "--"):
-            is_for_ros = argument == "--ros-args"
-        elif is_for_ros and argument == "--params-file":
-            wrong = _wrong_file(next(rest, ""))
-        elif is_for_ros and argument in ("-p", "--param"):
-            wrong = _wrong_rule(next(rest, ""))
-        if wrong:
-            return wrong
+    """Return why ROS cannot read an argument, with a remedy; empty if it can read all."""
+    for option in _options(arguments):
+        value = option.value
+        problem = _wrong_file(value) if option.is_file else _wrong_rule(value)
+        if problem:
+            return problem
     return ""
 
 
 def _wrong_rule(rule: str) -> str:
-    """Return why a setting of -p cannot be read; empty if it can."""
+    """Return why a setting of -p, NAME:=VALUE, cannot be read; empty if it can."""
     target, assignment, value = rule.partition(":=")
     if not assignment:
-        return (
-            f"-p {rule} has no ':='; write -p NAME:=VALUE, as in -p robot_radius:=0.3"
-        )
+        example = "write -p NAME:=VALUE, as in -p robot_radius:=0.3"
+        return f"-p {rule} has no ':='; {example}"
     node, colon, name = target.rpartition(":")
     if colon and "/" in node:
-        return f"-p {rule} names a node with '/'; write -p {node.split('/')[-1]}:{name}:={value}"
+        remedy = f"write -p {_node_name(node)}:{name}:={value}"
+        return f"-p {rule} names a node with '/'; {remedy}"
     if not value.strip():
-        return f"-p {rule} has no value; give one, and for an empty text: -p \"{target}:=''\""
+        remedy = f"give one, and for an empty text: -p \"{target}:=''\""
+        return f"-p {rule} has no value; {remedy}"
     try:
         yaml.load(value, Loader=yaml.BaseLoader)
     except yaml.YAMLError as error:
-        return (
-            f"-p {rule}: the value is no YAML ({_reason(error)}); put a text in quotes"
-        )
+        problem = f"the value is no YAML ({_reason(error)})"
+        return f"-p {rule}: {problem}; put a text in quotes"
     return ""
 
 
 def _wrong_file(file: str) -> str:
     """Return why a parameter file cannot be read; empty if it can."""
+    name = f"the parameter file {file!r}"
     form = "write NODE:, below it ros__parameters:, and below that NAME: VALUE"
     try:
         document = yaml.load(Path(file).read_bytes(), Loader=yaml.BaseLoader)
     except OSError as error:
-        return f"the parameter file {file!r} cannot be read ({error.strerror}); check the path"
+        return f"{name} cannot be read ({error.strerror}); check the path"
     except (ValueError, yaml.YAMLError, RecursionError) as error:
-        return f"the parameter file {file!r} is no YAML ({_reason(error)}); correct it"
+        return f"{name} is no YAML ({_reason(error)}); correct it"
     if not document:
-        return f"the parameter file {file!r} is empty; {form}, or leave it out"
+        return f"{name} is empty; {form}, or leave it out"
     if not [*_sections(document)]:
         similar = nearest(PARAMETERS, _keys(document))
         instead = f", but {similar}" if similar else ""
-        return f"the parameter file {file!r} has no {PARAMETERS}{instead}; {form}"
+        return f"{name} has no {PARAMETERS}{instead}; {form}"
     return ""
 
 
-def _keys(tree: Any) -> Iterator[str]:
-    for key, below in tree.items() if isinstance(tree, dict) else ():
-        yield key
-        yield from _keys(below)
+def _keys(document: object) -> Iterator[str]:
+    """Yield all keys of a YAML document, at any depth."""
+    if isinstance(document, dict):
+        for key, part in document.items():
+            yield key
+            yield from _keys(part)
 
 
 def _reason(error: Exception) -> str:
-    """Return why a text is no YAML, with the line where that is known."""
+    """Return why a text is no YAML, with the number of the line if it is known."""
     if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
         return f"line {error.problem_mark.line + 1}: {error.problem}"
     return str(error).partition("\n")[0]

@@ -1,9 +1,10 @@
 """The planner's parameters, in the words of its ``--help``."""
 
+from dataclasses import dataclass
 from typing import Final
 
 from ddqn_planner.grid import MoveRule
-from ddqn_planner.nodes.declared import Declared
+from ddqn_planner.nodes.declared import Declared, declared_by, parameter
 from ddqn_planner.planning import PlanMethod
 from ddqn_planner.planning.field import CACHE_BYTES
 
@@ -11,96 +12,121 @@ MOVE_RULES: Final = [rule.value for rule in MoveRule]
 METHODS: Final = [method.value for method in PlanMethod]
 LOADABLE: Final = "a model that can be loaded; else the one before it stays"
 
+OCCUPIED_THRESHOLD: Final = Declared(
+    65, "Percent from which on a cell is occupied", (1, 100)
+)
+ALLOW_UNKNOWN: Final = Declared(False, "Unknown cells are free")
 OF_MAPS: Final = {
-    "occupied_threshold": Declared(
-        65, "Percent from which on a cell is occupied", (1, 100)
-    ),
-    "allow_unknown": Declared(False, "Unknown cells are free"),
+    "occupied_threshold": OCCUPIED_THRESHOLD,
+    "allow_unknown": ALLOW_UNKNOWN,
 }
-"""How both nodes read a map."""
+"""How the planner and the trainer read a map."""
 
-PLANNER_PARAMETERS: Final = {
-    "autostart": Declared(True, "Start without a lifecycle manager", read_only=True),
-    "model": Declared("any_map", "A shipped model's name, or a model file", LOADABLE),
-    "move_rule": Declared(
+
+@dataclass(frozen=True)
+class PlannerSettings:
+    """The planner's parameters, with their defaults, descriptions and limits.
+
+    An instance holds the values of one time.
+    """
+
+    autostart: bool = parameter(
+        True, "Start without a lifecycle manager", read_only=True
+    )
+    model: str = parameter(
+        "any_map", "A shipped model's name, or a model file", LOADABLE
+    )
+    move_rule: str = parameter(
         "", "Legal diagonal moves; '' for the model's rule", ["", *MOVE_RULES]
-    ),
-    "map_type": Declared(
+    )
+    map_type: str = parameter(
         "map", "Values of a map, or of a Nav2 costmap", ["map", "costmap"]
-    ),
-    "map_timeout": Declared(
+    )
+    map_timeout: float = parameter(
         5.0, "Seconds to plan on the last costmap; 0: always", (0, 3600)
-    ),
-    "require_directions": Declared(
+    )
+    require_directions: bool = parameter(
         False, "Wait for map_directions, even from a later node"
-    ),
-    **OF_MAPS,
-    "use_map_costs": Declared(
+    )
+    occupied_threshold: int = parameter(*OCCUPIED_THRESHOLD)
+    allow_unknown: bool = parameter(*ALLOW_UNKNOWN)
+    use_map_costs: bool = parameter(
         False, "For any_map: a free cell costs by its value, unknown most"
-    ),
-    "robot_radius": Declared(
+    )
+    robot_radius: float = parameter(
         0.0, "Metres: cells nearer to an obstacle are occupied", (0, 100)
-    ),
-    "start_clearing_radius": Declared(
+    )
+    start_clearing_radius: float = parameter(
         -1.0,
-        "Metres: obstacles so near to an occupied start do not count; -1: robot_radius, at least "
-        "one cell; 0: such a start is refused",
+        "Metres: obstacles so near to an occupied start do not count; "
+        "-1: robot_radius, at least one cell; 0: such a start is refused",
         (-1, 100),
-    ),
-    "clearance_weight": Declared(
+    )
+    clearance_weight: float = parameter(
         0.0, "For any_map: how strongly to avoid obstacles", (0, 1)
-    ),
-    "tolerance": Declared(
+    )
+    tolerance: float = parameter(
         0.0, "Metres: how far an occupied or cut off goal may move", (0, 1000)
-    ),
-    "yaw_tolerance": Declared(0.0, "Radians: the same for a robot's heading", (0, 4)),
-    "path_bound": Declared(
+    )
+    yaw_tolerance: float = parameter(
+        0.0, "Radians: the same for a robot's heading", (0, 4)
+    )
+    path_bound: float = parameter(
         1.2, "A robot's first path: how many times the least cost", (1, 10)
-    ),
-    "replan_period": Declared(
+    )
+    replan_period: float = parameter(
         1.0, "Seconds between plans on a free path; 0: each map", (0, 3600)
-    ),
-    "switch_threshold": Declared(
+    )
+    switch_threshold: float = parameter(
         0.05, "Share by which a kept path may cost more", (0, 10)
-    ),
-    "mode": Declared(
+    )
+    mode: str = parameter(
         "greedy", "astar_fallback: search where greedy steps get stuck", METHODS
-    ),
-    "path_simplification": Declared(
+    )
+    path_simplification: str = parameter(
         "straight",
         "straight: lines, a pose at least each cell; none: cells",
         ["none", "straight"],
         replaced={"line_of_sight": "straight"},
-    ),
-    "start_source": Declared(
-        "initialpose", "What says where the robot is", ["initialpose", "odometry", "tf"]
-    ),
-    "robot_frame": Declared(
+    )
+    start_source: str = parameter(
+        "initialpose",
+        "What says where the robot is",
+        ["initialpose", "odometry", "tf"],
+    )
+    robot_frame: str = parameter(
         "base_link", "The robot's frame, for the start_source tf", "not empty"
-    ),
-    "transform_tolerance": Declared(
+    )
+    transform_tolerance: float = parameter(
         0.3,
         "Seconds: greatest age of a transform, wait for one, silence of odometry",
         (0, 1000),
-    ),
-    "field_cache_bytes": Declared(
-        CACHE_BYTES, "Bytes for kept Q fields; the last three always stay", (0, 2**40)
-    ),
-    "planner_id": Declared(
+    )
+    field_cache_bytes: int = parameter(
+        CACHE_BYTES,
+        "Bytes for kept Q fields; the last three always stay",
+        (0, 2**40),
+    )
+    planner_id: str = parameter(
         "GridBased", "What Nav2's requests may name, or leave empty"
-    ),
-    "other_planners": Declared(
+    )
+    other_planners: str = parameter(
         "",
         "Prefix of planner_server's actions, for another planner_id; '': none",
         read_only=True,
-    ),
-    "allow_partial_planning": Declared(
+    )
+    allow_partial_planning: bool = parameter(
         False,
-        "Through several poses: as far as there is a path, if there is one to the first",
-    ),
-    "experience": Declared("", "What drives taught: a file or folder; '': none"),
-    "exploration": Declared(
+        "Through several poses: as far as there is a path, "
+        "if there is one to the first",
+    )
+    experience: str = parameter("", "What drives taught: a file or folder; '': none")
+    exploration: float = parameter(
         0.1, "Share by which a path may take longer, to learn", (0, 10)
-    ),
-    "follow_trainer": Declared(False, "Load what the trainer saves", read_only=True),
-}
+    )
+    follow_trainer: bool = parameter(
+        False, "Load what the trainer saves", read_only=True
+    )
+
+
+PLANNER_PARAMETERS: Final = declared_by(PlannerSettings)

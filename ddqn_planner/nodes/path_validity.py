@@ -21,7 +21,7 @@ class PathCheck(NamedTuple):
     footprint: str  # as Nav2 writes it; empty: the model's body, or a disc
     layer_name: str  # of a costmap
     is_unknown_invalid: bool
-    max_cost: int  # Nav2's cost, from which on a cell is not free
+    max_cost: int  # Nav2's cost, 0 to 255: a cell that costs as much is not free
     distance: float  # metres along the path to look at; 0: all
     only_first: bool  # return the first invalid pose alone
 
@@ -47,10 +47,11 @@ async def check_path(
     Parameters
     ----------
     requests : Requests
-        Which wait for the map, the model and poses.
+        Of the node: it waits for the map, the model and poses.
     check : PathCheck
     needs_robot : bool
-        Whether an unknown pose of the robot is an error; otherwise all poses count then.
+        Whether an unknown pose of the robot is an error. Otherwise all poses of the
+        path are checked then.
 
     Raises
     ------
@@ -59,7 +60,7 @@ async def check_path(
     """
     inputs = await requests.inputs()
     grid, planner = inputs.grid, inputs.planner
-    body = None
+    body = None  # for a disc the cell of each pose has to be free
     if check.footprint:
         body = points_of(read_footprint(check.footprint), grid.resolution)
     elif planner.pose_planner is not None:
@@ -109,7 +110,7 @@ async def poses_in_map(
 
 async def robot_in_map(requests: Requests, inputs: PlanInputs) -> tuple[float, float]:
     """Return where the robot is in the map's frame, (x, y) in metres."""
-    stamped = await requests.robot_pose()
+    stamped = await requests.robot()
     start = await requests.in_map(inputs, THE_START, stamped)
     x, y, _ = pose_of(start.message)
     return x, y

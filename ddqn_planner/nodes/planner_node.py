@@ -16,6 +16,7 @@ from ddqn_planner.experience import Experience
 from ddqn_planner.memory import give_back, llvm_was_used, reuse_small_arrays
 from ddqn_planner.model import model_of
 from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal
+from ddqn_planner.nodes.base_node import unless_refused
 from ddqn_planner.nodes.clocks import STEADY
 from ddqn_planner.nodes.conversions import (
     Float64,
@@ -29,8 +30,13 @@ from ddqn_planner.nodes.display import FieldDisplay
 from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.model_source import ModelSource, read_model
-from ddqn_planner.nodes.nav2 import NavigationServer, serve_nav2
-from ddqn_planner.nodes.other_planners import GivenUp, OtherPlanners, check_prefix
+from ddqn_planner.nodes.nav2 import GoalHandle, NavigationServer, serve_nav2
+from ddqn_planner.nodes.other_planners import (
+    GivenUp,
+    GoalAnswer,
+    OtherPlanners,
+    check_prefix,
+)
 from ddqn_planner.nodes.outcome import (
     NO_REQUEST,
     NOT_ACTIVE,
@@ -39,10 +45,9 @@ from ddqn_planner.nodes.outcome import (
     PathQuery,
     RequestError,
 )
-from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
+from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS, PlannerSettings
 from ddqn_planner.nodes.path_validity import PathCheck, check_path
-from ddqn_planner.nodes.pending_requests import unless
-from ddqn_planner.nodes.poses import Places, check_source
+from ddqn_planner.nodes.poses import Poses, check_source
 from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.nodes.requests import Requests
 from ddqn_planner.nodes.spinning import spin_until_shutdown
@@ -51,9 +56,9 @@ from ddqn_planner.planning import PlanMethod, Planner
 from ddqn_planner.planning.plan import PosePlan
 from ddqn_planner.planning.segments import SAME_COST
 
-CONFIGURED = "inactive", "active"  # states with a map, a start and requests
-LOOK_PERIOD = 0.1  # seconds until the next look after a change
-IDLE_PERIOD = 1.0  # seconds between looks otherwise
+CONFIGURED = ("inactive", "active")  # states with a map, a start and requests
+SOON_PERIOD = 0.1  # seconds until the next check after a change
+IDLE_PERIOD = 1.0  # seconds between checks otherwise
 
 Planning = Coroutine[None, None, Outcome]
 
@@ -77,9 +82,11 @@ class PlannerNode(ManagedNode):
     def __init__(self) -> None:
         super().__init__("planner", PLANNER_PARAMETERS)
         self._checks_first_parameters = False
-        self._settings = self.settings()
-        self._looks = self.create_timer(LOOK_PERIOD, self._on_look, clock=STEADY)
-        self._diagnostics = PlannerDiagnostics(self, self._look_soon)
+        self._settings = PlannerSettings(**self.values())
+        self._check_timer = self.create_timer(
+            SOON_PERIOD, self._on_check_timer, clock=STEADY
+        )
+        self._diagnostics = PlannerDiagnostics(self, self._check_soon)
         self._worker = Worker(self)
         self._map_worker = Worker(self)
         self._display_worker = Worker(self)
@@ -92,31 +99,39 @@ class PlannerNode(ManagedNode):
     # Lifecycle
 
     def start(self) -> None:
-        """Configure the node; requests wait until the model is loaded."""
+        """Configure the node, and accept requests, which wait for the model.
+
+        The state becomes active with the model, by `_on_replan`.
+        """
         # Meanwhile DDS discovers other nodes, and the node tells what else is missing.
         self._model.load()
         self.change("configure")
-        self.activate()  # the state follows when there is a model
+        self.activate()
 
     def configure(self) -> None:
         """Listen to the map and to where the robot is, and create what answers requests."""
         super().configure()
         self._display = FieldDisplay(self, self._display_worker)
         self._plan_publisher = self.create_publisher(Path, "plan", LATCHED)
-        # A group of its own: a trigger that comes during a plan makes the node plan again.
+        # A group of its own: a trigger that comes during a plan makes the node plan
+        # again.
         group = MutuallyExclusiveCallbackGroup()
-        self._replan = self.create_guard_condition(self._plan_for_active_goal, group)
+        self._replan = self.create_guard_condition(self._on_replan, group)
         self._map = MapSource(self, self._diagnostics, self._map_worker, self._on_map)
-        self._places = Places(
-            self, self._diagnostics, lambda: self._map.frame, self._on_start
+        self._poses = Poses(
+            self,
+            self._diagnostics,
+            settings=lambda: self._settings,
+            map_frame=lambda: self._map.frame,
+            on_start=self._on_start,
         )
         self._requests = Requests(
             self._settings,
             self._map,
-            self._places,
+            self._poses,
             self._model,
             self._worker,
-            self._look_soon,
+            self._check_soon,
         )
         self.create_subscription(PoseStamped, "goal_pose", self._on_goals, 10)
         self.create_subscription(PoseArray, "goal_poses", self._on_goals, 10)
@@ -150,22 +165,25 @@ class PlannerNode(ManagedNode):
         """Refuse requests, and forget the active goal."""
         super().deactivate()
         self._refusal = NOT_ACTIVE
-        self._active = ActiveGoal([], 0.0)
+        self._active_goal = ActiveGoal([], 0.0)
         # The last outcome of an action with a path, whose rest the next action may keep.
-        self._followed: Outcome | None = None
+        self._path_of_action: Outcome | None = None
         # The last outcome with or without a path: an older path is not improved.
-        self._newest: Outcome | None = None
-        self._logged: LoggedPlan | None = None
+        self._newest_outcome: Outcome | None = None
+        self._logged_plan: LoggedPlan | None = None
         self._diagnostics.change()
 
     def cleanup(self) -> None:
-        """Free the map and the model's fields, and forget refusals and the last plan."""
+        """Undo `configure`: destroy and free what it created, and free the model.
+
+        The diagnostics forget refused inputs and the last plan.
+        """
         super().cleanup()
         self.deactivate()
         self._diagnostics.refused.clear()
         self._diagnostics.note(NO_REQUEST)
         self.jump_back_callbacks.clear()
-        for name in ("_places", "_display", "_map", "_requests"):
+        for name in ("_poses", "_display", "_map", "_requests"):
             if hasattr(self, name):  # `configure` may have failed before it
                 delattr(self, name)
         # At the end of the process nothing is freed: a collection may take a second.
@@ -173,16 +191,21 @@ class PlannerNode(ManagedNode):
             self._model.forget()
 
     async def prepare(self, transition: str) -> bool:
-        """Load the model before ``configure``; refuse waiting requests before a stop."""
+        """Load the model before ``configure``; refuse waiting requests before a stop.
+
+        Return False if the transition is impossible, as there is no model.
+        """
         if transition == "configure":
             self._model.load()
-            await unless(self._model.wait_until_loaded(), lambda: self.is_stopping)
+            await unless_refused(
+                self._model.wait_until_loaded(), lambda: self.is_stopping
+            )
             return self._model.planner is not None and not self.is_stopping
         if transition != "activate":
             self._refuse(NOT_ACTIVE)
             while self.state in CONFIGURED and self.is_answering:
-                self._look_soon()
-                await self._requests.next_look
+                self._check_soon()
+                await self._requests.next_wake
         return True
 
     def refuse_requests(self) -> None:
@@ -191,14 +214,18 @@ class PlannerNode(ManagedNode):
         self._refuse(STOPPING)
 
     def _refuse(self, refusal: Outcome) -> None:
+        """Answer all requests with a refusal, also those that wait."""
         self._refusal = refusal
         if self.state in CONFIGURED:
-            self._requests.look_again()  # waiting requests see the refusal
+            self._requests.wake_waiting()  # to see the refusal
 
     # Parameters
 
     def check_parameters(self, new: dict[str, Any]) -> None:
-        """Check new values as `BaseNode` does, whether TF can be used, and load files."""
+        """Check new values as `BaseNode` does, whether TF can be used, and load files.
+
+        If ROS then sets the parameters, `_apply_parameters` uses the loaded files.
+        """
         super().check_parameters(new)
         source = new.get("start_source", "")
         check_source("start_source", source, "'initialpose' or 'odometry'")
@@ -206,49 +233,59 @@ class PlannerNode(ManagedNode):
         if self._checks_first_parameters:
             return  # workers load the first files
         if "model" in new:
-            self._candidate = read_model(new["model"])
+            self._new_model = read_model(new["model"])
         if "experience" in new:
             file = new["experience"]
             self._new_experience = Experience.load(file) if file else None
 
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
-        self._settings = self.settings()
+        """Use parameters that were set, and plan to the active goal with them."""
+        self._settings = PlannerSettings(**self.values())
+        # Without the parameters that subscriptions declare.
         changed = {parameter.name for parameter in parameters} & self._declared.keys()
-        # Subscriptions declare parameters, too, which are none of these.
         if not changed or self.state not in CONFIGURED:
             return
         if "model" in changed:
-            self._model.use(*self._candidate)
-        self._places.listen_to_source()
+            self._model.use(*self._new_model)
+        self._poses.listen_to_source()
         self._requests.settings = self._settings
         self._map.apply_parameters(changed)
         if "experience" in changed:
             self._map.times.use(self._new_experience)
-        self._plan_for(self._active.poses)
+        self._set_active_goal(self._active_goal.poses)
 
     def _on_model(self, message: UInt8MultiArray) -> None:
+        """Plan with the trainer's model, or report it as refused."""
         with self._diagnostics.receiving("trainer/model"):
             data = bytes_of("model", message)
-            if message.layout == self._model.layout:  # with the digest of the model
+            if message.layout == self._model.layout:  # the layout holds a digest
                 return
             planner = Planner(*model_of(data))
             self._model.use(planner, "trainer/model", message.layout)
-            self._plan_for(self._active.poses)
+            self._set_active_goal(self._active_goal.poses)
 
     # Map, start and goal
 
     def _on_map(self) -> None:
-        self._requests.look_again()
+        self._requests.wake_waiting()
         self._replan.trigger()
 
     def _on_start(self) -> None:
-        self._plan_for(self._active.poses, self._active.followed)
+        self._set_active_goal(self._active_goal.poses, self._active_goal.followed)
 
-    def _plan_for(
+    def _set_active_goal(
         self, goals: Sequence[PoseStamped], followed: Outcome | None = None
     ) -> None:
-        """Plan to goals at once, though a plan to the last ones may not be ready."""
-        self._active = ActiveGoal(goals, self._settings.replan_period, followed)
+        """Plan to the nearest of some goals at once, whatever was planned before.
+
+        Parameters
+        ----------
+        goals : sequence of PoseStamped
+            Other goals than before, or the same goals again.
+        followed : Outcome, optional
+            With a path to the same goals, whose rest may be kept.
+        """
+        self._active_goal = ActiveGoal(goals, self._settings.replan_period, followed)
         self._replan.trigger()
 
     def _on_goals(self, message: PoseStamped | PoseArray) -> None:
@@ -263,7 +300,9 @@ class PlannerNode(ManagedNode):
         else:
             self._diagnostics.ok("goal_poses")
             header = message.header
-            self._plan_for([PoseStamped(header=header, pose=pose) for pose in poses])
+            self._set_active_goal(
+                [PoseStamped(header=header, pose=pose) for pose in poses]
+            )
 
     # Planning
 
@@ -277,29 +316,37 @@ class PlannerNode(ManagedNode):
         self._diagnostics.log(outcome)
         return response
 
+    async def _on_replan(self) -> None:
+        """Plan for the active goal, if there is one, as soon as there is a model.
+
+        A node that has started without a lifecycle manager becomes active before.
+        """
+        await self._model.wait_until_loaded()
+        accepts_requests = self._refusal is None
+        if accepts_requests and self.state == "inactive":
+            self.change("activate")
+        if self._active_goal.poses:
+            await self._plan_for_active_goal()
+
     async def _plan_for_active_goal(self) -> None:
         """Plan for the active goal, publish the path if it is news, and log the outcome.
 
-        The node becomes active with its first model.
+        Nothing is published or logged if the goal needs no new plan.
         """
-        await self._model.wait_until_loaded()
-        if self._refusal is None and self.state == "inactive":
-            self.change("activate")
-        active = self._active
+        active = self._active_goal
         goals = active.poses
-        if not goals:
-            return
         outcome = await self._answer(goals, self._requests.plan_for(active))
         if outcome.status in (UNCHANGED.status, NOT_ACTIVE.status):
             return
         self._publish(outcome, active)
         self._improve_later(outcome)
-        logged = LoggedPlan(goals, outcome.goal, outcome.status, outcome.plan.method)
-        if self._logged != logged:
-            self._logged = logged
+        plan = LoggedPlan(goals, outcome.goal, outcome.status, outcome.plan.method)
+        if self._logged_plan != plan:
+            self._logged_plan = plan
             self._diagnostics.log(outcome, paths=True)
 
     def _publish(self, outcome: Outcome, active: ActiveGoal) -> None:
+        """Keep an outcome for the active goal; publish its path, if that is news."""
         is_news = active.note(outcome)
         if is_news:
             self._plan_publisher.publish(path_bytes(*path_poses(outcome)))
@@ -308,11 +355,12 @@ class PlannerNode(ManagedNode):
     async def _plan_for_action(
         self, query: PathQuery, given_up: GivenUp
     ) -> tuple[Path, Outcome]:
-        planning = self._requests.plan(query, self._followed)
+        """Return the path for a goal of an action, and the outcome."""
+        planning = self._requests.plan(query, self._path_of_action)
         outcome = await self._answer(query.goals, planning, given_up)
         poses = path_poses(outcome)
         if len(outcome.plan.path):
-            self._followed = outcome
+            self._path_of_action = outcome
             # The action gets the better path with its next request.
             self._improve_later(outcome)
             self._plan_publisher.publish(path_bytes(*poses))
@@ -322,12 +370,17 @@ class PlannerNode(ManagedNode):
     async def _ask_other_planner(
         self,
         server: OtherPlanners,
-        handle: Any,
+        handle: GoalHandle,
         given_up: GivenUp,
         is_preempted_there: Callable[[], bool],
-    ) -> Any:
-        """Return another planner's answer to a goal, or an outcome without an answer."""
+    ) -> GoalAnswer | Outcome:
+        """Return another planner's answer to a goal, or an outcome without an answer.
+
+        The outcome is noted in the diagnostics. The parameters are as of
+        `OtherPlanners.ask`.
+        """
         goal = handle.request
+        answer: GoalAnswer | Outcome
         try:
             with self.answering():
                 answer = await server.ask(
@@ -347,8 +400,12 @@ class PlannerNode(ManagedNode):
         return answer
 
     def _improve_later(self, outcome: Outcome) -> None:
-        """Look for a body's cheapest path, if it may be cheap enough for a switch."""
-        self._newest = outcome
+        """Let the executor search the cheapest path, if the robot may switch to it.
+
+        Only a path of a robot with a body may cost more than the cheapest path: at most
+        `plan.bound` times as much.
+        """
+        self._newest_outcome = outcome
         plan = outcome.plan
         switch_ratio = (1 + self._settings.switch_threshold) * SAME_COST
         if isinstance(plan, PosePlan) and plan.bound > switch_ratio:
@@ -356,12 +413,17 @@ class PlannerNode(ManagedNode):
             executor.create_task(self._improve_path, outcome)
 
     async def _improve_path(self, outcome: Outcome) -> None:
+        """Search the cheapest path; publish it, if it leads to the active goal.
+
+        The search ends when there is a newer outcome.
+        """
+
         def given_up() -> Outcome | None:
-            return None if outcome is self._newest else UNCHANGED
+            return None if outcome is self._newest_outcome else UNCHANGED
 
         better = await self._answer([], self._requests.improve(outcome), given_up)
-        if outcome is self._active.last and better.request is not None:
-            self._publish(better, self._active)
+        if outcome is self._active_goal.last and better.request is not None:
+            self._publish(better, self._active_goal)
 
     async def _on_is_path_valid(self, request: Any, response: Any) -> Any:
         """Answer Nav2's IsPathValid: whether the robot can drive the rest of a path."""
@@ -373,7 +435,7 @@ class PlannerNode(ManagedNode):
         )
         try:
             with self.answering():
-                invalid_poses = await unless(checking, lambda: self._refusal)
+                invalid_poses = await unless_refused(checking, lambda: self._refusal)
             if isinstance(invalid_poses, Outcome):
                 raise ValueError(invalid_poses.reason)
         except Exception as error:  # as when no memory is left: the node must survive
@@ -392,11 +454,23 @@ class PlannerNode(ManagedNode):
         planning: Planning,
         given_up: GivenUp = lambda: None,
     ) -> Outcome:
-        """Plan, unless the node stops or the request is given up."""
+        """Return the outcome of a coroutine that plans, whatever error it raises.
+
+        Parameters
+        ----------
+        goals : sequence of PoseStamped
+            Of the request: without a map, the path has the frame of the first goal.
+        planning : coroutine
+            It is closed when the node refuses requests, or when this one is given up.
+        given_up : callable
+            Returns the outcome if the request is given up now, else None.
+        """
         outcome: Outcome
         try:
             with self.answering():
-                outcome = await unless(planning, lambda: self._refusal or given_up())
+                outcome = await unless_refused(
+                    planning, lambda: self._refusal or given_up()
+                )
         except RequestError as error:
             outcome = Outcome(error.status, str(error))
         except Exception as error:  # as when no memory is left: the node must survive
@@ -416,40 +490,49 @@ class PlannerNode(ManagedNode):
 
     # Diagnostics
 
-    def _look_soon(self) -> None:
-        """Look at changes, or whether a message has come, in `LOOK_PERIOD`."""
-        self._look_each(LOOK_PERIOD)
+    def _check_soon(self) -> None:
+        """Check in `SOON_PERIOD` whether anything has come that requests wait for."""
+        self._set_check_period(SOON_PERIOD)
 
-    def _look_each(self, period: float) -> None:
-        nanoseconds = int(1e9 * period)
+    def _set_check_period(self, seconds: float) -> None:
+        nanoseconds = int(1e9 * seconds)
         # A timer that is reset wakes the node.
-        if self._looks.timer_period_ns != nanoseconds:
-            self._looks.timer_period_ns = nanoseconds
-            self._looks.reset()
+        if self._check_timer.timer_period_ns != nanoseconds:
+            self._check_timer.timer_period_ns = nanoseconds
+            self._check_timer.reset()
 
-    def _on_look(self) -> None:
-        is_configured = self.state in CONFIGURED
-        is_settling = is_configured and self._map.is_settling
-        active = self._active
-        replans_often = bool(active.poses) and active.period < IDLE_PERIOD
-        is_near = replans_often or active.lacks_pose or is_settling
-        self._look_each(LOOK_PERIOD if is_near else IDLE_PERIOD)
+    def _on_check_timer(self) -> None:
+        """Let requests check what they wait for; publish diagnostics that are due."""
+        self._set_check_period(SOON_PERIOD if self._expects_change() else IDLE_PERIOD)
         map_missing = ""
-        if is_configured:
-            self._requests.look_again()
-            self._places.transform_start()
+        if self.state in CONFIGURED:
             map_missing = self._map.missing
-            pose_has_come = active.lacks_pose and self._places.know(active.poses)
-            if pose_has_come or active.is_look_due(lacks_map=bool(map_missing)):
-                self._replan.trigger()
+            self._wake_requests(lacks_map=bool(map_missing))
+        # Once all is compiled, the memory of the compiler is given back.
         if llvm_was_used.is_set() and not self._model.loading:
             llvm_was_used.clear()
             self._worker.call(give_back)
-        if self._diagnostics.is_due():
+        if self._diagnostics.begin_period_if_due():
             self._publish_diagnostics(map_missing)
 
+    def _expects_change(self) -> bool:
+        """Return whether the next check has to come soon."""
+        active = self._active_goal
+        replans_often = bool(active.poses) and active.period < IDLE_PERIOD
+        is_map_settling = self.state in CONFIGURED and self._map.is_settling
+        return replans_often or active.lacks_pose or is_map_settling
+
+    def _wake_requests(self, lacks_map: bool) -> None:
+        """Wake the requests that wait, and plan for the active goal if that is due."""
+        active = self._active_goal
+        self._requests.wake_waiting()
+        self._poses.transform_initial_pose()
+        pose_has_come = active.lacks_pose and self._poses.can_transform(active.poses)
+        if pose_has_come or active.is_check_due(lacks_map):
+            self._replan.trigger()
+
     def _publish_diagnostics(self, map_missing: str) -> None:
-        """Publish the diagnostics, with why there is no map; empty with a map."""
+        """Publish the diagnostics; `map_missing` says why there is no map, if so."""
         refusal = self._refusal.reason if self._refusal is not None else ""
         model_missing = "the model is being loaded" if self._model.loading else ""
         missing = [refusal, map_missing, model_missing]

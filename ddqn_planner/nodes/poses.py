@@ -3,12 +3,18 @@
 import importlib.util
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any, NamedTuple
 
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
+from geometry_msgs.msg import (
+    Point,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    TransformStamped,
+    Vector3,
+)
 from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
@@ -26,6 +32,7 @@ from ddqn_planner.nodes.conversions import (
 )
 from ddqn_planner.nodes.diagnostics import Diagnostics
 from ddqn_planner.nodes.outcome import RequestError
+from ddqn_planner.nodes.parameters import PlannerSettings
 from ddqn_planner.nodes.ros_packages import apt_install
 
 READ_PERIOD = 0.5  # seconds between two reads of TF
@@ -34,7 +41,8 @@ TF_DEPTH = 1000  # messages that come between two reads
 AGE_OF_FIRST_POSE = 1.0
 SILENCE = 2.0  # seconds without odometry after which the robot's pose is unknown
 REMEDY = f"; or install tf2_ros ({apt_install('tf2-ros-py')}), which transforms it"
-NEWEST = Time()
+REMEDY_OF_START = "or set start_source, or give the request's start its frame"
+NEWEST = Time()  # the stamp 0, by which tf2 returns the newest transform
 TYPES = {
     "odom": Odometry,
     "initialpose": PoseWithCovarianceStamped,
@@ -47,192 +55,230 @@ def has_tf() -> bool:
     return importlib.util.find_spec("tf2_ros") is not None
 
 
-def check_source(parameter: str, value: str, others: str) -> None:
-    """Raise a RuntimeError with the remedy if a parameter asks for TF without tf2_ros."""
+def check_source(parameter: str, value: str, other_values: str) -> None:
+    """Raise a RuntimeError if a parameter has the value `tf` without tf2_ros.
+
+    The error names the parameter, and other values that it may have, in words.
+    """
     if value == "tf" and not has_tf():
-        missing = (
-            f"needs tf2_ros, and that is not installed: {apt_install('tf2-ros-py')}"
-        )
-        raise RuntimeError(
-            f"{parameter} is 'tf', which {missing}, or set {parameter} to {others}"
-        )
+        install = apt_install("tf2-ros-py")
+        problem = f"needs tf2_ros, and that is not installed: {install}"
+        remedy = f"set {parameter} to {other_values}"
+        raise RuntimeError(f"{parameter} is 'tf', which {problem}, or {remedy}")
 
 
 class CheckedTransforms:
-    """Hands transforms to a buffer of tf2, with quaternions of norm 1, or refuses them.
+    """Gives transforms to a buffer of tf2, with quaternions of norm 1, or refuses them.
 
-    tf2 refuses those of another norm, or takes them as they are, by its release.
+    Some releases of tf2 refuse quaternions of another norm, others use them as they are.
     """
 
     def __init__(self, buffer: Any, node: BaseNode) -> None:
-        self._buffer, self._node = buffer, node
+        self._buffer = buffer
+        self._node = node
         self.refused: dict[tuple[str, str], str] = {}
         """Why the last transform between two frames was refused."""
 
     def set_transform(self, transform: TransformStamped, authority: str) -> None:
-        """Hand on what `tf` brings."""
-        if self._is_good(transform):
+        """Give a transform of the topic `tf` to the buffer, if it is good."""
+        if self._make_unit(transform):
             self._buffer.set_transform(transform, authority)
 
     def set_transform_static(self, transform: TransformStamped, authority: str) -> None:
-        """Hand on what `tf_static` brings."""
-        if self._is_good(transform):
+        """Give a transform of the topic `tf_static` to the buffer, if it is good."""
+        if self._make_unit(transform):
             self._buffer.set_transform_static(transform, authority)
 
-    def _is_good(self, stamped: TransformStamped) -> bool:
-        frames = stamped.header.frame_id, stamped.child_frame_id
-        wrong = transform_problem(stamped)
-        if not wrong:
-            self.refused.pop(frames, None)
-            turn = stamped.transform.rotation
-            stamped.transform.rotation = unit_quaternion(turn)
-            return True
-        if frames not in self.refused:
-            self._node.get_logger().warning(f"transform refused: {wrong}")
-        self.refused[frames] = wrong
-        return False
+    def _make_unit(self, stamped: TransformStamped) -> bool:
+        """Give a transform's quaternion the norm 1; return False if it is refused."""
+        frames = (stamped.header.frame_id, stamped.child_frame_id)
+        problem = transform_problem(stamped)
+        if problem:
+            if frames not in self.refused:
+                self._node.get_logger().warning(f"transform refused: {problem}")
+            self.refused[frames] = problem
+            return False
+        self.refused.pop(frames, None)
+        transform = stamped.transform
+        transform.rotation = unit_quaternion(transform.rotation)
+        return True
 
 
 class Frames:
-    """Transforms poses to the map's frame by TF, to which it listens from the first need on."""
+    """Transforms poses to the map's frame by TF, to which it listens when first needed.
 
-    # `tolerance` returns how many seconds the newest transform may be old, or in the future.
+    Parameters
+    ----------
+    node
+        Subscribes to TF.
+    tolerance
+        Returns how many seconds the newest transform may be old, or in the future.
+    """
+
     def __init__(
         self, node: BaseNode, tolerance: Callable[[], float] = lambda: math.inf
     ) -> None:
         self.available = has_tf()
-        self._node, self._tolerance = node, tolerance
+        self._node = node
+        self._tolerance = tolerance
         self._listener: Any = None
-        self.began = -math.inf  # to listen
+        self.listening_since = -math.inf
+        """When the node began to listen to TF, in seconds of the steady clock."""
 
     def check(self, name: str, stamped: PoseStamped, map_frame: str) -> None:
-        """Check a pose as `check_pose` does; with TF its frame may be any."""
+        """Check a pose as `check_pose` does; with TF, poses of any frame are good."""
         check_pose(name, stamped, "" if self.available else map_frame, REMEDY)
 
     def to_map(self, name: str, stamped: PoseStamped, map_frame: str) -> PoseStamped:
-        """Check a pose, and return it in the map's frame of its time; a RequestError without TF."""
+        """Return a pose in the map's frame, by the transform of the time of its stamp.
+
+        Parameters
+        ----------
+        name : str
+            What errors call the pose.
+        stamped : PoseStamped
+        map_frame : str
+
+        Raises
+        ------
+        ValueError
+            If the pose is malformed.
+        RequestError
+            If TF has no such transform.
+        """
         self.check(name, stamped, map_frame)
         frame = stamped.header.frame_id
         if frame == map_frame:
             return with_unit_quaternion(stamped)
+        stamp = Time.from_msg(stamped.header.stamp)
         try:
-            stamp = Time.from_msg(stamped.header.stamp)
-            return transformed(stamped, self._lookup(map_frame, frame, stamp))
+            if stamp.nanoseconds:
+                transform = self._at_time(map_frame, frame, stamp)
+            else:
+                transform = self._newest(map_frame, frame)
+            return transformed(stamped, transform)
         except ValueError as error:
-            reason = f"{name}'s frame is {frame!r}, and {error}, or give it in the map's frame"
-            raise RequestError("TF_ERROR", reason, self.began) from None
+            reason = (
+                f"{name}'s frame is {frame!r}, and {error}, "
+                "or give it in the map's frame"
+            )
+            raise RequestError("TF_ERROR", reason, self.listening_since) from None
 
     def origin_of(self, frame: str, map_frame: str) -> PoseStamped:
-        """Return where a frame's origin is now; ValueError if TF does not know it of now."""
-        return transformed(PoseStamped(), self._lookup(map_frame, frame))
+        """Return the pose of a frame in the map's frame now; ValueError without TF."""
+        return transformed(PoseStamped(), self._newest(map_frame, frame))
 
-    def _age_problem(self, transform: TransformStamped) -> str:
-        """Return why the newest transform is too old, or too new; empty if it is not."""
-        stamp = Time.from_msg(transform.header.stamp)
-        age = (self._node.get_clock().now() - stamp).nanoseconds / 1e9
-        limit = self._tolerance()
-        # Static transforms have the stamp 0, and are never too old.
-        if not stamp.nanoseconds or abs(age) <= limit:
-            return ""
-        words = f"{age:.3g} s old" if age > 0 else f"{-age:.3g} s in the future"
-        return f"the newest is {words}, more than transform_tolerance, {limit:g} s"
+    def _newest(self, target: str, source: str) -> TransformStamped:
+        """Return the newest transform between two frames; ValueError if it is old."""
+        transform = self._lookup(target, source, NEWEST)
+        problem = self._age_problem(transform)
+        if problem:
+            raise ValueError(_no_transform(target, source, problem))
+        return transform
 
-    def _lookup(
-        self, target: str, source: str, stamp: Time = NEWEST
-    ) -> TransformStamped:
-        """Return the transform from a frame to another at a time, by default the newest."""
+    def _at_time(self, target: str, source: str, stamp: Time) -> TransformStamped:
+        """Return the transform between two frames at a time; ValueError without it."""
+        try:
+            return self._lookup(target, source, stamp)
+        except ValueError:
+            # The pose may be from just before the node began to listen.
+            newest = self._newest(target, source)
+            later = (Time.from_msg(newest.header.stamp) - stamp).nanoseconds / 1e9
+            if 0 < later <= AGE_OF_FIRST_POSE:
+                return newest
+            raise
+
+    def _lookup(self, target: str, source: str, stamp: Time) -> TransformStamped:
+        """Return what tf2 has after all messages that came; ValueError if nothing.
+
+        The transform turns and shifts poses of the frame `source` into `target`.
+        """
         self.listen()
-        self._read()
+        self._receive_transforms()
         try:
             transform: TransformStamped = self._buffer.lookup_transform(
                 target, source, stamp
             )
-            problem = "" if stamp.nanoseconds else self._age_problem(transform)
-            if not problem:
-                return transform
         except self._tf2_ros.TransformException as error:
-            if stamp.nanoseconds:
-                newest = self._lookup(target, source)
-                later = (Time.from_msg(newest.header.stamp) - stamp).nanoseconds / 1e9
-                # The pose may be from before the node began to listen.
-                if 0 < later <= AGE_OF_FIRST_POSE:
-                    return newest
-            problem = "; ".join([str(error), *self._checked.refused.values()])
-        raise ValueError(
-            f"no transform leads from {source!r} to {target!r} ({problem}); publish one"
-        )
+            problems = "; ".join([str(error), *self._checked.refused.values()])
+            raise ValueError(_no_transform(target, source, problems)) from None
+        return transform
+
+    def _age_problem(self, transform: TransformStamped) -> str:
+        """Return why a newest transform is too old, or too new; empty if it is not."""
+        stamp = Time.from_msg(transform.header.stamp)
+        is_static = stamp.nanoseconds == 0
+        age = (self._node.get_clock().now() - stamp).nanoseconds / 1e9
+        limit = self._tolerance()
+        if is_static or abs(age) <= limit:
+            return ""
+        difference = f"{age:.3g} s old"
+        if age <= 0:
+            difference = f"{-age:.3g} s in the future"
+        return f"the newest is {difference}, more than transform_tolerance, {limit:g} s"
 
     def listen(self) -> None:
-        """Listen to TF from now on: most robots do not need it, and each message costs time."""
-        if self._listener is None:
-            import tf2_ros  # it takes a while
+        """Listen to TF from now on.
 
-            self._tf2_ros, self._buffer, self.began = (
-                tf2_ros,
-                tf2_ros.Buffer(),
-                time.monotonic(),
-            )
-            self._checked = CheckedTransforms(self._buffer, self._node)
-            self._listener = tf2_ros.TransformListener(
-                self._checked, self._node, qos=TF_DEPTH
-            )
-            # No executor wakes for them, a hundred a second: they are read when they are needed.
-            self._listener.group.can_execute = lambda _: False
-            self._node.create_timer(READ_PERIOD, self._read, clock=STEADY)
-            self._node.jump_back_callbacks.append(self._forget)
+        Most robots do not need it, and each message costs time.
+        """
+        if self._listener is not None:
+            return
+        import tf2_ros  # it takes a while
 
-    def _read(self) -> None:
+        self._tf2_ros = tf2_ros
+        self._buffer = tf2_ros.Buffer()
+        self.listening_since = time.monotonic()
+        self._checked = CheckedTransforms(self._buffer, self._node)
+        self._listener = tf2_ros.TransformListener(
+            self._checked, self._node, qos=TF_DEPTH
+        )
+        # No executor wakes for the messages, a hundred per second: they are received
+        # when a transform is needed.
+        self._listener.group.can_execute = lambda _: False
+        self._node.create_timer(READ_PERIOD, self._receive_transforms, clock=STEADY)
+        self._node.jump_back_callbacks.append(self._forget_transforms)
+
+    def _receive_transforms(self) -> None:
+        """Give all messages that came on TF's topics to tf2."""
         for subscription in (self._listener.tf_sub, self._listener.tf_static_sub):
-            with subscription.handle:
-                take = partial(
-                    subscription.handle.take_message, subscription.msg_type, False
-                )
+            handle = subscription.handle
+            with handle:
+                # Returns None when no message is left.
+                take = partial(handle.take_message, subscription.msg_type, False)
                 for message, _ in iter(take, None):
                     subscription.callback(message)
 
-    def _forget(self) -> None:
-        self._read()
+    def _forget_transforms(self) -> None:
+        """Forget all transforms: tf2 refuses transforms that are older than them."""
+        self._receive_transforms()
         self._checked.refused.clear()
-        self._buffer.clear()  # tf2 takes no transform that is older than those it has
-        self.began = time.monotonic()
+        self._buffer.clear()
+        self.listening_since = time.monotonic()
+
+
+def _no_transform(target: str, source: str, problem: str) -> str:
+    return f"no transform leads from {source!r} to {target!r} ({problem}); publish one"
 
 
 def transform_problem(stamped: TransformStamped) -> str:
     """Return what is wrong with a transform's numbers, and a remedy; empty if good."""
-    frame, child = stamped.header.frame_id, stamped.child_frame_id
-    name = f"the transform from {child!r} to {frame!r}"
+    name = (
+        f"the transform from {stamped.child_frame_id!r} to {stamped.header.frame_id!r}"
+    )
     turn = rotation(stamped.transform.rotation)
     if not turn.is_rounded:
-        numbers = ", ".join(f"{number:.6g}" for number in turn)
-        wrong = f"{name} has the quaternion ({numbers}) of norm {turn.norm:.6g}"
-        return f"{wrong}; publish one of norm 1"
-    shift = stamped.transform.translation
-    metres = shift.x, shift.y, shift.z
-    if not all(map(math.isfinite, metres)):
-        numbers = ", ".join(f"{number:.6g}" for number in metres)
-        return f"{name} has the translation ({numbers}); publish finite numbers"
+        problem = f"the quaternion ({_rounded(turn)}) of norm {turn.norm:.6g}"
+        return f"{name} has {problem}; publish one of norm 1"
+    translation = vector(stamped.transform.translation)
+    if not all(map(math.isfinite, translation)):
+        problem = f"the translation ({_rounded(translation)})"
+        return f"{name} has {problem}; publish finite numbers"
     return ""
 
 
-def transformed(stamped: PoseStamped, transform: TransformStamped) -> PoseStamped:
-    """Return a pose in the transform's frame, projected to the plane: z is 0, and yaw is left.
-
-    A ValueError if the numbers are those of no transform.
-    """
-    wrong = transform_problem(transform)
-    if wrong:
-        raise ValueError(wrong)
-    turn = rotation(transform.transform.rotation).normalised()
-    position = stamped.pose.position
-    translation = transform.transform.translation
-    turned_position = _turned(turn, Vector(position.x, position.y, position.z))
-    facing = rotation(stamped.pose.orientation).normalised()
-    direction = _turned(turn, _turned(facing, Vector(1.0, 0.0, 0.0)))
-    result = PoseStamped(header=transform.header)
-    result.pose.position.x = turned_position.x + translation.x
-    result.pose.position.y = turned_position.y + translation.y
-    result.pose.orientation = quaternion(math.atan2(direction.y, direction.x))
-    return result
+def _rounded(numbers: Iterable[float]) -> str:
+    return ", ".join(f"{number:.6g}" for number in numbers)
 
 
 class Vector(NamedTuple):
@@ -243,17 +289,55 @@ class Vector(NamedTuple):
     z: float
 
 
-def _turned(turn: Rotation, point: Vector) -> Vector:
+X_AXIS = Vector(1.0, 0.0, 0.0)
+
+
+def vector(message: Point | Vector3) -> Vector:
+    """Return the numbers of a message."""
+    return Vector(message.x, message.y, message.z)
+
+
+def transformed(stamped: PoseStamped, transform: TransformStamped) -> PoseStamped:
+    """Return a pose in the transform's frame, in the plane: z, roll and pitch are 0.
+
+    A ValueError if the transform's numbers are those of no transform.
+    """
+    problem = transform_problem(transform)
+    if problem:
+        raise ValueError(problem)
+    turn = rotation(transform.transform.rotation).normalised()
+    position = _turned(vector(stamped.pose.position), turn)
+    translation = transform.transform.translation
+    rotation_of_pose = rotation(stamped.pose.orientation).normalised()
+    direction = _turned(_turned(X_AXIS, rotation_of_pose), turn)
+    result = PoseStamped(header=transform.header)
+    result.pose.position.x = position.x + translation.x
+    result.pose.position.y = position.y + translation.y
+    result.pose.orientation = quaternion(math.atan2(direction.y, direction.x))
+    return result
+
+
+def _turned(point: Vector, turn: Rotation) -> Vector:
     """Return a point p turned by a unit quaternion (r, w): p + 2 r × (r × p + w p)."""
-    x, y, z, w = turn
-    # (a, b, c) is r × p + w p.
-    a = y * point.z - z * point.y + w * point.x
-    b = z * point.x - x * point.z + w * point.y
-    c = x * point.y - y * point.x + w * point.z
+    axis = Vector(turn.x, turn.y, turn.z)
+    first = _cross(axis, point)
+    shifted = Vector(
+        first.x + turn.w * point.x,
+        first.y + turn.w * point.y,
+        first.z + turn.w * point.z,
+    )
+    second = _cross(axis, shifted)
     return Vector(
-        point.x + 2 * (y * c - z * b),
-        point.y + 2 * (z * a - x * c),
-        point.z + 2 * (x * b - y * a),
+        point.x + 2 * second.x, point.y + 2 * second.y, point.z + 2 * second.z
+    )
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    """Return the cross product of two vectors."""
+    return Vector(
+        a.y * b.z - a.z * b.y,
+        a.z * b.x - a.x * b.z,
+        a.x * b.y - a.y * b.x,
     )
 
 
@@ -262,118 +346,171 @@ def listen(
     topic: str,
     depth: int,
     diagnostics: Diagnostics,
-    take: Callable[[PoseStamped], None],
+    on_pose: Callable[[PoseStamped], None],
 ) -> Subscription:
-    """Hand each pose of a topic of `TYPES` to a function, whose ValueError refuses it."""
+    """Subscribe to a topic with poses of any kind of message.
+
+    Parameters
+    ----------
+    node : BaseNode
+    topic : str
+        A name in `TYPES`, perhaps after a namespace.
+    depth : int
+        Length of the queue in messages.
+    diagnostics : Diagnostics
+        Reports a pose that is refused.
+    on_pose : callable
+        Called with each pose; a ValueError refuses it.
+    """
     message_type = TYPES[topic.rpartition("/")[2]]
     is_odometry = message_type is Odometry
 
-    def on_message(message: Any) -> None:
+    def on_message(
+        message: Odometry | PoseWithCovarianceStamped | PoseStamped,
+    ) -> None:
+        # The first two have the pose beside its covariance.
         pose = getattr(message.pose, "pose", message.pose)
         with diagnostics.receiving(topic, is_frequent=is_odometry):
-            take(PoseStamped(header=message.header, pose=pose))
+            on_pose(PoseStamped(header=message.header, pose=pose))
 
     quality = QoSProfile(depth=depth)
-    if is_odometry:  # reliable publishers and others are received
+    if is_odometry:  # received from best-effort and reliable publishers
         quality.reliability = ReliabilityPolicy.BEST_EFFORT
     return node.create_subscription(message_type, topic, on_message, quality)
 
 
-class Places(Frames):
-    """Frames, and where the robot is by ``start_source``: the last `initialpose`, `odom`, or TF."""
+class Poses(Frames):
+    """Poses in the map's frame, and the robot's pose by the parameter ``start_source``.
 
-    # `frame` returns the map's; `plan` is called when there is a start to plan from at once.
+    Parameters
+    ----------
+    node
+        Subscribes to the source.
+    diagnostics
+        Where refused poses are reported.
+    settings
+        Returns the parameters of now.
+    map_frame
+        Returns the frame of the map; empty without a map.
+    on_start
+        Called with the first pose of odometry, and with each `initialpose`: the active
+        goal may be planned for.
+    """
+
     def __init__(
         self,
         node: BaseNode,
         diagnostics: Diagnostics,
-        frame: Callable[[], str],
-        plan: Callable[[], None],
+        settings: Callable[[], PlannerSettings],
+        map_frame: Callable[[], str],
+        on_start: Callable[[], None],
     ) -> None:
-        super().__init__(node, lambda: float(node.value("transform_tolerance")))
-        self._diagnostics, self._map_frame, self._plan = diagnostics, frame, plan
-        self._pose: PoseStamped | None = None
+        super().__init__(node, lambda: settings().transform_tolerance)
+        self._diagnostics = diagnostics
+        self._settings = settings
+        self._map_frame = map_frame
+        self._on_start = on_start
+        # The last one of the source's topic, with the time by the node's clock when it
+        # came.
+        self._last_pose: PoseStamped | None = None
+        self._pose_came = Time()
+        # When the node began to wait for odometry, in seconds of the steady clock.
+        self._odometry_since = -math.inf
         self._subscription: Any = None
-        self.topic = ""
+        self._source = ""  # "tf", or the topic "initialpose" or "odom"
         self.listen_to_source()
         node.jump_back_callbacks.append(self._forget_odometry)
 
     def listen_to_source(self) -> None:
-        """Listen to what the parameter names, if it is another source."""
-        source = self._node.value("start_source")
-        topic = "odom" if source == "odometry" else source
-        if topic == self.topic:
+        """Listen to the source that the parameter names now, if it is another one."""
+        source = self._settings().start_source
+        if source == "odometry":
+            source = "odom"
+        if source == self._source:
             return
         self._node.destroy_subscription(self._subscription)
-        self._diagnostics.ok(self.topic)
-        self.topic, self._pose, self._heard_from = topic, None, time.monotonic()
-        if topic == "tf":
+        self._diagnostics.ok(self._source)
+        self._source = source
+        self._last_pose = None
+        self._odometry_since = time.monotonic()
+        if source == "tf":
             self.listen()
         else:
             self._subscription = listen(
-                self._node, topic, 10, self._diagnostics, self._take
+                self._node, source, 10, self._diagnostics, self.receive
             )
 
     def _forget_odometry(self) -> None:
-        if self.topic == "odom":
-            self._pose, self._heard_from = None, time.monotonic()
+        if self._source == "odom":
+            self._last_pose = None
+            self._odometry_since = time.monotonic()
 
-    def _take(self, pose: PoseStamped) -> None:
+    def receive(self, pose: PoseStamped) -> None:
+        """Use a pose of the source's topic; a ValueError refuses it."""
         self.check("the start", pose, self._map_frame())
-        # Odometry comes all the time: it only triggers a plan that waits for the first pose.
-        is_due = self._pose is None or self.topic == "initialpose"
-        self._pose, self._came = pose, self._node.get_clock().now()
-        if is_due:
-            self._plan()
+        # Odometry comes all the time: only the first pose may be waited for.
+        is_start = self._last_pose is None or self._source == "initialpose"
+        self._last_pose = pose
+        self._pose_came = self._node.get_clock().now()
+        if is_start:
+            self._on_start()
 
-    def transform_start(self) -> None:
-        """Transform the last `initialpose` as soon as TF can: it forgets the times before."""
+    def transform_initial_pose(self) -> None:
+        """Transform a set pose to the map's frame as soon as TF can.
+
+        Later TF has forgotten the time of the pose.
+        """
         frame = self._map_frame()
-        if self.topic == "initialpose" and self._pose is not None and frame:
+        if self._source == "initialpose" and self._last_pose is not None and frame:
             with suppress(ValueError):
-                self._pose = self.to_map("the start", self._pose, frame)
+                self._last_pose = self.to_map("the start", self._last_pose, frame)
 
-    def know(self, goals: Sequence[PoseStamped]) -> bool:
-        """Return whether the start and some goals have a place on the map."""
+    def can_transform(self, goals: Sequence[PoseStamped]) -> bool:
+        """Return whether the robot's pose and all goals have a pose on the map now."""
         with suppress(ValueError):
-            for pose in (self.start(), *goals):
+            for pose in (self.robot(), *goals):
                 self.to_map("a pose", pose, self._map_frame())
             return True
         return False
 
-    def start(self) -> PoseStamped:
-        """Return the last pose in its own frame, by TF in the map's; or raise a RequestError."""
-        if self.topic == "tf":
-            try:
-                return self.origin_of(
-                    self._node.value("robot_frame"), self._map_frame()
-                )
-            except ValueError as error:
-                reason = (
-                    f"the start is unknown: {error}, or set robot_frame or start_source"
-                )
-                raise RequestError("NO_START", reason, self.began) from None
-        topic = self._subscription.topic_name
-        if self.topic == "initialpose":
-            if self._pose is not None:  # its stamp may be that of another clock
-                return self._pose
-            problem = f"set it on {topic} (in RViz: 2D Pose Estimate)"
-            listening_since = -math.inf  # a user sets it: there is nothing to wait for
-        else:
-            problem = self._odometry_problem(topic)
-            if self._pose is not None and not problem:
-                return self._pose
-            listening_since = self._heard_from
-        remedy = "or set start_source, or give the request's start its frame"
-        reason = f"the start is unknown; {problem}; {remedy}"
-        raise RequestError("NO_START", reason, listening_since)
+    def robot(self) -> PoseStamped:
+        """Return the robot's pose; a RequestError says why it is unknown.
 
-    def _odometry_problem(self, topic: str) -> str:
-        """Return why odometry does not tell the robot's pose now; empty if it does."""
-        if self._pose is None:
-            return f"nothing came on {topic} in the map's frame"
-        silence = (self._node.get_clock().now() - self._came).nanoseconds / 1e9
-        if silence <= max(self._node.value("transform_tolerance"), SILENCE):
-            return ""
-        remedy = "publish it more often, set transform_tolerance"
-        return f"nothing came on {topic} for {silence:.3g} s; {remedy}"
+        By TF it is in the map's frame, else in the frame of the last message.
+        """
+        if self._source == "tf":
+            return self._pose_by_tf()
+        if self._source == "odom":
+            return self._pose_by_odometry()
+        # Its age does not matter: a robot stays where a user has set it.
+        if self._last_pose is None:
+            topic = self._subscription.topic_name
+            problem = f"set it on {topic} (in RViz: 2D Pose Estimate)"
+            raise RequestError(
+                "NO_START", f"the start is unknown; {problem}; {REMEDY_OF_START}"
+            )
+        return self._last_pose
+
+    def _pose_by_tf(self) -> PoseStamped:
+        try:
+            return self.origin_of(self._settings().robot_frame, self._map_frame())
+        except ValueError as error:
+            reason = (
+                f"the start is unknown: {error}, or set robot_frame or start_source"
+            )
+            raise RequestError("NO_START", reason, self.listening_since) from None
+
+    def _pose_by_odometry(self) -> PoseStamped:
+        topic = self._subscription.topic_name
+        if self._last_pose is None:
+            problem = f"nothing came on {topic} in the map's frame"
+        else:
+            silence = (self._node.get_clock().now() - self._pose_came).nanoseconds / 1e9
+            if silence <= max(self._settings().transform_tolerance, SILENCE):
+                return self._last_pose
+            problem = (
+                f"nothing came on {topic} for {silence:.3g} s; "
+                "publish it more often, set transform_tolerance"
+            )
+        reason = f"the start is unknown; {problem}; {REMEDY_OF_START}"
+        raise RequestError("NO_START", reason, self._odometry_since)

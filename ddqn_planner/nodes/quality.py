@@ -13,14 +13,17 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 SERVICE_QUALITY = QoSProfile(depth=5000)
 
 GREATEST_DEPTH = 2**31 - 1  # of a queue in DDS
-# What parameters may change of each subscription.
+# The policies of a subscription that parameters may set.
 OVERRIDABLE = [
     QoSPolicyKind[name] for name in ("HISTORY", "DEPTH", "DURABILITY", "RELIABILITY")
 ]
 
 
 def overriding_options(topic: str) -> QoSOverridingOptions:
-    """Return the policies of a subscription that parameters may override."""
+    """Let parameters override policies of the subscription to a topic.
+
+    The values of these parameters are checked: a ValueError says what to give.
+    """
 
     def check_depth(quality: QoSProfile) -> SetParametersResult:
         if not 0 <= quality.depth <= GREATEST_DEPTH:

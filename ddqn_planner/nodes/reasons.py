@@ -7,20 +7,13 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped
 
 from ddqn_planner.grid import Cell
-from ddqn_planner.nodes.outcome import (
-    Request,
-)
-from ddqn_planner.planning import (
-    Plan,
-    PlanMethod,
-    PlanStatus,
-    unknown_space,
-)
+from ddqn_planner.nodes.outcome import Request
+from ddqn_planner.planning import Plan, PlanMethod, PlanStatus, unknown_space
 from ddqn_planner.planning.exact_paths import NO_PATH, ExactPath
 from ddqn_planner.planning.plan import PosePlan, PoseRequest
 
 MOST_CELLS = 5  # of goals that a reason lists
-# No help with several goals, of which none moves.
+# No remedy for several goals: none of them moves.
 TOLERANCE = ", or a greater tolerance"
 REMEDIES = {
     PlanStatus.START_OUTSIDE_MAP: "set the start on the map",
@@ -78,19 +71,23 @@ def reason_of_failure(
     goal: PoseStamped,
     robot_radius: float,
 ) -> str:
-    """Say why there is no path, between which places, and what to do."""
+    """Say why there is no path, between which places, and what to do.
+
+    The parameters are as of `reason_of`; the plan has no path.
+    """
     grid = request.grid
     start_cell, *goal_cells = request.cells
+    has_several_goals = len(goal_cells) > 1
+    # A plan that unknown space has prevented has a remedy of its own.
     is_unknown = plan.reason.endswith(unknown_space.REMEDY)
     if is_unknown:
         problem, _, remedy = plan.reason.partition("; ")
     else:
-        problem = plan.status.value
-        remedy = remedy_of(plan)
+        remedies = REMEDIES_OF_BODY if isinstance(plan, PosePlan) else REMEDIES
+        problem = plan.reason if has_several_goals else plan.status.value
+        remedy = remedies[plan.status]
     goals_in_words = f"goal: {_place(goal, goal_cells[0])}"
-    if len(goal_cells) > 1:
-        if not is_unknown:
-            problem = plan.reason
+    if has_several_goals:
         problem = f"no path to any of {len(goal_cells)} goals: {problem}"
         remedy = remedy.removesuffix(TOLERANCE)
         goals_in_words = _cells_in_words(goal_cells)
@@ -99,6 +96,7 @@ def reason_of_failure(
     reason = f"{problem} ({place})"
     if plan.status is PlanStatus.GOAL_OCCUPIED and not is_unknown:
         goals_on_map = filter(grid.contains, goal_cells)
+        # A goal that is no obstacle is in the inflated cells around one.
         if not all(map(grid.is_obstacle, goals_on_map)):
             limit = _clearance_in_words(plan, robot_radius)
             reason += f", nearer to an obstacle than {limit}"
@@ -108,20 +106,17 @@ def reason_of_failure(
     return f"{reason}; {remedy}"
 
 
-def remedy_of(plan: Plan) -> str:
-    """Return what to do about a plan without a path."""
-    remedies = REMEDIES_OF_BODY if isinstance(plan, PosePlan) else REMEDIES
-    return remedies[plan.status]
-
-
 def reason_of_path(request: Request, plan: Plan, path: ExactPath) -> str:
-    """Say how long a path is, how it was found, and what moved or was ignored."""
+    """Say how long a path is, how it was found, and what moved or was ignored.
+
+    The parameters are as of `reason_of`; the plan has a path.
+    """
     grid = request.grid
     _, *goal_cells = request.cells
     length = plan.length if isinstance(plan, PosePlan) else path.length
     reason = f"a path of {length:.2f} cells"
     if len(goal_cells) > 1:
-        reason += f" to goal {reached(request, plan) + 1} of {len(goal_cells)}"
+        reason += f" to goal {nearest_goal(request, plan) + 1} of {len(goal_cells)}"
     reason += f", {_method_in_words(plan)}"
     if plan.extra_cost:
         reason += f", kept: its cost is {plan.extra_cost:+.1%} beside that of a new one"
@@ -140,8 +135,9 @@ def reason_of_path(request: Request, plan: Plan, path: ExactPath) -> str:
 
 
 def _method_in_words(plan: Plan) -> str:
+    """Return how a path was found."""
     if isinstance(plan, PosePlan):
-        if math.isinf(plan.bound):
+        if math.isinf(plan.bound):  # no field leads from the start: nothing is proved
             return (
                 "kept, as there is none from the cell and heading nearest to the start"
             )
@@ -159,6 +155,7 @@ def _clearing_radius(request: Request) -> float:
 
 
 def _clearance_in_words(plan: Plan, robot_radius: float) -> str:
+    """Return how near to an obstacle a robot may be, and by which of its settings."""
     if isinstance(plan, PosePlan):
         return "the robot's body allows"
     if robot_radius:
@@ -173,14 +170,19 @@ def _cells_in_words(goal_cells: Sequence[Cell]) -> str:
     return f"goals: cells {cells}"
 
 
-def reached(request: Request, plan: Plan) -> int:
-    """Return the index of the goal that a plan leads to; a kept path ends beside it."""
+def nearest_goal(request: Request, plan: Plan) -> int:
+    """Return the index of the goal to which a plan leads; 0 without a path.
+
+    A kept path may end some cells from the goal.
+    """
     if plan.goal is None:
         return 0
-    return int(np.argmin([math.dist(cell, plan.goal) for cell in request.cells[1:]]))
+    _, *goal_cells = request.cells
+    return int(np.argmin([math.dist(cell, plan.goal) for cell in goal_cells]))
 
 
 def _place(stamped: PoseStamped, cell: Cell) -> str:
+    """Return a position and its cell in words."""
     position = stamped.pose.position
     return (
         f"({position.x:.6g}, {position.y:.6g}) m in cell ({cell[0]:.6g}, {cell[1]:.6g})"

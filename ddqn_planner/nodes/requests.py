@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from types import SimpleNamespace
 from typing import NamedTuple, TypeVar
 
 from geometry_msgs.msg import PoseStamped
@@ -18,9 +17,10 @@ from ddqn_planner.nodes.conversions import cell_from_pose, pose_of
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.model_source import ModelSource
 from ddqn_planner.nodes.outcome import Outcome, PathQuery, Request, RequestError
-from ddqn_planner.nodes.poses import Places
-from ddqn_planner.nodes.reasons import reached, reason_of
-from ddqn_planner.nodes.retries import FAILURES, Retries
+from ddqn_planner.nodes.parameters import PlannerSettings
+from ddqn_planner.nodes.poses import Poses
+from ddqn_planner.nodes.reasons import nearest_goal, reason_of
+from ddqn_planner.nodes.retries import Retries
 from ddqn_planner.nodes.worker import Worker
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest
 from ddqn_planner.planning.exact_paths import NO_PATH, ExactPath, exact_path
@@ -34,7 +34,7 @@ T = TypeVar("T")
 
 
 class PlanInputs(NamedTuple):
-    """The map and the model of now, whatever changes while a request is planned."""
+    """The map and the model for a request, though both may change meanwhile."""
 
     header: Header  # of the map
     grid: GridMap  # with the robot's body, directions and expected times
@@ -49,7 +49,7 @@ class MapPose(NamedTuple):
 
 
 class Legs(NamedTuple):
-    """The plans of a path from goal to goal; the last plan may have no path."""
+    """The plans of the legs from stop to stop; the last plan may have no path."""
 
     request: Request  # of the last plan
     plans: list[Plan]
@@ -59,60 +59,70 @@ class Legs(NamedTuple):
 class Requests:
     """Plans paths; a `RequestError` says why a path cannot be planned for."""
 
-    settings: SimpleNamespace
+    settings: PlannerSettings  # of now: the node sets others when parameters change
     map: MapSource
-    places: Places
+    poses: Poses
     model: ModelSource
     worker: Worker
-    look_soon: Callable[[], None]
-    next_look: Future = field(default_factory=Future)
+    check_soon: Callable[[], None]  # lets the node call `wake_waiting` soon
+    next_wake: Future = field(default_factory=Future)  # done by `wake_waiting`
     retries: Retries = field(default_factory=Retries)
 
-    def look_again(self) -> None:
+    def wake_waiting(self) -> None:
         """Wake the requests that wait for a map or a pose: it may have come."""
-        look = self.next_look
-        self.next_look = Future()
-        look.set_result(None)
+        wake = self.next_wake
+        self.next_wake = Future()
+        wake.set_result(None)
 
     async def plan(self, query: PathQuery, current: Outcome | None = None) -> Outcome:
-        """Plan as `plan_once`; after a failure for the same goal, on the next costmap.
+        """Plan as `plan_once`; after a failure for the same goal, on the next costmaps.
 
         A client that clears the costmap after a failure, as Nav2's behavior trees do,
         asks again before the cleared costmap has come. So a query that fails again
         waits for that. As a costmap from before the clear may come first, the query
         waits for several. Their stamps are no help: they may be those of another clock.
         """
-        goals = query.goals
-        arrivals = self.map.arrivals
-        first_costmap = arrivals.number
-        deadline = math.inf
-        while True:
-            plan_time = time.monotonic()
-            costmap = arrivals.number
-            outcome = await self.plan_once(query, current)
-            if outcome.status not in FAILURES or outcome.request is None:
-                break
-            if deadline == math.inf:
-                resolution = outcome.request.grid.resolution
-                if not self.retries.is_retry(goals, costmap, resolution):
+        costmap = self.map.arrivals.number
+        outcome = await self.plan_once(query, current)
+        if self._may_succeed_soon(query, costmap, outcome):
+            first_costmap = costmap
+            deadline = time.monotonic() + self.map.retry_wait
+            is_in_time = True
+            while outcome.has_failed and is_in_time:
+                if not await self._wait_for_costmap(costmap, deadline):
+                    # Until a costmap comes, the next query does not wait.
+                    self.map.arrivals.awaited_in_vain = first_costmap
                     break
-                deadline = time.monotonic() + self.map.retry_wait
-            elif plan_time >= deadline:
-                break
-            if not await self._wait_for_costmap(costmap, deadline):
-                # The next query does not wait, unless a costmap has come by then.
-                arrivals.awaited_in_vain = first_costmap
-                break
-        self.retries.note(goals, costmap, outcome)
+                is_in_time = time.monotonic() < deadline
+                costmap = self.map.arrivals.number
+                outcome = await self.plan_once(query, current)
+        self.retries.note(query.goals, costmap, outcome)
         return outcome
 
+    def _may_succeed_soon(
+        self, query: PathQuery, costmap: int, outcome: Outcome
+    ) -> bool:
+        """Return whether a query failed again, on the costmap of a number."""
+        if not outcome.has_failed or outcome.request is None:
+            return False
+        resolution = outcome.request.grid.resolution
+        return self.retries.is_retry(query.goals, costmap, resolution)
+
     async def _wait_for_costmap(self, last: int, deadline: float) -> bool:
-        """Return whether a costmap or an update comes after the one of a number."""
+        """Return True when a costmap or an update comes; False after the deadline.
+
+        Parameters
+        ----------
+        last : int
+            The number, in `Arrivals`, of the costmap before.
+        deadline : float
+            Seconds of the steady clock.
+        """
         while self.map.arrivals.number == last:
             if time.monotonic() >= deadline:
                 return False
-            self.look_soon()
-            await self.next_look
+            self.check_soon()
+            await self.next_wake
         return True
 
     async def plan_once(
@@ -124,9 +134,11 @@ class Requests:
         ----------
         query : PathQuery
         current : Outcome, optional
-            Of the path that the robot follows: its rest may be kept, with one goal.
+            Of the path that the robot follows. A query with one goal may keep the rest
+            of this path.
         """
-        settings = self.settings  # of now, like the map and the model
+        # The parameters, the map and the model may change while the query is planned.
+        settings = self.settings
         check_query(query, settings.planner_id)
         inputs = await self.inputs()
         names = goal_names(len(query.goals), query.has_via_points)
@@ -143,10 +155,7 @@ class Requests:
         outcome = outcome_of(inputs, settings, legs, stops)
         if len(goals) == 1 or len(outcome.plan.path):
             return outcome
-        missed_goal = names[len(legs.plans) - 1]
-        if missed_goal != THE_GOAL:
-            count = len(goals) - 1 if query.has_via_points else len(goals)
-            missed_goal += f" of {count}"
+        missed_goal = missed_goal_in_words(query, names, len(legs.plans))
         outcome = replace(outcome, reason=f"{missed_goal}: {outcome.reason}")
         if settings.allow_partial_planning and not query.has_via_points:
             outcome = with_partial_path(outcome, legs, stops)
@@ -155,8 +164,9 @@ class Requests:
     async def plan_for(self, active: ActiveGoal) -> Outcome:
         """Plan to the active goal, or to the nearest of several, if there is a reason.
 
-        A failed plan does not wait for the next costmap, on which the goal is planned
-        for anyway.
+        Without a reason the outcome is `UNCHANGED`. The poses of the active goal are
+        transformed into the map's frame. After a failure there is no wait for the next
+        costmap, as the active goal is planned for on each costmap anyway.
         """
         settings = self.settings
         costmap = self.map.arrivals.number
@@ -172,7 +182,7 @@ class Requests:
         if active.followed is not None:
             frame = inputs.header.frame_id
             request = with_current_path(request, active.followed, frame)
-        is_period_over = active.schedule_look()
+        is_period_over = active.begin_period_if_due()
         if not active.is_due(inputs.planner, request, inputs.header, is_period_over):
             return UNCHANGED
         plan = await self._plan(inputs.planner, request)
@@ -182,21 +192,24 @@ class Requests:
         return outcome
 
     async def improve(self, outcome: Outcome) -> Outcome:
-        """Return the outcome of a request for poses, with a path of the least cost."""
-        request, planner, goal = outcome.request, outcome.planner, outcome.goal
-        assert isinstance(request, PoseRequest)
+        """Return an outcome for a robot with a body again, with the cheapest path."""
+        planner = outcome.planner
+        goal = outcome.goal
+        assert isinstance(outcome.request, PoseRequest)
         assert isinstance(outcome.plan, PosePlan)
         assert planner is not None
         assert goal is not None
-        request = replace(request, bound=1.0, under_way=outcome.plan.poses)
+        # A bound of 1: no path costs less. The outcome's path is kept if it is so cheap.
+        request = replace(outcome.request, bound=1.0, under_way=outcome.plan.poses)
         plan = await self._plan(planner, request)
+        # Reasons of paths name neither the start, here the goal, nor the robot_radius.
         reason = reason_of(request, plan, goal, goal, 0.0)
         return replace(outcome, request=request, plan=plan, reason=reason)
 
     async def _plan_legs(
         self, planner: Planner, request: Request, later_goals: Sequence[MapPose]
     ) -> Legs:
-        """Plan to the goal of a request and on to later goals, until there is no path."""
+        """Plan to the goal of a request, then on to later goals, until a leg fails."""
         plan = await self._plan(planner, request)
         plans = [plan]
         for goal in later_goals:
@@ -208,10 +221,11 @@ class Requests:
         return Legs(request, plans)
 
     async def _plan(self, planner: Planner, request: Request) -> Plan:
-        """Plan in slow steps by the worker: between two of them others have a turn."""
+        """Plan in steps by the worker: between two steps, other requests have a turn."""
+        # A generator: its last value is the plan, the values before are None.
         steps = planner.steps(request)
         try:
-            plan = next(steps)
+            plan = next(steps)  # at once, as most requests need no second step
         except ValueError as error:
             raise RequestError("MAP_RESOLUTION_UNSUPPORTED", str(error)) from None
         while plan is None:
@@ -221,9 +235,9 @@ class Requests:
     # Waiting for the map, the model and poses
 
     async def inputs(self) -> PlanInputs:
-        """Wait for the map, ready to plan on, and for the planner."""
+        """Wait for the map, ready to plan on, and for the model."""
         header = await self._wait_for(self.map.check)
-        ready = self.map.ready()
+        ready = self.map.ready()  # the worker prepares the map meanwhile
         await self.model.wait_until_loaded()
         planner = self.model.planner
         if planner is None:
@@ -236,14 +250,24 @@ class Requests:
     async def in_map(
         self, inputs: PlanInputs, name: str, stamped: PoseStamped
     ) -> MapPose:
-        """Wait for the transform of a pose, which errors call by its name."""
+        """Return a pose in the map's frame, after a wait for its transform.
+
+        Parameters
+        ----------
+        inputs : PlanInputs
+        name : str
+            What errors call the pose. A pose with the name `THE_START` that is wrong is
+            an INVALID_START, any other an INVALID_GOAL.
+        stamped : PoseStamped
+            In any frame.
+        """
         frame: str = inputs.header.frame_id
         deadline = time.monotonic() + self.settings.transform_tolerance
         try:
-            to_map = partial(self.places.to_map, name, stamped, frame)
+            to_map = partial(self.poses.to_map, name, stamped, frame)
             pose = await self._wait_for(to_map, deadline)
             return MapPose(pose, cell_from_pose(name, pose, inputs.grid, frame))
-        except RequestError:
+        except RequestError:  # a ValueError with a status
             raise
         except ValueError as error:
             status = "INVALID_START" if name == THE_START else "INVALID_GOAL"
@@ -263,18 +287,18 @@ class Requests:
     ) -> MapPose:
         """Return the start of a query in the map, by default the robot's pose."""
         if start is None:
-            start = await self.robot_pose()
+            start = await self.robot()
         return await self.in_map(inputs, THE_START, start)
 
-    async def robot_pose(self) -> PoseStamped:
-        """Wait for the pose of the robot, in its own frame."""
-        return await self._wait_for(self.places.start)
+    async def robot(self) -> PoseStamped:
+        """Wait for the pose of the robot, in the frame of its source."""
+        return await self._wait_for(self.poses.robot)
 
     async def _wait_for(self, get: Callable[[], T], deadline: float = 0.0) -> T:
-        """Return a function's result as soon as it raises no RequestError.
+        """Return the result of `get` as soon as it raises no `RequestError`.
 
-        Errors of which it is said that their remedy `may_come` are waited out, and
-        others until the deadline.
+        The error is raised when what is missing no longer `may_come` and the deadline,
+        in seconds of the steady clock, has passed.
         """
         while True:
             try:
@@ -282,25 +306,30 @@ class Requests:
             except RequestError as error:
                 if not error.may_come and time.monotonic() >= deadline:
                     raise
-            self.look_soon()
-            await self.next_look
+            self.check_soon()
+            await self.next_wake
 
 
 def check_query(query: PathQuery, own_id: str) -> None:
-    """Raise a RequestError if a query has no goal, or names another planner."""
+    """Raise a RequestError if a query has no goal, or names another planner.
+
+    ``own_id`` is the parameter ``planner_id``.
+    """
     if not query.goals:
         raise RequestError("NO_GOALS", "the request has no goal; give one or more")
     if query.planner_id not in ("", own_id):
         problem = f"there is no planner {query.planner_id!r}"
-        remedy = f"give {own_id!r} or '' as the planner_id, or set the parameter 'planner_id'"
+        remedy = (
+            f"give {own_id!r} or '' as the planner_id, "
+            "or set the parameter 'planner_id'"
+        )
         raise RequestError("INVALID_PLANNER", f"{problem}; {remedy}")
 
 
-def tolerance_of(query: PathQuery, settings: SimpleNamespace) -> float:
+def tolerance_of(query: PathQuery, settings: PlannerSettings) -> float:
     """Return the tolerance of a query in metres, by default the parameter's."""
     if query.tolerance is None:
-        default: float = settings.tolerance
-        return default
+        return settings.tolerance
     if not 0 <= query.tolerance < math.inf:
         problem = f"the tolerance is {query.tolerance}"
         remedy = "give metres, finite and 0 or more"
@@ -309,7 +338,10 @@ def tolerance_of(query: PathQuery, settings: SimpleNamespace) -> float:
 
 
 def goal_names(count: int, has_via_points: bool = False) -> list[str]:
-    """Return the names of a query's goals in errors."""
+    """Return what errors call the goals of a query, from the first to the last.
+
+    With via-points, all goals but the last are via-points.
+    """
     if has_via_points:
         return [*(f"via-point {number}" for number in range(1, count)), THE_GOAL]
     if count == 1:
@@ -317,16 +349,29 @@ def goal_names(count: int, has_via_points: bool = False) -> list[str]:
     return [f"goal {number}" for number in range(1, count + 1)]
 
 
+def missed_goal_in_words(
+    query: PathQuery, names: Sequence[str], number_of_legs: int
+) -> str:
+    """Return the goal to which the last of the planned legs has no path, in words."""
+    name = names[number_of_legs - 1]
+    if name == THE_GOAL:
+        return name
+    number_of_via_points = len(names) - 1
+    count = number_of_via_points if query.has_via_points else len(names)
+    return f"{name} of {count}"
+
+
 def request_to(
     inputs: PlanInputs,
-    settings: SimpleNamespace,
+    settings: PlannerSettings,
     start: MapPose,
     goals: Sequence[MapPose],
     tolerance: float,
 ) -> Request:
     """Return the planner's request for a path to the nearest of some goals.
 
-    Of several goals none moves: the tolerance, in metres, holds for a single goal.
+    The tolerance, in metres, says how far a single goal may move; one of several goals
+    does not move.
     """
     grid, planner = inputs.grid, inputs.planner
     if len(goals) > 1:
@@ -362,36 +407,42 @@ def next_request(request: Request, leg: Plan, goal: MapPose) -> Request:
     return request.after(leg, goal.cell)
 
 
-def clearing_radius(settings: SimpleNamespace, grid: GridMap) -> float:
+def clearing_radius(settings: PlannerSettings, grid: GridMap) -> float:
     """Return the start_clearing_radius in cells."""
-    metres: float = settings.start_clearing_radius
-    if metres < 0:
+    metres = settings.start_clearing_radius
+    if metres < 0:  # by default
         metres = max(settings.robot_radius, grid.resolution)
     return metres / grid.resolution
 
 
 def outcome_of(
     inputs: PlanInputs,
-    settings: SimpleNamespace,
+    settings: PlannerSettings,
     legs: Legs,
     stops: Sequence[MapPose],
 ) -> Outcome:
     """Return the outcome of the plans of some legs.
 
-    The stops are the start and then the goals, of which later ones may not be planned
-    for: all after the first goal without a path, or all if a plan leads to the nearest.
+    Parameters
+    ----------
+    inputs : PlanInputs
+    settings : PlannerSettings
+    legs : Legs
+        From stop to stop. Or one leg, from the start to the nearest of several goals.
+    stops : sequence of MapPose
+        The start, and then the goals. There may be fewer legs than goals.
     """
     request, plans = legs
     plan = plans[0] if len(plans) == 1 else joined(plans)
-    leg_start = stops[len(plans) - 1].message
-    goal = stops[len(plans) + reached(request, plan)].message
+    leg_starts = [stop.message for stop in stops[: len(plans)]]
+    possible_goals = stops[len(plans) :]  # of the last leg, or goals after its goal
+    goal = possible_goals[nearest_goal(request, plan)].message
     path = NO_PATH
     if len(plan.path):
-        passed_stops = [stop.message for stop in stops[: len(plans)]]
-        path = exact_path_through([*passed_stops, goal], plans, request)
+        path = exact_path_through([*leg_starts, goal], plans, request)
     return Outcome(
         plan.status.name,
-        reason_of(request, plan, leg_start, goal, settings.robot_radius, path),
+        reason_of(request, plan, leg_starts[-1], goal, settings.robot_radius, path),
         inputs.planner,
         request,
         plan,
@@ -405,14 +456,18 @@ def outcome_of(
 def with_partial_path(
     outcome: Outcome, legs: Legs, stops: Sequence[MapPose]
 ) -> Outcome:
-    """Return an outcome with the path of all legs but the last, which has none."""
+    """Return a failed outcome with the path of all legs before the leg that failed.
+
+    The outcome is the same if the first leg failed. The stops are the start and then
+    the goals.
+    """
     plans = legs.plans[:-1]
     if not plans:
         return outcome
     plan = joined(plans)
     passed_stops = [stop.message for stop in stops[: len(plans) + 1]]
     path = exact_path_through(passed_stops, plans, legs.request)
-    length = path.length or plan.length  # a body has no exact path
+    length = path.length or plan.length  # cells; a body has no exact path
     return replace(
         outcome,
         status=plan.status.name,
@@ -427,9 +482,13 @@ def with_partial_path(
 def exact_path_through(
     stops: Sequence[PoseStamped], plans: Sequence[Plan], request: Request
 ) -> ExactPath:
-    """Return a disc's path along plans, between exact stops; empty for a body."""
+    """Return the path of a disc along the plans of its legs; empty for a body.
+
+    It leads through the exact positions of the stops, of which there is one more than
+    there are plans. The request is for any of the legs.
+    """
     if isinstance(request, PoseRequest):
         return NO_PATH
     cells = [plan.path for plan in plans]
-    points = [pose_of(stop)[:2] for stop in stops]
+    points = [pose_of(stop)[:2] for stop in stops]  # (x, y) in metres
     return exact_path(cells, request.grid, request.move_rule, points)

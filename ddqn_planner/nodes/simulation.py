@@ -154,7 +154,7 @@ class Simulation:
         node = self._node
         move_rule = MoveRule(node.value("move_rule"))
         scenario = Scenario(map_in_frame.grid, start, goal, move_rule)
-        parameters = hyper_parameters(vars(node.settings()))
+        parameters = hyper_parameters(node.values())
         return TrainingRun(node.folder, [scenario], parameters, node.value("seed"))
 
     def stop(self) -> Answer:

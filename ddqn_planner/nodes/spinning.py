@@ -13,11 +13,10 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-from ddqn_planner.nodes.base_node import BaseNode
+from ddqn_planner.nodes.base_node import FAREWELL, BaseNode
 from ddqn_planner.nodes.declared import Parameters
 from ddqn_planner.nodes.help import print_help
 from ddqn_planner.nodes.overrides import wrong_argument
-from ddqn_planner.nodes.pending_requests import FAREWELL
 from ddqn_planner.nodes.stop_signal import Interrupted, StopSignal
 from ddqn_planner.output import unless_cut_off
 

@@ -8,7 +8,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
-# What happens on topics of a type that only one node should publish.
+# What happens if several nodes publish a topic of a type that one node should publish.
 EFFECTS_OF_SEVERAL_PUBLISHERS: dict[object, str] = {
     Odometry: "the robot's place may jump from one's to the other's",
     OccupancyGrid: "each message replaces the last one of the other",
@@ -36,18 +36,19 @@ def topic_problems(node: Node) -> Iterator[str]:
 
 
 def _problems_of(subscription: Subscription, node: Node) -> Iterator[str]:
+    """Yield a sentence for each problem of the publishers of a subscription's topic."""
     topic = subscription.topic_name
     misfits_by_publisher: list[tuple[str, list[Misfit]]] = []
     for publisher in node.get_publishers_info_by_topic(topic):
         name = f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
         misfits = _misfits(publisher.qos_profile, subscription.qos_profile)
         misfits_by_publisher.append((name, misfits))
-    received = [name for name, misfits in misfits_by_publisher if not misfits]
+    received_names = [name for name, misfits in misfits_by_publisher if not misfits]
     effect = EFFECTS_OF_SEVERAL_PUBLISHERS.get(subscription.msg_type)
-    if effect and len(received) > 1:
-        names = ", ".join(sorted(received))
+    if effect and len(received_names) > 1:
+        names = ", ".join(sorted(received_names))
         yield (
-            f"{topic} has {len(received)} publishers ({names}), so {effect}; let one "
+            f"{topic} has {len(received_names)} publishers ({names}), so {effect}; let one "
             "publish, or remap the others"
         )
     for name, misfits in misfits_by_publisher:
@@ -61,6 +62,7 @@ def _problems_of(subscription: Subscription, node: Node) -> Iterator[str]:
 
 
 def _misfits(offered: QoSProfile, requested: QoSProfile) -> list[Misfit]:
+    """Return why a subscription receives nothing of a publisher; empty if it does."""
     return [
         misfit
         for misfit in MISFITS
@@ -70,4 +72,5 @@ def _misfits(offered: QoSProfile, requested: QoSProfile) -> list[Misfit]:
 
 
 def _policy(quality: QoSProfile, name: str) -> str:
+    """Return the value of a policy as users write it, such as "best_effort"."""
     return str(getattr(quality, name).name).lower()

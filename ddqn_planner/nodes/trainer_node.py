@@ -113,7 +113,7 @@ class TrainerNode(LearningNode):
             as_path(new["output_folder"], "output_folder")
         if new.get("experience") and self._is_complete:
             Experience.load(new["experience"])
-        hyper_parameters(vars(self.settings()) | new)
+        hyper_parameters(self.values() | new)
 
     def _read_map_file(self) -> MapFile | None:
         """Use the map of the parameter ``map_file``; return the file, or None."""

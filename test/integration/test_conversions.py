@@ -3,6 +3,7 @@ import math
 import re
 import sys
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from types import SimpleNamespace
@@ -41,7 +42,8 @@ from ddqn_planner.nodes.conversions import (
 )
 from ddqn_planner.nodes.diagnostics import Diagnostics
 from ddqn_planner.nodes.outcome import RequestError
-from ddqn_planner.nodes.poses import CheckedTransforms, Frames, Places, transformed
+from ddqn_planner.nodes.parameters import PlannerSettings
+from ddqn_planner.nodes.poses import CheckedTransforms, Frames, Poses, transformed
 
 HEADER = Header(frame_id="map")
 
@@ -352,12 +354,22 @@ NOW = 111  # seconds of the node's clock
 
 
 def new_node(source: str = "tf") -> Mock:
-    """Return what `Places` and `Diagnostics` ask of a node."""
-    values = {"start_source": source, "robot_frame": "odom", "transform_tolerance": 5.0}
-    node = Mock(jump_back_callbacks=[], value=values.__getitem__)
+    """Return what `Poses` and `Diagnostics` ask of a node."""
+    node = Mock(jump_back_callbacks=[])
+    node.settings.start_source = source
     node.create_subscription = lambda _, topic, *__: SimpleNamespace(topic_name=topic)
     node.get_clock().now.return_value = Time(seconds=NOW, clock_type=ClockType.ROS_TIME)
     return node
+
+
+def new_poses(node: Mock) -> Poses:
+    settings = replace(
+        PlannerSettings(),
+        start_source=node.settings.start_source,
+        robot_frame="odom",
+        transform_tolerance=5.0,
+    )
+    return Poses(node, Diagnostics(node), lambda: settings, lambda: "map", lambda: None)
 
 
 @pytest.fixture
@@ -368,7 +380,7 @@ def listening(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Frames]:
         tf2_ros = Mock(Buffer=lambda: Buffer(*seconds), TransformException=KeyError)
         tf2_ros.__spec__ = object  # it is installed
         monkeypatch.setitem(sys.modules, "tf2_ros", tf2_ros)
-        monkeypatch.setattr(Frames, "_read", lambda _: None)
+        monkeypatch.setattr(Frames, "_receive_transforms", lambda _: None)
         return Frames(new_node(), lambda: 20.0)
 
     return make
@@ -417,14 +429,14 @@ def test_a_newest_transform_beyond_the_tolerance_is_not_used(listening: Any) -> 
     for stamp, words in (late | dict.fromkeys((NOW - 2, NOW + 2, 0), "")).items():
         listening(stamp)
         node = new_node()
-        places = Places(node, Diagnostics(node), lambda: "map", lambda: None)
-        goal_in_map = partial(places.to_map, "the goal", pose_at(0), "map")
+        poses = new_poses(node)
+        goal_in_map = partial(poses.to_map, "the goal", pose_at(0), "map")
         if words:
             why = f"(the newest is {words}, more than transform_tolerance, 5 s)"
-            assert f"'odom' to 'map' {why}" in refusal("NO_START", places.start)
+            assert f"'odom' to 'map' {why}" in refusal("NO_START", poses.robot)
             assert why in refusal("TF_ERROR", goal_in_map)
         else:
-            assert places.start().pose.position.x == 1.0
+            assert poses.robot().pose.position.x == 1.0
             assert goal_in_map().header.stamp.sec == stamp
 
 
@@ -433,7 +445,7 @@ def test_transforms_from_before_the_clock_jumped_back_are_forgotten(
 ) -> None:
     frames = listening(100)
     assert frames.origin_of("odom", "map").pose.position.x == 1.0
-    frames.began -= 60
+    frames.listening_since -= 60
     for forget in frames._node.jump_back_callbacks:  # as the node does
         forget()
     with pytest.raises(ValueError, match="does not exist"):
@@ -445,14 +457,14 @@ def test_transforms_from_before_the_clock_jumped_back_are_forgotten(
 
 def test_a_set_start_outlives_time_and_a_jump_of_the_clock() -> None:
     node, pose = new_node("initialpose"), pose_at(NOW, "map")
-    places = Places(node, Diagnostics(node), lambda: "map", lambda: None)
-    places._take(pose)
+    poses = new_poses(node)
+    poses.receive(pose)
     for forget in node.jump_back_callbacks:
         forget()
     node.get_clock().now.return_value = Time(
         seconds=2 * NOW, clock_type=ClockType.ROS_TIME
     )
-    assert places.start() is pose
+    assert poses.robot() is pose
 
 
 def test_other_frames_are_refused_without_tf_and_the_remedy_names_it(

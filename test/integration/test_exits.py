@@ -134,7 +134,7 @@ def wait(node):
     print("a callback waits", flush=True)
     lock.acquire()
 
-PlannerNode._on_look = wait
+PlannerNode._on_check_timer = wait
 """
 
 

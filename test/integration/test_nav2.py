@@ -34,16 +34,16 @@ from std_msgs.msg import Header
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes import nav2
+from ddqn_planner.nodes.base_node import unless_refused
 from ddqn_planner.nodes.nav2 import (
     PREEMPTED,
     NavigationServer,
     PathAction,
     error_code,
-    poses_of,
+    goal_poses,
 )
 from ddqn_planner.nodes.other_planners import GivenUp
 from ddqn_planner.nodes.outcome import NOT_ACTIVE, Outcome, PathQuery, RequestError
-from ddqn_planner.nodes.pending_requests import unless
 from ddqn_planner.nodes.planner_node import PlannerNode
 from ddqn_planner.nodes.quality import SERVICE_QUALITY
 from ddqn_planner.nodes.requests import check_query
@@ -189,7 +189,7 @@ class Server:
         async def planning() -> Any:
             return await self.planned
 
-        return PathMessage(), await unless(
+        return PathMessage(), await unless_refused(
             planning(), lambda: self.refusal or given_up()
         )
 
@@ -294,7 +294,7 @@ def test_goals_without_a_frame_have_that_of_their_list() -> None:
     server.begin(handle).close()
     ((_, goals),) = server.asked
     assert goals == [own, PoseStamped(header=header, pose=none.pose)]
-    assert poses_of(Goals(header=header, goals=[])) == []
+    assert goal_poses(Goals(header=header, goals=[])) == []
 
 
 def test_a_path_leads_through_via_points_to_its_goal() -> None:
@@ -359,7 +359,7 @@ class Other:
         async def answering() -> Any:
             return await self.answer
 
-        return await unless(answering(), given_up)
+        return await unless_refused(answering(), given_up)
 
 
 @pytest.mark.parametrize(

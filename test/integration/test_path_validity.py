@@ -62,7 +62,7 @@ class Asked:
         self.node._map.take(map_message(values, GRID, next(NUMBERS)))
 
     def stand(self, stamped: PoseStamped) -> None:
-        self.node._places._take(stamped)
+        self.node._poses.receive(stamped)
 
     def get_plan(self, start: PoseStamped, goal: PoseStamped, **fields: Any) -> Path:
         request = GetPlan.Request(start=start, goal=goal, **fields)
@@ -116,7 +116,7 @@ def test_each_release_gets_the_fields_that_it_has(asked: Asked, release: str) ->
         assert asked.check(path, release, max_cost=150).invalid_pose_indices == [20]
         unknown = asked.check(path, release, consider_unknown_as_obstacle=True)
         assert unknown.invalid_pose_indices == [21]
-    asked.node._places._pose = None
+    asked.node._poses._last_pose = None
 
 
 def test_newer_requests_name_all_poses_a_footprint_and_a_distance(asked: Asked) -> None:

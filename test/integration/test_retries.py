@@ -22,12 +22,11 @@ from rclpy.utilities import try_shutdown
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import GridMap
-from ddqn_planner.nodes.arrivals import Arrivals
+from ddqn_planner.nodes.base_node import FAREWELL
 from ddqn_planner.nodes.nav2 import CANCELED
 from ddqn_planner.nodes.outcome import NOT_ACTIVE, STOPPING, Outcome, PathQuery
-from ddqn_planner.nodes.pending_requests import FAREWELL
 from ddqn_planner.nodes.planner_node import IDLE_PERIOD, PlannerNode
-from ddqn_planner.nodes.retries import Retries
+from ddqn_planner.nodes.retries import Arrivals, Retries
 from ddqn_planner.planning import Plan, PlanRequest, PlanStatus
 
 CLEARS = 8
