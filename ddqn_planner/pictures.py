@@ -1,9 +1,11 @@
-"""Plans to look at: as text, in a terminal's colours, and as a picture file. No ROS is needed."""
+"""Plans to look at: as text, and as a picture. No ROS is needed."""
+
+from __future__ import annotations
 
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,37 +14,58 @@ from ddqn_planner.files import as_path, write_atomically
 from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap
 from ddqn_planner.robot.footprint import placed
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 Array = NDArray[np.float64]
 
-OBSTACLE_COLOUR, PATH_COLOUR, DIRECTION_COLOUR = "#22223b", "#d1495b", "#6c757d"
-
+OBSTACLE_COLOUR = "#22223b"
+PATH_COLOUR = "#d1495b"
+DIRECTION_COLOUR = "#6c757d"
+# From the worst value to the best: light to dark, so that the order shows without
+# colours, too.
 VALUE_COLOURS = ("#f4f1de", "#cfe8dc", "#93cfc8", "#4fa3b5")
-"""From the worst value to the best: light to dark, so that the order shows without colours too."""
 
-SIGNS = ".>^<v#*SG"  # of a map as text: where one has to stand for several, it is the last of them
+# The signs of cells in a text. One for several cells is the last of their signs here.
+SIGNS = ".>^<v#*SG"
 MAX_TEXT_WIDTH = 64  # signs in a row, two characters for each
 # Cells of the longest side of a map with lines between its cells.
 MAX_SIDE_WITH_LINES = 64
 MAX_ARROWS = 48  # arrows of one-way zones along the longest side of a map
 OUTLINES = 30  # of a body along its path
-ONE_WAY = 1e-9  # the mean direction of a cell that is not one-way is shorter
+# The mean direction of a cell that is not one-way is shorter: 0, except for rounding.
+SHORTEST_DIRECTION = 1e-9
+
+
+class BodyPicture(NamedTuple):
+    """A body that moves along poses; all lengths are in cells, all yaws in radians."""
+
+    footprint: Array  # (K, 2): its corners (x, y), for a robot at (0, 0) that faces +x
+    poses: Array  # (N, 3): (x, y, yaw) along the path; none without a path
+    ends: Array  # (2, 3): where it starts, and where it has to arrive
 
 
 def draw_text(grid: GridMap, cells: Sequence[Cell]) -> str:
-    """Return the map as text, y upwards: # occupied, . or an arrow free, * path, S and G ends."""
-    shown = np.where(grid.occupancy, SIGNS.index("#"), 0)
+    """Return the map as text, y upwards: a sign per cell, or per square of cells.
+
+    # is occupied, . free, and an arrow a one-way zone; * is the path, from S to G.
+    """
+    signs = np.full(grid.occupancy.shape, SIGNS.index("."))  # indices in SIGNS
     if grid.forbidden is not None:
         x, y = _mean_directions(grid.forbidden)
-        quarter = np.rint(np.arctan2(y, x) / (np.pi / 2)).astype(np.int64) % 4
-        in_zone = ~grid.occupancy & (np.hypot(x, y) > ONE_WAY)
-        shown[in_zone] = quarter[in_zone] + 1
-    for sign, places in (("*", cells), ("S", cells[:1]), ("G", cells[-1:])):
-        for x, y in places:
-            shown[y, x] = SIGNS.index(sign)
-    side = -(-grid.width // MAX_TEXT_WIDTH)  # cells
-    for axis, size in enumerate(shown.shape):
-        shown = np.maximum.reduceat(shown, range(0, size, side), axis)
-    return "\n".join(" ".join(SIGNS[sign] for sign in row) for row in shown[::-1])
+        # 0 to 3: the quarter turns from +x to the direction, as the arrows > ^ < v.
+        quarters = np.rint(np.arctan2(y, x) / (np.pi / 2)).astype(np.int64) % 4
+        is_one_way = np.hypot(x, y) > SHORTEST_DIRECTION
+        signs[is_one_way] = SIGNS.index(">") + quarters[is_one_way]
+    signs[grid.occupancy] = SIGNS.index("#")
+    for sign, marked_cells in (("*", cells), ("S", cells[:1]), ("G", cells[-1:])):
+        for x, y in marked_cells:
+            signs[y, x] = SIGNS.index(sign)
+    side = _ceil_divide(grid.width, MAX_TEXT_WIDTH)  # of the squares, in cells
+    signs = np.maximum.reduceat(signs, range(0, grid.height, side), axis=0)
+    signs = np.maximum.reduceat(signs, range(0, grid.width, side), axis=1)
+    upwards = signs[::-1]
+    return "\n".join(" ".join(SIGNS[sign] for sign in row) for row in upwards)
 
 
 def save_picture(
@@ -52,64 +75,52 @@ def save_picture(
     value: NDArray[np.float32] | None = None,
     title: str = "",
     value_label: str = "value: max Q(s, a)",
-    body: tuple[Array, Array, Array] | None = None,  # see `draw_body`
+    body: BodyPicture | None = None,
 ) -> None:
-    """Draw the map, the value where it is finite, and the path or the body along it into a file.
+    """Save a picture of a map with a path of cells, or with a body along its poses.
 
-    The ending of its name says in which format. A ValueError lists the formats.
+    Parameters
+    ----------
+    path
+        The file. Its ending says in which format; a ValueError lists the formats.
+    value
+        (H, W): a colour per cell, where the value is finite.
+    value_label
+        What the colours show.
     """
-    from matplotlib.colors import LinearSegmentedColormap
     from matplotlib.figure import Figure
-    from matplotlib.patheffects import withStroke
     from matplotlib.ticker import MaxNLocator
 
     file = as_path(path)
-    picture_format(file)  # before the work
-    tall = min(max(grid.height / grid.width, 0.4), 1.0)
-    figure = Figure(figsize=(7.2, 1.5 + 5.1 * tall), dpi=120, layout="constrained")
+    ending = picture_format(file)  # an error comes before the work
+    aspect = min(max(grid.height / grid.width, 0.4), 1.0)
+    figure = Figure(figsize=(7.2, 1.5 + 5.1 * aspect), dpi=120, layout="constrained")
     axes = figure.subplots()
     axes.set(facecolor="white", xlabel="x [cells]", ylabel="y [cells]", aspect="equal")
     axes.set_title(title, loc="left", fontsize=12)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(integer=True))
     if value is not None:
-        finite = np.where(np.isfinite(value), value, np.nan)
-        colours = LinearSegmentedColormap.from_list("value", VALUE_COLOURS)
-        image = axes.imshow(
-            finite, origin="lower", cmap=colours, interpolation="nearest"
-        )
-        bar = axes.inset_axes((1.02, 0, 0.035, 1))  # as high as the map
-        figure.colorbar(image, bar, label=value_label)
+        _draw_value(axes, value, value_label)
     draw_obstacles(axes, grid)
     if body is not None:
         draw_body(axes, *body)
     elif cells:
-        x, y = np.transpose(cells)
-        outline = [withStroke(linewidth=5.5, foreground="white")]
-        axes.plot(
-            x, y, color=PATH_COLOUR, linewidth=3, path_effects=outline, label="path"
-        )
-        style: Any = {
-            "color": PATH_COLOUR,
-            "edgecolors": "white",
-            "linewidths": 1.5,
-            "zorder": 3,
-        }
-        for label, end, marker, size in (
-            ("start", 0, "o", 110),
-            ("goal", -1, "*", 300),
-        ):
-            axes.scatter(x[end], y[end], size, label=label, marker=marker, **style)
+        _draw_path(axes, cells)
     if cells or body is not None:
         figure.legend(loc="outside lower center", ncols=4, frameon=False)
     # In memory first, so that an old file stays complete, and no pipe is waited for.
     content = io.BytesIO()
-    figure.savefig(content, format=picture_format(file))
+    figure.savefig(content, format=ending)
     write_atomically(file, content.getvalue())
 
 
 def picture_format(path: Path, option: str = "the picture") -> str:
-    """Return the format of a picture by its file's name; a ValueError lists those there are."""
+    """Return the format of a picture, which is the ending of its file's name.
+
+    A ValueError lists the endings that matplotlib can write; it names the file by
+    `option`.
+    """
     from matplotlib.figure import Figure
 
     formats = sorted(Figure().canvas.get_supported_filetypes())
@@ -122,39 +133,72 @@ def picture_format(path: Path, option: str = "the picture") -> str:
     return ending
 
 
-def draw_body(axes: Any, footprint: Array, poses: Array, ends: Array) -> None:
-    """Draw what a body sweeps along poses (N, 3), in cells, and where it starts and ends."""
+def _draw_value(axes: Axes, value: NDArray[np.float32], label: str) -> None:
+    """Colour the cells that have a finite value (H, W), and add a labelled scale."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    finite = np.where(np.isfinite(value), value, np.nan)
+    colours = LinearSegmentedColormap.from_list("value", VALUE_COLOURS)
+    image = axes.imshow(finite, origin="lower", cmap=colours, interpolation="nearest")
+    scale = axes.inset_axes((1.02, 0, 0.035, 1))  # as high as the map
+    axes.get_figure().colorbar(image, scale, label=label)  # type: ignore[union-attr]
+
+
+def _draw_path(axes: Axes, cells: Sequence[Cell]) -> None:
+    """Draw a line through cells, and a marker at each end."""
+    from matplotlib.patheffects import withStroke
+
+    x, y = np.transpose(cells)
+    outline = [withStroke(linewidth=5.5, foreground="white")]
+    axes.plot(x, y, color=PATH_COLOUR, linewidth=3, path_effects=outline, label="path")
+    style: Any = {
+        "color": PATH_COLOUR,
+        "edgecolors": "white",
+        "linewidths": 1.5,
+        "zorder": 3,
+    }
+    axes.scatter(x[0], y[0], 110, label="start", marker="o", **style)
+    axes.scatter(x[-1], y[-1], 300, label="goal", marker="*", **style)
+
+
+def draw_body(axes: Axes, footprint: Array, poses: Array, ends: Array) -> None:
+    """Draw what a body sweeps, and the body at both ends; see `BodyPicture`."""
     from matplotlib.collections import PolyCollection
 
     if len(poses):
-        swept: Any = placed(footprint, poses)
+        swept: Any = placed(footprint, poses)  # (N, K, 2)
         axes.add_collection(
             PolyCollection(swept, facecolor=VALUE_COLOURS[1], label="swept")
         )
-        style: Any = {
-            "facecolor": VALUE_COLOURS[2],
-            "edgecolor": VALUE_COLOURS[3],
-            "alpha": 0.3,
-        }
-        axes.add_collection(
-            PolyCollection(swept[:: len(swept) // OUTLINES + 1], **style)
+        step = len(swept) // OUTLINES + 1
+        outlines = PolyCollection(
+            swept[::step],
+            facecolor=VALUE_COLOURS[2],
+            edgecolor=VALUE_COLOURS[3],
+            alpha=0.3,
         )
+        axes.add_collection(outlines)
         axes.plot(*poses.T[:2], color=PATH_COLOUR, linewidth=2, label="path")
-    (back, _), (front, left) = footprint.min(axis=0), footprint.max(axis=0)
-    behind = max(0.0, back)  # of an origin that the body lies ahead of
-    if front <= 0:  # or behind
-        behind = (front + back) / 2
-    nose = np.array([[front, 0], [behind, left / 2], [behind, -left / 2]])
-    for pose, label, colour in zip(
-        ends, ("start", "goal"), ("white", PATH_COLOUR), strict=True
-    ):
-        style = {"edgecolor": PATH_COLOUR, "zorder": 3}
-        axes.fill(*placed(footprint, pose).T, label=label, facecolor=colour, **style)
+    # A triangle from the robot's origin to the front of the body shows the heading. It
+    # begins at the back if all of the body lies ahead of the origin, and in the middle
+    # if all of it lies behind.
+    back, _ = footprint.min(axis=0)
+    front, left = footprint.max(axis=0)
+    base = max(0.0, back)
+    if front <= 0:
+        base = (front + back) / 2
+    nose = np.array([[front, 0], [base, left / 2], [base, -left / 2]])
+    colours = {"start": "white", "goal": PATH_COLOUR}
+    for pose, (label, colour) in zip(ends, colours.items(), strict=True):
+        outline = placed(footprint, pose)
+        axes.fill(
+            *outline.T, label=label, facecolor=colour, edgecolor=PATH_COLOUR, zorder=3
+        )
         axes.fill(*placed(nose, pose).T, facecolor=OBSTACLE_COLOUR, zorder=3)
 
 
-def draw_obstacles(axes: Any, grid: GridMap) -> None:
-    """Draw a map's occupied cells and one-way zones into matplotlib axes, and lines of cells."""
+def draw_obstacles(axes: Axes, grid: GridMap) -> None:
+    """Draw a map's occupied cells, lines between cells, and arrows in one-way zones."""
     from matplotlib.colors import ListedColormap
 
     occupied = np.where(grid.occupancy, 1.0, np.nan)
@@ -166,22 +210,45 @@ def draw_obstacles(axes: Any, grid: GridMap) -> None:
         axes.grid(which="minor", color="white", linewidth=0.8)
         axes.tick_params(which="minor", length=0)
     if grid.forbidden is not None:
-        step = -(-max(grid.width, grid.height) // MAX_ARROWS)
-        directions = _mean_directions(grid.forbidden)
-        shown = (np.hypot(*directions) > ONE_WAY) & ~grid.occupancy
-        y, x = np.nonzero(shown[::step, ::step])
-        along = directions[:, y * step, x * step]
-        along *= 0.8 * step / np.hypot(*along)
-        style = {"pivot": "middle", "angles": "xy", "scale_units": "xy", "scale": 1}
-        axes.quiver(
-            x * step, y * step, *along, color=DIRECTION_COLOUR, width=0.002, **style
-        )
+        _draw_directions(axes, grid, grid.forbidden)
 
 
-def _mean_directions(forbidden: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Return (2, H, W) float64: the sum of the legal directions of each cell, x and y."""
-    legal = (forbidden >> np.arange(len(MOVES))[:, None, None] & 1) == 0
-    directions: NDArray[np.float64] = np.tensordot(
-        (MOVES / LENGTHS[:, None]).T, legal, 1
+def _draw_directions(axes: Axes, grid: GridMap, forbidden: NDArray[np.uint8]) -> None:
+    """Draw an arrow in each n-th row and column of the one-way zones."""
+    step = _ceil_divide(max(grid.width, grid.height), MAX_ARROWS)  # cells
+    directions = _mean_directions(forbidden)
+    is_one_way = (np.hypot(*directions) > SHORTEST_DIRECTION) & ~grid.occupancy
+    row, column = np.nonzero(is_one_way[::step, ::step])
+    y = row * step
+    x = column * step
+    arrows = directions[:, y, x]  # (2, arrows)
+    arrows *= 0.8 * step / np.hypot(*arrows)
+    axes.quiver(
+        x,
+        y,
+        *arrows,
+        color=DIRECTION_COLOUR,
+        width=0.002,
+        pivot="middle",
+        angles="xy",
+        scale_units="xy",
+        scale=1,
     )
+
+
+def _mean_directions(forbidden: NDArray[np.uint8]) -> Array:
+    """Return the sum of the unit vectors of each cell's legal moves: (2, H, W), x, y.
+
+    `forbidden` (H, W) has bit a set where move a is forbidden. The sum is 0 where all
+    moves are legal, or none.
+    """
+    action = np.arange(len(MOVES))[:, None, None]
+    is_legal = (forbidden >> action & 1) == 0  # (8, H, W)
+    unit_vectors = MOVES / LENGTHS[:, None]  # (8, 2)
+    directions: Array = np.tensordot(unit_vectors.T, is_legal, 1)
     return directions
+
+
+def _ceil_divide(size: int, parts: int) -> int:
+    """Return size / parts, rounded up."""
+    return -(-size // parts)

@@ -25,7 +25,7 @@ from scipy.sparse.csgraph import dijkstra
 from tables import table
 
 from ddqn_planner import GridMap, Planner, load_map
-from ddqn_planner.cli import file_of
+from ddqn_planner.commands.options import file_of
 from ddqn_planner.grid import MOVES, Cell, MoveRule
 from ddqn_planner.model import ModelMetadata, RobotNetwork, package_version
 from ddqn_planner.planning.plan import PosePlan

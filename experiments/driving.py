@@ -33,7 +33,8 @@ from tables import table, write_report
 from trainings import in_parallel, make_folder, parser_of
 
 from ddqn_planner import Experience, GridMap
-from ddqn_planner.cli import exit_code, file_of
+from ddqn_planner.cli import exit_code
+from ddqn_planner.commands.options import file_of
 from ddqn_planner.grid.noise import random_requests
 
 Options = argparse.Namespace

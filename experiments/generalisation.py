@@ -22,7 +22,8 @@ from tables import table
 from tqdm import tqdm
 
 from ddqn_planner import GridMap, MoveRule, Planner, QField
-from ddqn_planner.cli import exit_code, file_of
+from ddqn_planner.cli import exit_code
+from ddqn_planner.commands.options import file_of
 from ddqn_planner.grid import (
     MOVES,
     Cell,

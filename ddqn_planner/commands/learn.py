@@ -1,0 +1,151 @@
+"""``ddqn-planner learn``: learns from recorded drives how long places take."""
+
+from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+from ddqn_planner.commands.options import Option, add_options, file_of, files_of
+from ddqn_planner.experience import Experience
+from ddqn_planner.experience.drives import EXPERIENCE, LOCK, RECORD, Drive
+from ddqn_planner.experience.recordings import read_recording
+from ddqn_planner.files import (
+    WorkFolder,
+    check_distinct,
+    check_writable,
+    differences,
+    write_atomically,
+)
+from ddqn_planner.grid import GridMap, read_map_file
+from ddqn_planner.resources import find_map, with_remedy
+
+OPTIONS = (
+    Option(
+        "out",
+        Path,
+        None,
+        "by default experience.npz in the first folder, or beside the file",
+    ),
+    Option(
+        "experience",
+        Path,
+        None,
+        "older file that the drives add to; else all is learned anew",
+    ),
+    Option(
+        "nominal-speed",
+        float,
+        None,
+        "a first guess, m/s; by default 0.5, or --experience's",
+    ),
+    Option("robot-width", float, None, "metres; by default 0.5, or --experience's"),
+    Option(
+        "topic",
+        str,
+        "",
+        "MCAP: of poses or transforms, by default that with most of them",
+    ),
+    Option("frame", str, "map", "MCAP: the map's frame"),
+    Option("robot-frame", str, "", "MCAP: by default any that ends in base_link"),
+)
+
+
+def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
+    """Learn from all drives of the recordings, and write the experience; return 0."""
+    parser.add_argument(
+        "drives",
+        type=file_of,
+        nargs="+",
+        help="trainers' folders, bags, MCAP files, or CSV files with the columns "
+        "seconds, x, y",
+    )
+    parser.add_argument(
+        "--map", required=True, help="ROS map YAML, or name of a shipped map"
+    )
+    add_options(parser, *OPTIONS)
+    options = parser.parse_args(arguments)
+    first = options.drives[0]
+    out = options.out or (first if first.is_dir() else first.parent) / EXPERIENCE
+    check_writable(out, "--out")
+    map_file = read_map_file(find_map(options.map))
+    recordings = {f"the recording {path}": path for path in options.drives}
+    check_distinct({"--out": out}, {**recordings, **files_of(map_file)})
+    grid = map_file.grid()
+    experience = _experience_to_teach(options)
+    with ExitStack() as locked_folders:
+        drives = _read_drives(options, grid, locked_folders)
+        _teach(experience, drives, grid, out)
+        # Not `save`, which adds to an older file.
+        write_atomically(out, experience.to_bytes())
+    metres = sum(drive.metres for drive in drives)
+    minutes = sum(drive.seconds[-1] - drive.seconds[0] for drive in drives) / 60
+    print(f"{len(drives)} drives, {metres:.0f} m, {minutes:.1f} min")
+    print(f"speed in the open: {experience.learned_speed:.2f} m/s")
+    print(f"saved {out}")
+    return 0
+
+
+def _experience_to_teach(options: Namespace) -> Experience:
+    """Return the experience of ``--experience``, or a new one of the options."""
+    robot = {}
+    for name in ("nominal_speed", "robot_width"):
+        value = getattr(options, name)
+        if value is not None:
+            robot[name] = value
+    if not options.experience:
+        return Experience(**{"nominal_speed": 0.5, **robot})
+    experience = Experience.load(options.experience)
+    changed = differences(experience.options, robot)
+    if changed:
+        raise ValueError(f"{options.experience} has {changed}; leave those options out")
+    return experience
+
+
+def _read_drives(
+    options: Namespace, grid: GridMap, locked_folders: ExitStack
+) -> list[Drive]:
+    """Return the drives of all recordings.
+
+    `locked_folders` keeps the folder of a trainer node locked: no node may record there
+    meanwhile.
+    """
+    drives: list[Drive] = []
+    for path in options.drives:
+        if (path / RECORD).is_file():
+            folder = WorkFolder(path, [LOCK, RECORD], "drives", "records")
+            locked_folders.enter_context(folder)
+        recording = read_recording(
+            path,
+            grid,
+            topic=options.topic,
+            frame=options.frame,
+            robot_frame=options.robot_frame,
+        )
+        print(f"{path}: {recording.source}")
+        drives += recording.drives
+    return drives
+
+
+def _teach(
+    experience: Experience, drives: Sequence[Drive], grid: GridMap, out: Path
+) -> None:
+    """Teach an experience drives on a map, and train its prior.
+
+    A ValueError if it could learn from none of them: the file `out` stays as it is.
+    """
+    reasons = []
+    for number, drive in enumerate(drives, 1):
+        learned = drive.teach(experience, grid)
+        if not learned:
+            reasons.append(learned.reason)
+            print(f"drive {number} taught nothing: {learned.reason}")
+    if len(reasons) == len(drives):
+        raise ValueError(
+            f"no drive taught anything, and {out} is as before; {reasons[0]}"
+        )
+    try:
+        from ddqn_planner.training.prior_training import prior_of  # needs torch
+    except ImportError as error:
+        print(f"the map's prior is not trained: {with_remedy(error)}")
+        return
+    experience.prior = prior_of(grid, experience.evidence.places, experience.prior)

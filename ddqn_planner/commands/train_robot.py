@@ -1,0 +1,74 @@
+"""``ddqn-planner train-robot``: trains the model of a robot's body and motions."""
+
+import sys
+from argparse import ArgumentParser
+from collections.abc import Sequence
+from pathlib import Path
+
+from tqdm import tqdm
+
+from ddqn_planner.commands.options import Option, add_options
+from ddqn_planner.files import as_path, check_distinct, check_writable
+from ddqn_planner.grid.arguments import as_whole
+from ddqn_planner.model import save_model
+from ddqn_planner.training.robot import MOST_STEPS, ROBOT, RobotTrainer
+
+OPTIONS = (
+    Option(
+        "footprint",
+        str,
+        None,
+        "'[[x, y], ...]', metres, or a radius, as in Nav2's costmaps",
+    ),
+    Option(
+        "padding",
+        float,
+        0.0,
+        "metres by which the body counts as larger: room for a controller",
+    ),
+    Option("motion", str, None, "differential, ackermann or omnidirectional"),
+    Option("turning-radius", float, 0.0, "of its bends, metres; ackermann needs it"),
+    Option("resolution", float, 0.05, "of the maps, metres per cell"),
+    Option(
+        "lattice",
+        Path,
+        None,
+        "a file of Nav2's lattice generator, instead of these three",
+    ),
+    Option("out", Path, "my_robot.safetensors", "the model's file"),
+    Option("seed", int, 0, "seed of the training"),
+    Option("steps", int, ROBOT.steps, "transitions after which to give up"),
+)
+
+
+def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
+    """Train until the body is proved, and save the model; return 1 without a proof."""
+    add_options(parser, *OPTIONS)
+    options = parser.parse_args(arguments)
+    as_whole("--steps", options.steps, 1, MOST_STEPS)
+    out = as_path(options.out, "--out")
+    check_writable(out, "--out")
+    check_distinct({"--out": out}, {"--lattice": options.lattice})
+    trainer = RobotTrainer(
+        options.footprint,
+        options.motion,
+        options.turning_radius,
+        options.resolution,
+        options.lattice,
+        options.seed,
+        options.padding,
+    )
+    # disable=None: no bar if the output is not a terminal.
+    with tqdm(total=options.steps, disable=None) as bar:
+        for certificate in trainer.run(options.steps):
+            bar.update(trainer.steps - bar.n)
+            bar.set_postfix(
+                weak=certificate.weak, forbidden=certificate.forbidden, refresh=False
+            )
+    print(f"{trainer.steps:,} transitions: {certificate}")
+    if not certificate.proved:
+        remedy = "give more --steps, or another --seed or --resolution"
+        print(f"not saved; {remedy}", file=sys.stderr)
+        return 1
+    save_model(out, trainer.network, trainer.metadata())
+    return 0
