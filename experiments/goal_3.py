@@ -38,7 +38,7 @@ from ddqn_planner.training.compiled_learner import (
     adam,
     differentiate,
     evaluate,
-    look,
+    evaluate_common_windows,
     networks_of,
 )
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
@@ -120,7 +120,7 @@ def train_supervised(training: Training) -> None:
     steps = training.parameters.steps
     for number in range(steps):
         drawn = random.integers(len(cell), size=SUPERVISED_BATCH)
-        look(network, windows)
+        evaluate_common_windows(network, windows)
         evaluate(network, windows, scenario[drawn], cell[drawn])
         # -log of the probability that softmax(Q) gives to the best moves, and its gradient by Q
         best_BA = best_SCA[scenario[drawn], cell[drawn]]

@@ -13,12 +13,16 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from ddqn_planner.cli import file_of
+from ddqn_planner.commands.options import file_of
 from ddqn_planner.files import write_atomically, write_csv
 from ddqn_planner.grid import LENGTHS, neighbours
 from ddqn_planner.model import PaperQNetwork
 from ddqn_planner.planning import Planner
-from ddqn_planner.training.compiled_learner import evaluate, look, networks_of
+from ddqn_planner.training.compiled_learner import (
+    evaluate,
+    evaluate_common_windows,
+    networks_of,
+)
 from ddqn_planner.training.environment import (
     GridVectorEnvironment,
     Scenario,
@@ -275,7 +279,7 @@ def rollouts(
     exact: Any = background.astype(np.float64)
     tensors = {name: of_model.tensors[name] for name in of_model.shapes(of_model.sizes)}
     windows, (network,) = networks_of(exact, environment.shape, [tensors], len(maps))
-    look(network, windows)
+    evaluate_common_windows(network, windows)
     lengths = np.zeros((2, len(maps)))
     for length, is_masked in zip(lengths, (True, False), strict=True):
         cell, visited = environment.start.copy(), np.zeros(background.shape, np.bool_)

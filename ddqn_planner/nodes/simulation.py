@@ -161,14 +161,14 @@ class Simulation:
         """Stop the training, which saves."""
         if self._run is None or self._node.state != "training":
             return Answer(True, "no training was running")
-        self._run.asked.add("stop")  # which the worker looks at after each step
+        self._run.requests.add("stop")  # which the worker looks at after each step
         return Answer(True, "the training saves and stops, and ~/start continues it")
 
     def save(self) -> Answer:
         """Save after the current step."""
         if self._run is None or self._node.state != "training":
             return Answer(False, "no training is running; it was saved when it ended")
-        self._run.asked.add("save")
+        self._run.requests.add("save")
         return Answer(True, "saving after this step; ~/model_saved or an error follows")
 
     def _train(self, run: TrainingRun, map_in_frame: MapInFrame) -> None:
@@ -185,7 +185,7 @@ class Simulation:
                     if episode.number % node.value("episode_interval") == 0:
                         positions = centres(episode.cells, map_in_frame.grid)
                         executor.create_task(node.draw, map_in_frame.frame, positions)
-            end = "stopped" if "stop" in run.asked else "finished"
+            end = "stopped" if "stop" in run.requests else "finished"
         except Exception as error:  # the node must survive any error
             end = "failed"
             node.fail(

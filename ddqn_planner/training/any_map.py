@@ -11,8 +11,9 @@ from ddqn_planner.model.certificate import MOVE_RULES
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
-# Unlike the paper, every episode starts at a random free cell, a collision costs more than any
-# rollout on these maps, and the agent keeps exploring moves that it believes impossible.
+# Unlike the paper, every episode starts at a random free cell, a collision costs more
+# than any rollout on these maps, and the agent keeps exploring moves that it believes
+# impossible.
 ANY_MAP: Final = HyperParameters(
     network="any_map",
     reward="path_cost",
@@ -36,18 +37,23 @@ MAPS: Final = 512
 
 
 def random_scenarios(seed: int, maps: int = MAPS) -> list[Scenario]:
-    """Draw maps to train on, half for each move rule; a path joins start and goal."""
+    """Draw as many `maps` to train on, half for each move rule, with start and goal.
+
+    A path leads from each start to its goal.
+    """
     random = np.random.default_rng(as_seed(seed))
     scenarios = []
     for number in range(maps):
         rule = MOVE_RULES[number % len(MOVE_RULES)]
         # High fill rates show 3x3 patches that are rare otherwise.
         occupancy = random.random((10, 10)) < random.uniform(0.1, 0.6)
-        # All four are drawn each time: the draws belong to what one seed gives.
+        # A map has one of four kinds of costs. All four are drawn for each map: fewer
+        # draws would change all later maps of the seed.
         constant = np.full(occupancy.shape, random.integers(100), dtype=np.int8)
-        unknown = unknown_costs(occupancy, 0.3, random)
-        costs = (None, random_costs(occupancy, random), constant, unknown)
-        grid = GridMap(occupancy, cost=costs[random.integers(len(costs))])
+        partly_unknown = unknown_costs(occupancy, 0.3, random)
+        random_cost = random_costs(occupancy, random)
+        kinds = (None, random_cost, constant, partly_unknown)
+        grid = GridMap(occupancy, cost=kinds[random.integers(len(kinds))])
         ((start, goal),) = random_requests(occupancy, rule, 1, random)
         scenarios.append(Scenario(grid, start, goal, rule))
     return scenarios

@@ -49,30 +49,35 @@ WINDOWS_OF_A_CALL = 5_000
 
 
 class Windows(NamedTuple):
-    """The 3x3 windows that the convolution sees on S maps, and of B states."""
+    """The 3x3 windows that the convolution sees on S maps, and in B states.
 
-    common: Floats  # (L, 9): without a robot, as most maps have it
-    by_map: Floats  # (S, L, 9): without a robot, as each map has it
-    # The windows of map 0 that are not the common ones, those of map 1, ...: the ones
-    # of map s lie from first_differing[s] to before first_differing[s + 1].
+    Window row * columns + column has its centre in the cell (2 * column, 2 * row). Its
+    9 cells are in the order of rows. A window of a map "differs", and a window of a
+    state is "changed", if its cells are not those of the common window of this number.
+    """
+
+    common: Floats  # (L, 9): the windows without a robot, as most maps have them
+    by_map: Floats  # (S, L, 9): the windows without a robot, of each map
+    # The numbers of the windows of map 0 that differ, then those of map 1, and so on.
+    # Map s has differing[first_differing[s] : first_differing[s + 1]].
     differing: Integers
     first_differing: Integers  # (S + 1,)
     shape: tuple[int, int]  # (H, W) of the maps
-    # The windows of each state that are not the common ones: those of state n lie from
-    # first_changed[n] to before first_changed[n + 1].
-    changed: Integers  # (B * D,): their numbers, 0 to L - 1
-    first_changed: Integers  # (B + 1,)
-    patch: Floats  # (B * D, 9): their cells
+    # The changed windows of state 0, then those of state 1, and so on. State n has the
+    # rows from first_changed[n] to before first_changed[n + 1] of these three arrays.
+    changed: Integers  # (B * D,): the number of the window, 0 to L - 1
+    patch: Floats  # (B * D, 9): the cells of the window
     convolved: Floats  # (B * D, F): before ReLU, by the network that was evaluated last
+    first_changed: Integers  # (B + 1,)
 
 
 class Network(NamedTuple):
-    """The weights of the paper's network, and what it computed last.
+    """The weights of the paper's network, and the results that it computed last.
 
-    The network of gradients has the gradients by these in their places.
+    A network of gradients holds in each array the gradient by that array.
     """
 
-    weights: Floats  # all weights that follow, up to `last_bias`, in a row
+    weights: Floats  # (all,): the memory of the six arrays that follow
     kernel: Floats  # (9, F)
     kernel_bias: Floats  # (F,)
     layer: Floats  # (F * L, U): the layer after the convolution
@@ -80,10 +85,12 @@ class Network(NamedTuple):
     last: Floats  # (U, 8); empty without a hidden layer: then U is 8
     last_bias: Floats  # (8,), or empty
     common_feature: Floats  # (L, F): convolution of the common windows, after ReLU
-    common_output: Floats  # (U,): of the layer after the convolution, for these
-    output: Floats  # (B, U): of this layer, for each state
+    common_output: Floats  # (U,): what `layer` makes of the common windows, before ReLU
+    output: Floats  # (B, U): what `layer` makes of the windows of each state
     q: Floats  # (B, 8); without a hidden layer, this is `output`
-    # 8 zeros where U is 8, else empty: a loop whose end is known is twice as fast.
+    # 8 zeros without a hidden layer, else empty. The length of a tuple belongs to its
+    # type, so that the compiler knows how long a loop over 8 outputs is: such a loop is
+    # twice as fast. See `output_count`.
     eight: tuple[int, ...]
 
 
@@ -162,13 +169,21 @@ def training_of(
 ) -> Training:
     """Return the arrays of a training, which share their memory with its objects.
 
-    `parts` are the tensors of θ, of θ⁻ and of Adam's two moments.
+    Parameters
+    ----------
+    parts
+        Four dictionaries of tensors by name: of θ, of θ⁻ and of Adam's two moments.
+        Their tensors are replaced by others that share the memory of the arrays.
+    environment, replay
+        The robots and the replay buffer that `play` changes.
+    next_q_of
+        Returns which Q of the next states the target uses, of that by θ and by θ⁻.
     """
     parameters = environment.parameters
-    slopes = {name: np.zeros_like(tensor) for name, tensor in parts[0].items()}
+    gradients = {name: np.zeros_like(tensor) for name, tensor in parts[0].items()}
     states = max(parameters.batch_size, parameters.environments)
     windows, networks = networks_of(
-        environment.background, environment.shape, [*parts, slopes], states
+        environment.background, environment.shape, [*parts, gradients], states
     )
     online, target, mean, square, gradient = networks
     learning = Learning(
@@ -200,6 +215,7 @@ def training_of(
 
 
 def _settings(parameters: HyperParameters) -> Settings:
+    """Return the hyper-parameters that compiled functions need."""
     return Settings(**{name: getattr(parameters, name) for name in Settings._fields})
 
 
@@ -209,14 +225,17 @@ def networks_of(
     parts: Sequence[dict[str, Floats]],
     states: int,
 ) -> tuple[Windows, list[Network]]:
-    """Return networks that evaluate up to so many states at once.
+    """Return the windows of S maps, and a network for each dictionary of tensors.
 
     Parameters
     ----------
     background_SC
         What the maps, of shape (H, W), show without a robot. All floats get its type.
     parts
-        The tensors of each network by name; they become parts of `Network.weights`.
+        The tensors of each network by name. Each tensor is replaced by one that shares
+        the memory of `Network.weights`.
+    states
+        How many states the networks can evaluate at once.
     """
     filters = len(parts[0]["convolution.bias"])
     windows = _windows_of(background_SC, shape, filters, states)
@@ -226,27 +245,38 @@ def networks_of(
 def _windows_of(
     background_SC: Floats, shape: tuple[int, int], filters: int, states: int
 ) -> Windows:
-    outside = np.pad(background_SC, [(0, 0), (0, 1)])  # cells outside a map are 0
-    by_map = outside[:, window_cells(shape)]  # (S, L, 9)
+    """Return the windows of the maps, with buffers for up to `states` states."""
+    # `window_cells` gives the number H * W to cells outside a map: they are 0.
+    padded = np.pad(background_SC, [(0, 0), (0, 1)])
+    # The memory is in the order of C for several maps as for one, by `take` and `copy`:
+    # all functions would be compiled again for another order.
+    by_map = np.take(padded, window_cells(shape), axis=1)  # (S, L, 9)
     common = np.sort(by_map, axis=0)[len(by_map) // 2]  # the median of each cell
-    scenario, differing = np.nonzero((by_map != common).any(axis=2))
+    is_different = (by_map != common).any(axis=2)  # (S, L)
+    scenario, differing = np.nonzero(is_different)
     first_differing = np.searchsorted(scenario, np.arange(len(by_map) + 1))
     # Four windows at most show the robot.
     changed_windows = states * (4 + int(np.diff(first_differing).max()))
     return Windows(
         common=common,
         by_map=by_map,
-        differing=differing,
+        differing=differing.copy(),
         first_differing=first_differing,
         shape=shape,
         changed=np.zeros(changed_windows, np.int64),
-        first_changed=np.zeros(states + 1, np.int64),
         patch=_zeros((changed_windows, 9), background_SC),
         convolved=_zeros((changed_windows, filters), background_SC),
+        first_changed=np.zeros(states + 1, np.int64),
     )
 
 
 def _network_of(tensors: dict[str, Floats], windows: Windows, states: int) -> Network:
+    """Return a network of weights, with buffers for up to `states` states.
+
+    The values of `tensors` are replaced by tensors that share the network's memory.
+    """
+    # Weights and biases of the convolution, of the layer after it, and with a hidden
+    # layer those of the last layer.
     arrays = [_inputs_first(tensor) for tensor in tensors.values()]
     has_hidden_layer = len(tensors) > 4
     if not has_hidden_layer:
@@ -281,52 +311,64 @@ def _network_of(tensors: dict[str, Floats], windows: Windows, states: int) -> Ne
 
 
 def _inputs_first(tensor: Floats) -> Floats:
-    """Return a tensor of weights as (inputs, outputs), or of biases as it is."""
+    """Return a tensor of weights as (inputs, outputs), or of biases as it is.
+
+    The weights of a convolution, (F, 1, 3, 3), become (9, F).
+    """
     is_convolution = tensor.ndim == 4
     weights: Floats = tensor.reshape(-1, 9).T if is_convolution else tensor.T
     return weights
 
 
 def _zeros(shape: tuple[int, ...], like: Floats) -> Floats:
-    """Return zeros of an array's type."""
+    """Return zeros of the type that the array `like` has."""
     return np.zeros(shape, like.dtype)
 
 
 @inner_in_place
-def put(values: Floats, array: Floats) -> None:
-    """Copy values into an array (N,)."""
+def copy_into(array: Floats, values: Floats) -> None:
+    """Copy the values (N,) into an array (N,)."""
     for n in range(array.size):
         array[n] = values[n]
 
 
 @inner_in_place
-def add(values: Floats, array: Floats) -> None:
-    """Add values to an array (N,)."""
+def add_to(array: Floats, values: Floats) -> None:
+    """Add the values (N,) to an array (N,)."""
     for n in range(array.size):
         array[n] += values[n]
 
 
 @inlined
 def relu(value: np.float32) -> np.float32:
-    """Return a value, or 0 if it is less."""
+    """Return the value if it is positive, else 0."""
     return max(value, np.float32(0))
 
 
+@inlined
+def output_count(network: Network) -> int:
+    """Return U, how many outputs the layer after the convolution has.
+
+    Without a hidden layer U is 8, and the compiler knows it, see `Network.eight`.
+    """
+    return len(network.eight) or network.common_output.size
+
+
 @inner_in_place
-def look(network: Network, windows: Windows) -> None:
-    """Compute what a network makes of the common windows, after its weights changed."""
+def evaluate_common_windows(network: Network, windows: Windows) -> None:
+    """Compute `common_feature` and `common_output` by the network's present weights."""
     feature = network.common_feature
     output = network.common_output
     window_count, filters = feature.shape
     convolve(network.kernel, network.kernel_bias, windows.common, window_count, feature)
-    put(network.layer_bias, output)
+    copy_into(output, network.layer_bias)
     for f in range(filters):
         for window in range(window_count):
             activation = relu(feature[window, f])
             feature[window, f] = activation
             if activation != 0:
                 row = f * window_count + window
-                for u in range(len(network.eight) or output.size):
+                for u in range(output_count(network)):
                     output[u] += activation * network.layer[row, u]
 
 
@@ -334,7 +376,10 @@ def look(network: Network, windows: Windows) -> None:
 def convolve(
     kernel: Floats, bias: Floats, patch: Floats, patch_count: int, convolved: Floats
 ) -> None:
-    """Compute the convolution of the first so many patches, before ReLU."""
+    """Compute `convolved` (P, F), before ReLU, of the first `patch_count` of P patches.
+
+    A patch (P, 9) is the 9 cells of a window.
+    """
     for row in range(patch_count):
         for f in range(bias.size):
             convolved[row, f] = bias[f]
@@ -349,8 +394,11 @@ def convolve(
 def evaluate(
     network: Network, windows: Windows, scenario: Integers, cell: Integers
 ) -> None:
-    """Compute Q, in `network.q`, of robots in cells (B,) of maps (B,)."""
-    see(windows, scenario, cell)
+    """Compute ``network.q`` of B states: a robot in `cell` (B,) on map `scenario` (B,).
+
+    The common windows must have been evaluated since the weights changed.
+    """
+    collect_changed_windows(windows, scenario, cell)
     changed_count = windows.first_changed[cell.size]
     convolve(
         network.kernel,
@@ -360,16 +408,17 @@ def evaluate(
         windows.convolved,
     )
     for n in range(cell.size):
-        put(network.common_output, network.output[n])
+        copy_into(network.output[n], network.common_output)
         for row in range(windows.first_changed[n], windows.first_changed[n + 1]):
             correct_output(network, windows, n, row)
-        if len(network.eight) == 0:
+        has_hidden_layer = len(network.eight) == 0
+        if has_hidden_layer:
             apply_last_layer(network, n)
 
 
 @inlined
 def correct_output(network: Network, windows: Windows, n: int, row: int) -> None:
-    """Add to the output for state n what a changed window's features differ by."""
+    """Add to the output of state n how a changed window, in this row, changes it."""
     window = windows.changed[row]
     window_count, filters = network.common_feature.shape
     output = network.output
@@ -384,14 +433,14 @@ def correct_output(network: Network, windows: Windows, n: int, row: int) -> None
         change = relu(windows.convolved[row, f]) - network.common_feature[window, f]
         if change != 0:
             weight_row = f * window_count + window
-            for u in range(len(network.eight) or network.common_output.size):
+            for u in range(output_count(network)):
                 output[n, u] += change * network.layer[weight_row, u]
 
 
 @inlined
 def apply_last_layer(network: Network, n: int) -> None:
     """Compute Q of state n from the output of the hidden layer before ReLU."""
-    put(network.last_bias, network.q[n])
+    copy_into(network.q[n], network.last_bias)
     for u in range(network.common_output.size):
         if network.output[n, u] > 0:  # most are not
             for action in range(8):
@@ -399,42 +448,72 @@ def apply_last_layer(network: Network, n: int) -> None:
 
 
 @inner_in_place
-def see(windows: Windows, scenario: Integers, cell: Integers) -> None:
-    """Cut out the changed windows of maps (B,) with robots in cells (B,)."""
-    changed = windows.changed
-    first_changed = windows.first_changed
-    height, width = windows.shape
-    end = 0
+def collect_changed_windows(
+    windows: Windows, scenario: Integers, cell: Integers
+) -> None:
+    """Write the changed windows of B states into `windows`.
+
+    State n is a robot in cell[n] on map scenario[n]. Its changed windows are those that
+    show the robot, and then those in which the map differs from most maps.
+    """
+    row_count = 0  # of the rows that have been written
     for n in range(cell.size):
-        y, x = divmod(cell[n], width)
-        # The window (row, column) has its centre in the cell (2 * column, 2 * row).
-        for row in range(y // 2, min((y + 1) // 2, (height - 1) // 2) + 1):
-            for column in range(x // 2, min((x + 1) // 2, (width - 1) // 2) + 1):
-                window = row * ((width + 1) // 2) + column
-                cut(windows, scenario[n], window, end)
-                robot = 3 * (y + 1 - 2 * row) + x + 1 - 2 * column
-                windows.patch[end, robot] = ROBOT
-                end += 1
-        end_with_robot = end
-        first = windows.first_differing[scenario[n]]
-        for index in range(first, windows.first_differing[scenario[n] + 1]):
-            window = windows.differing[index]
-            is_cut = False
-            for number in range(first_changed[n], end_with_robot):
-                is_cut |= changed[number] == window
-            if not is_cut:
-                cut(windows, scenario[n], window, end)
-                end += 1
-        first_changed[n + 1] = end
+        row_count = add_windows_of_robot(windows, scenario[n], cell[n], row_count)
+        row_count = add_windows_of_map(
+            windows, scenario[n], windows.first_changed[n], row_count
+        )
+        windows.first_changed[n + 1] = row_count
 
 
 @inlined
-def cut(windows: Windows, scenario: int, window: int, number: int) -> None:
-    """Make a map's window without a robot the changed window of this number."""
-    windows.changed[number] = window
+def add_windows_of_robot(
+    windows: Windows, scenario: int, cell: int, row_count: int
+) -> int:
+    """Write the windows that show a robot in a cell; return how many rows are written.
+
+    The windows overlap: up to two rows and two columns of them show one cell.
+    """
+    height, width = windows.shape
+    y, x = divmod(cell, width)
+    for row in range(y // 2, min((y + 1) // 2, (height - 1) // 2) + 1):
+        for column in range(x // 2, min((x + 1) // 2, (width - 1) // 2) + 1):
+            window = row * ((width + 1) // 2) + column
+            copy_window(windows, scenario, window, row_count)
+            y_in_window = y + 1 - 2 * row
+            x_in_window = x + 1 - 2 * column
+            windows.patch[row_count, 3 * y_in_window + x_in_window] = ROBOT
+            row_count += 1
+    return row_count
+
+
+@inlined
+def add_windows_of_map(
+    windows: Windows, scenario: int, first_row: int, row_count: int
+) -> int:
+    """Write the windows in which a map differs; return how many rows are written.
+
+    The rows from `first_row` on show the robot, and are not written a second time.
+    """
+    row_with_robot_end = row_count
+    first = windows.first_differing[scenario]
+    for index in range(first, windows.first_differing[scenario + 1]):
+        window = windows.differing[index]
+        is_written = False
+        for row in range(first_row, row_with_robot_end):
+            is_written |= windows.changed[row] == window
+        if not is_written:
+            copy_window(windows, scenario, window, row_count)
+            row_count += 1
+    return row_count
+
+
+@inlined
+def copy_window(windows: Windows, scenario: int, window: int, row: int) -> None:
+    """Make a map's window, without a robot, the changed window of this row."""
+    windows.changed[row] = window
     for position in range(9):  # a copy of a slice takes three times as long
         cell = windows.by_map[scenario, window, position]
-        windows.patch[number, position] = cell
+        windows.patch[row, position] = cell
 
 
 @compiled
@@ -443,25 +522,30 @@ def play(
     exploration: Generator,
     sampling: Generator,
     counters: Counters,
-    until: int,
+    last_step: int,
 ) -> Counters:
-    """Make steps until an episode ends, until step `until`, or for some milliseconds."""
+    """Make steps, and the updates due after them; return the new counters.
+
+    It ends when an episode ends, at step `last_step`, or after some milliseconds. The
+    generators `exploration` and `sampling` draw actions and batches.
+    """
     game, learning, robots = training
     settings = learning.settings
     steps, updates, replayed = counters
-    look(learning.online, learning.windows)
-    look(learning.target, learning.windows)
+    evaluate_common_windows(learning.online, learning.windows)
+    evaluate_common_windows(learning.target, learning.windows)
     robot_count = robots.cell.size
-    rounds = max(1, WINDOWS_OF_A_CALL // len(learning.online.common_feature))
-    until = min(until, steps + robot_count * rounds)
+    most_rounds = max(1, WINDOWS_OF_A_CALL // len(learning.online.common_feature))
+    last_step = min(last_step, steps + robot_count * most_rounds)
     has_ended = False
-    while steps < until and not has_ended:
+    while steps < last_step and not has_ended:
         choose_actions(learning, robots, exploration, steps)
         has_ended = move_robots(game, learning, robots, replayed)
         replayed += robot_count
-        intervals = steps // settings.update_interval
+        # An update is due for each multiple of the interval that the steps pass.
+        passed_multiples = steps // settings.update_interval
         steps += robot_count
-        updates_due = steps // settings.update_interval - intervals
+        updates_due = steps // settings.update_interval - passed_multiples
         if steps > settings.learning_starts:
             for _ in range(updates_due):
                 updates += 1
@@ -473,7 +557,10 @@ def play(
 def choose_actions(
     learning: Learning, robots: Robots, exploration: Generator, steps: int
 ) -> None:
-    """Choose the best action by the online network; with probability ε, any action."""
+    """Set each robot's action: with probability ε any, else the best by θ.
+
+    `steps` have been made in all; ε falls linearly with them.
+    """
     settings = learning.settings
     share = min(steps / settings.epsilon_steps, 1.0)
     epsilon = settings.epsilon_start + share * (
@@ -490,7 +577,11 @@ def choose_actions(
 
 @inner_in_place
 def move_robots(game: Game, learning: Learning, robots: Robots, replayed: int) -> bool:
-    """Move each robot once, remember the move, and return if an episode ended."""
+    """Move each robot by its action; return if an episode ended.
+
+    The transitions replace the oldest ones in the replay buffer, into which `replayed`
+    have been put so far.
+    """
     settings = learning.settings
     replay = learning.replay
     has_ended = False
@@ -525,29 +616,25 @@ def move_robots(game: Game, learning: Learning, robots: Robots, replayed: int) -
 def update(
     learning: Learning, sampling: Generator, updates: int, replayed: int
 ) -> None:
-    """Make the Double DQN update of this number, see `double_dqn_gradient`."""
+    """Change θ by Adam with the gradient of a batch, see `double_dqn_gradient`.
+
+    `updates` counts this update, too; `replayed` transitions have been put into the
+    replay buffer. Each `target_interval` updates θ⁻ becomes θ.
+    """
     settings = learning.settings
     windows = learning.windows
     online = learning.online
     target = learning.target
-    replay = learning.replay
     batch = learning.batch
     gradient = learning.gradient
     batch_size = batch.cell.size
-    for n in range(batch_size):
-        slot = sampling.integers(0, min(replayed, replay.cell.size))
-        batch.scenario[n] = replay.scenario[slot]
-        batch.cell[n] = replay.cell[slot]
-        batch.action[n] = replay.action[slot]
-        batch.next_cell[n] = replay.next_cell[slot]
-        batch.reward[n] = replay.reward[slot]
-        batch.discount[n] = replay.discount[slot]
+    draw_batch(learning, sampling, replayed)
     evaluate(online, windows, batch.scenario, batch.next_cell)
     evaluate(target, windows, batch.scenario, batch.next_cell)
     for n in range(batch_size):
         next_action = learning.next_q.selection[n].argmax()
         next_value = learning.next_q.evaluation[n, next_action]
-        # From here on the reward is y, the target of Q(s, a).
+        # The reward becomes y, the target of Q(s, a).
         batch.reward[n] += batch.discount[n] * next_value
     evaluate(online, windows, batch.scenario, batch.cell)
     gradient.q[:] = 0
@@ -564,33 +651,53 @@ def update(
         settings.learning_rate,
         updates,
     )
-    look(online, windows)
+    evaluate_common_windows(online, windows)
     if updates % settings.target_interval == 0:
-        put(online.weights, target.weights)
-        look(target, windows)
+        copy_into(target.weights, online.weights)
+        evaluate_common_windows(target, windows)
+
+
+@inner
+def draw_batch(learning: Learning, sampling: Generator, replayed: int) -> None:
+    """Draw the batch from the replay buffer, uniformly and with replacement.
+
+    `replayed` transitions have been put into the ring; the last ones are in it.
+    """
+    replay = learning.replay
+    batch = learning.batch
+    for n in range(batch.cell.size):
+        slot = sampling.integers(0, min(replayed, replay.cell.size))
+        batch.scenario[n] = replay.scenario[slot]
+        batch.cell[n] = replay.cell[slot]
+        batch.action[n] = replay.action[slot]
+        batch.next_cell[n] = replay.next_cell[slot]
+        batch.reward[n] = replay.reward[slot]
+        batch.discount[n] = replay.discount[slot]
 
 
 @inner_in_place
 def differentiate(
     network: Network, windows: Windows, gradient: Network, states: int
 ) -> None:
-    """Add the gradients by all weights to those in `gradient`.
+    """Add the gradient by all weights to the one in `gradient`: backpropagation.
 
-    The network evaluated these states last, and ``gradient.q`` is the gradient by their
-    Q. In `gradient`, the other results hold gradients too; ``windows.convolved`` gets
-    that by the convolution of the changed windows, where this was.
+    The network evaluated as many `states` last, and ``gradient.q`` is the gradient by
+    Q of these states. ``windows.convolved``, the convolution of the changed windows, is
+    overwritten by the gradient by it.
     """
     gradient.common_output[:] = 0
-    # By the convolution of the common windows before ReLU, unlike in a network.
+    # The gradient by the convolution of the common windows before ReLU, although a
+    # network has the features after ReLU in this place.
     gradient.common_feature[:] = 0
     for n in range(states):
-        if len(network.eight) == 0:
+        has_hidden_layer = len(network.eight) == 0
+        if has_hidden_layer:
             differentiate_last_layer(network, gradient, n)
-        add(gradient.output[n], gradient.common_output)
+        add_to(gradient.common_output, gradient.output[n])
         for row in range(windows.first_changed[n], windows.first_changed[n + 1]):
             differentiate_window(network, windows, gradient, n, row)
     differentiate_common_windows(network, gradient)
-    add(gradient.common_output, gradient.layer_bias)
+    add_to(gradient.layer_bias, gradient.common_output)
     add_kernel_gradient(
         gradient, windows.common, len(windows.common), gradient.common_feature
     )
@@ -600,8 +707,8 @@ def differentiate(
 
 @inlined
 def differentiate_last_layer(network: Network, gradient: Network, n: int) -> None:
-    """Compute the gradients by the last layer and by its input, of state n."""
-    add(gradient.q[n], gradient.last_bias)
+    """Add the gradient by the last layer of state n; set that by the hidden output."""
+    add_to(gradient.last_bias, gradient.q[n])
     for u in range(network.common_output.size):
         activation = relu(network.output[n, u])
         gradient.output[n, u] = 0
@@ -616,7 +723,10 @@ def differentiate_last_layer(network: Network, gradient: Network, n: int) -> Non
 def differentiate_window(
     network: Network, windows: Windows, gradient: Network, n: int, row: int
 ) -> None:
-    """Compute the gradients of what `correct_output` adds for a changed window."""
+    """Add the gradients of what `correct_output` adds to state n for a changed window.
+
+    ``windows.convolved[row]`` becomes the gradient by the convolution of the window.
+    """
     window = windows.changed[row]
     window_count, filters = network.common_feature.shape
     slopes = gradient.output
@@ -628,7 +738,7 @@ def differentiate_window(
         # Most features are 0, with the robot and without.
         if feature != 0 or change != 0:
             weight_row = f * window_count + window
-            for u in range(len(network.eight) or network.common_output.size):
+            for u in range(output_count(network)):
                 gradient.layer[weight_row, u] += change * slopes[n, u]
                 by_feature += network.layer[weight_row, u] * slopes[n, u]
             if common_feature > 0:
@@ -638,7 +748,7 @@ def differentiate_window(
 
 @inlined
 def differentiate_common_windows(network: Network, gradient: Network) -> None:
-    """Add the gradients of what the common windows give all states."""
+    """Add the gradients of the common output, a part of each state's output."""
     window_count, filters = network.common_feature.shape
     slopes = gradient.common_output
     for window in range(window_count):
@@ -646,7 +756,7 @@ def differentiate_common_windows(network: Network, gradient: Network) -> None:
             feature = network.common_feature[window, f]
             if feature > 0:
                 row = f * window_count + window
-                for u in range(len(network.eight) or network.common_output.size):
+                for u in range(output_count(network)):
                     gradient.layer[row, u] += feature * slopes[u]
                     by_feature = network.layer[row, u] * slopes[u]
                     gradient.common_feature[window, f] += by_feature
@@ -656,7 +766,10 @@ def differentiate_common_windows(network: Network, gradient: Network) -> None:
 def add_kernel_gradient(
     gradient: Network, patch: Floats, patch_count: int, by_convolved: Floats
 ) -> None:
-    """Add the gradients by kernel and bias, from that by the convolution of patches."""
+    """Add the gradient by the kernel and its bias, through the first patches (P, 9).
+
+    `by_convolved` (P, F) is the gradient by the convolution of the patches.
+    """
     filters = gradient.kernel_bias.size
     for row in range(patch_count):
         for f in range(filters):
@@ -677,12 +790,13 @@ def adam(
     learning_rate: float,
     updates: int,
 ) -> None:
-    """Take Adam's step of this number (Kingma and Ba 2015, with ε where torch has it).
+    """Change weights (N,) by Adam (Kingma and Ba 2015, with ε where torch has it).
 
-    The slopes, that is the gradient, are 0 afterwards.
+    `slopes` is the gradient, and 0 afterwards. `means` and `squares` are its moments.
+    `updates` is the number of this update, from 1 on.
     """
     step = np.float32(learning_rate / (1 - BETA_1**updates))
-    root = np.float32(1 / np.sqrt(1 - BETA_2**updates))
+    inverse_root = np.float32(1 / np.sqrt(1 - BETA_2**updates))
     share_of_mean = np.float32(1 - BETA_1)
     share_of_square = np.float32(1 - BETA_2)
     for n in range(weights.size):
@@ -694,5 +808,5 @@ def adam(
         mean = mean if abs(mean) > SMALLEST_MEAN else np.float32(0)
         means[n] = mean
         squares[n] += share_of_square * (slope * slope - squares[n])
-        weights[n] -= step * mean / (np.sqrt(squares[n]) * root + EPSILON)
+        weights[n] -= step * mean / (np.sqrt(squares[n]) * inverse_root + EPSILON)
         slopes[n] = 0

@@ -1,6 +1,7 @@
 """Double DQN: replay memory, and the gradient of the loss by Q.
 
-θ is the online network, θ⁻ the target network. Dimensions: B = a batch, A = 8 actions.
+θ is the online network, θ⁻ the target network.
+Dimensions: B = a batch, A = 8 actions.
 """
 
 from typing import NamedTuple, TypeAlias
@@ -14,7 +15,7 @@ Q: TypeAlias = NDArray[np.float32]
 class Transitions(NamedTuple):
     """B transitions; cells are numbers y * W + x on the scenario's map."""
 
-    scenario: NDArray[np.int64]  # (B,), as all others
+    scenario: NDArray[np.int64]  # (B,), as all others: the number of a map
     cell: NDArray[np.int64]
     action: NDArray[np.int64]
     reward: NDArray[np.float32]
@@ -54,15 +55,16 @@ class ReplayBuffer:
 
 
 class NextQ(NamedTuple):
-    """Q of the next states, which a target selects actions with and evaluates them with."""
+    """The two Q of the next states that a target uses."""
 
-    selection: Q  # (B, 8)
-    evaluation: Q  # (B, 8)
+    selection: Q  # (B, 8): its greatest value selects the next action
+    evaluation: Q  # (B, 8): its value of this action is that of the next state
 
 
 def next_q(target: str, online_BA: Q, target_BA: Q) -> NextQ:
-    """Return which Q of the next states a target uses, of that by θ and that by θ⁻.
+    """Return the Q of the next states that a target uses.
 
+    `online_BA` is Q of the next states by θ, and `target_BA` by θ⁻.
     Double DQN (van Hasselt et al. 2016, equation 4) selects the next action with θ and
     evaluates it with θ⁻. DQN (Mnih et al. 2015) does both with θ⁻.
     """

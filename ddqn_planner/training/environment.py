@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from numbers import Integral
+from types import EllipsisType
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -30,7 +31,7 @@ Observations = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Scenario:
-    """One path planning problem; a ValueError unless a path leads from its start to its goal."""
+    """A map with a start and a goal; a ValueError unless a path joins them."""
 
     grid: GridMap
     start: Cell
@@ -41,7 +42,7 @@ class Scenario:
         check_grid(self.grid)
         start = as_cell(self.start, "the start")
         goal = as_cell(self.goal, "the goal")
-        object.__setattr__(self, "start", start)  # as Python's dataclasses do
+        object.__setattr__(self, "start", start)  # as frozen dataclasses do it
         object.__setattr__(self, "goal", goal)
         object.__setattr__(self, "move_rule", MoveRule(self.move_rule))
         for name, cell in (("start", start), ("goal", goal)):
@@ -62,6 +63,7 @@ class Scenario:
             )
 
     def _leads_to_goal(self, move_rule: MoveRule) -> bool:
+        """Return if a path of moves that the rule allows joins start and goal."""
         reached = self.grid.reachable([self.start], move_rule)
         return bool(reached[self.goal[1], self.goal[0]])
 
@@ -77,15 +79,15 @@ def paper_scenario() -> Scenario:
 
 
 class Outcome(NamedTuple):
-    """What a move of N robots gave; (N,) each."""
+    """The result of a move of N robots; (N,) each."""
 
     reward: NDArray[np.float32]
-    terminated: NDArray[np.bool_]  # at the goal, or in a collision
-    truncated: NDArray[np.bool_]  # out of steps
+    terminated: NDArray[np.bool_]  # the robot arrived at its goal, or collided
+    truncated: NDArray[np.bool_]  # the robot has made its last step, elsewhere
 
 
-def _check_scenarios(scenarios: Any) -> None:
-    """Raise a ValueError for none, for other things, and for maps of several sizes."""
+def _check_scenarios(scenarios: Sequence[Scenario]) -> None:
+    """Raise a ValueError unless there are scenarios, all with maps of one size."""
     if not scenarios or not all(isinstance(item, Scenario) for item in scenarios):
         raise ValueError(f"the scenarios are {scenarios!r}; give at least one Scenario")
     shapes = {scenario.grid.occupancy.shape for scenario in scenarios}
@@ -98,14 +100,14 @@ def _check_scenarios(scenarios: Any) -> None:
 class GridVectorEnvironment:
     """N robots on maps of one size, moved in one step.
 
-    Each episode draws one of S scenarios. `reset` begins the first episodes, too. A
-    robot whose episode has ended makes no move until it is reset. Cells are numbers
+    Each episode draws one of S scenarios. `reset` begins the first episodes, too. No
+    robot moves while the episode of one has ended and is not reset. Cells are numbers
     y * W + x, C in all; the results of moves are looked up in tables.
 
     Attributes
     ----------
     background : (S, C) float32
-        What a network sees of each map without a robot.
+        What a network observes of each map without a robot.
     legal : (S, 8, C) bool
         Whether a move is legal.
     free_reward : (S, 8, C) float32
@@ -140,27 +142,8 @@ class GridVectorEnvironment:
         self.parameters = parameters
         self.random = random or np.random.default_rng()
 
-        height, width = self.shape
-        tables = (len(scenarios), len(MOVES), height * width)
-        self.background = np.stack(
-            [observation_background(s.grid.occupancy, s.goal) for s in scenarios]
-        )
-        legal = [s.grid.legal_moves(s.move_rule) for s in scenarios]
-        rewards = [move_reward(s.grid, s.start, s.goal, parameters) for s in scenarios]
-        self.legal = np.stack(legal).reshape(tables)
-        self.free_reward = np.stack(rewards).reshape(tables)
-        collision = np.float32(parameters.obstacle_reward)
-        self.rewards = np.where(self.legal, self.free_reward, collision)
-        self.next_cell = neighbours(self.shape)
-        number_of_x_y = np.array([1, width])
-        self.start = np.array([s.start for s in scenarios]) @ number_of_x_y
-        self.goal = np.array([s.goal for s in scenarios]) @ number_of_x_y
-        # The free cells of all maps in a row, and where those of each map begin.
-        is_free_SC = self.background == FREE  # goals are not
-        _, self._free_cells = np.nonzero(is_free_SC)
-        self._free_count = is_free_SC.sum(axis=1)
-        self._first_free = np.cumsum(self._free_count) - self._free_count
-
+        self._tabulate_moves()
+        self._list_cells()
         robots = parameters.environments
         self.scenario = np.zeros(robots, np.int64)
         self.cell = np.zeros(robots, np.int64)
@@ -170,8 +153,46 @@ class GridVectorEnvironment:
         self.terminated = np.zeros(robots, np.bool_)
         self.truncated = np.zeros(robots, np.bool_)
 
-    def reset(self, mask: Any = ...) -> None:
-        """Start new episodes: all, or those where `mask` (N,) is True."""
+    def _tabulate_moves(self) -> None:
+        """Set `legal`, `free_reward`, `rewards` and `next_cell`."""
+        legal = []
+        rewards = []
+        for scenario in self.scenarios:
+            grid = scenario.grid
+            legal.append(grid.legal_moves(scenario.move_rule))
+            rewards.append(
+                move_reward(grid, scenario.start, scenario.goal, self.parameters)
+            )
+        height, width = self.shape
+        shape_SAC = (len(self.scenarios), len(MOVES), height * width)
+        self.legal = np.stack(legal).reshape(shape_SAC)
+        self.free_reward = np.stack(rewards).reshape(shape_SAC)
+        collision = np.float32(self.parameters.obstacle_reward)
+        self.rewards = np.where(self.legal, self.free_reward, collision)
+        self.next_cell = neighbours(self.shape)
+
+    def _list_cells(self) -> None:
+        """Set `start`, `goal` and `background`, and list the free cells of all maps."""
+        _, width = self.shape
+        start_xy = np.array([scenario.start for scenario in self.scenarios])  # (S, 2)
+        goal_xy = np.array([scenario.goal for scenario in self.scenarios])
+        number_of_xy = np.array([1, width])
+        self.start = start_xy @ number_of_xy
+        self.goal = goal_xy @ number_of_xy
+        backgrounds = [
+            observation_background(scenario.grid.occupancy, scenario.goal)
+            for scenario in self.scenarios
+        ]
+        self.background = np.stack(backgrounds)
+        # The free cells of map 0, then those of map 1, and so on; and for each map, how
+        # many it has, and where they begin.
+        is_free_SC = self.background == FREE  # goals are not
+        _, self._free_cells = np.nonzero(is_free_SC)
+        self._free_count = is_free_SC.sum(axis=1)
+        self._first_free = np.cumsum(self._free_count) - self._free_count
+
+    def reset(self, mask: NDArray[np.bool_] | EllipsisType = ...) -> None:
+        """Start new episodes: of the robots where `mask` (N,) is True, else of all."""
         scenario = self.random.integers(len(self.start), size=len(self.cell[mask]))
         cell = initial_cells(
             self.start[scenario],
@@ -190,7 +211,10 @@ class GridVectorEnvironment:
         self.truncated[mask] = False
 
     def move(self, actions: NDArray[np.int64]) -> Outcome:
-        """Move each robot once, by the actions (N,)."""
+        """Move each robot once, by the actions (N,); a robot that collides stays.
+
+        The arrays of the result are overwritten by the next move.
+        """
         actions = numbers(
             "the actions", actions, self.cell.shape, "iu", (0, len(MOVES) - 1)
         )
@@ -211,14 +235,18 @@ class GridVectorEnvironment:
     def observe(
         self, scenario: NDArray[np.int64], cell: NDArray[np.int64]
     ) -> Observations:
-        """Return what robots in `cell` (B,) see of the maps `scenario` (B,): (B, H, W) float32."""
+        """Return the observations (B, H, W) of robots in cells (B,) of maps (B,)."""
         observations = self.background[scenario]
         observations[np.arange(len(cell)), cell] = ROBOT
         return observations.reshape(-1, *self.shape)
 
 
 class GridEnvironment(gymnasium.Env[Observations, np.int64]):
-    """``ddqn_planner.training.environment:ddqn_planner/Grid-v0``: by default, the paper's map."""
+    """One robot, by default on the paper's map.
+
+    Its name for `gymnasium.make` is
+    ``ddqn_planner.training.environment:ddqn_planner/Grid-v0``.
+    """
 
     metadata = {"render_modes": []}  # noqa: RUF012
 
@@ -242,7 +270,7 @@ class GridEnvironment(gymnasium.Env[Observations, np.int64]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode at the start or, with probability p_r, at a random free cell."""
+        """Start an episode, with probability p_r in a random cell, else at the start."""
         super().reset(seed=seed)
         self.vector.random = self.np_random
         self.vector.reset()
@@ -283,6 +311,7 @@ class GridEnvironment(gymnasium.Env[Observations, np.int64]):
         )
 
     def _observe(self) -> Observations:
+        """Return the observation (H, W) of the robot."""
         observation: Observations = self.vector.observe(
             self.vector.scenario, self.vector.cell
         )[0]

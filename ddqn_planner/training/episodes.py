@@ -12,7 +12,7 @@ from ddqn_planner.grid import Cell, path_length
 HEADER = (
     b"episode,step,scenario,outcome,moves,length,total_reward,average_reward,cells\r\n"
 )
-# A complete row: the number of the episode, and its cells.
+# A complete row. Its groups are the number of the episode, and its cells as "x:y x:y".
 ROW = re.compile(rb"(\d{1,18})(?:,[^,]*){7},(\d{1,9}:\d{1,9}(?: \d{1,9}:\d{1,9})*)\r\n")
 
 
@@ -29,10 +29,10 @@ class Episode(NamedTuple):
 
     number: int
     step: int  # environment steps of the training when it ended
-    scenario: int
+    scenario: int  # index of the map in the trainer's `scenarios`
     outcome: EpisodeEnd
-    cells: tuple[Cell, ...]  # in order, with the initial one
-    moves: int  # with an illegal last one
+    cells: tuple[Cell, ...]  # in order, from the initial one on
+    moves: int  # with the last one, if that was a collision
     total_reward: float
 
     @property
@@ -42,7 +42,11 @@ class Episode(NamedTuple):
 
 
 def open_record(path: Path, episodes: int) -> Appender:
-    """Open an ``episodes.csv`` to append to its first `episodes`; its later rows are dropped."""
+    """Open an ``episodes.csv`` to append to it; a missing file is made.
+
+    Only the rows of the episodes 1 to `episodes` stay: a checkpoint that is restored is
+    older than later rows.
+    """
     lines = [HEADER]
     if path.exists():
         rows = map(ROW.fullmatch, read_rows(path))
@@ -68,7 +72,10 @@ def record(episode: Episode) -> bytes:
 
 
 def read_cells(path: str | Path, every: int) -> Iterator[tuple[Cell, ...]]:
-    """Yield the cells of each `every`-th complete row; an OSError without a file."""
+    """Yield the cells of the episodes `every`, 2 * `every`, ... of an ``episodes.csv``.
+
+    Rows that are not complete are left out. An OSError without a file.
+    """
     for line in read_rows(as_path(path)):
         row = ROW.fullmatch(line)
         if row is None or int(row[1]) % every != 0:

@@ -11,10 +11,11 @@ from ddqn_planner.planning.segments import cost_along
 
 
 class Evaluation(NamedTuple):
-    """The greedy rollouts of one Q field, from all cells with a path; NaN if none is solved."""
+    """The greedy rollouts of one Q field from all cells with a path to the goal."""
 
-    starts: int
-    solved: int
+    starts: int  # how many cells have a path
+    solved: int  # from how many of them the rollout reaches the goal
+    # The cost of a solved rollout over that of the best path; NaN if none is solved.
     mean_ratio: float
     worst_ratio: float
 
@@ -22,8 +23,11 @@ class Evaluation(NamedTuple):
 def length_ratios(
     field: QField, grid: GridMap, move_rule: MoveRule
 ) -> NDArray[np.float64]:
-    """Return the cost of the greedy rollout from each cell over that of the best path: (H, W)."""
-    # Infinite where the rollout is trapped, NaN at the goal and in cells without a path.
+    """Return the cost of the greedy rollout from each cell over that of the best path.
+
+    (H, W): infinite where the rollout is trapped, NaN at the goal and in cells without
+    a path.
+    """
     optimum = shortest_distances(grid, field.goal, move_rule)
     ratios = np.full(optimum.shape, np.nan)
     for x, y in grid.free_cells():
@@ -38,7 +42,7 @@ def evaluate(field: QField, grid: GridMap, move_rule: MoveRule) -> Evaluation:
     """Summarise `length_ratios` of a field."""
     ratios = length_ratios(field, grid, move_rule)
     starts = int((~np.isnan(ratios)).sum())
-    solved = ratios[np.isfinite(ratios)]
+    solved = ratios[np.isfinite(ratios)]  # (solved,)
     if not len(solved):
         return Evaluation(starts, 0, np.nan, np.nan)
     return Evaluation(starts, len(solved), float(solved.mean()), float(solved.max()))

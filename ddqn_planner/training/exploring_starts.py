@@ -12,14 +12,17 @@ def initial_cells(
     p_r: float,
     random: np.random.Generator,
 ) -> NDArray[np.int64]:
-    """Draw where N episodes start: in random cells with probability p_r, else in `start_N`.
+    """Draw where N episodes start: in a random cell with probability p_r, or `start_N`.
 
     Parameters
     ----------
+    start_N
+        The start of each episode's map, as the number of a cell.
     free_cells
-        The free cells of all maps without the goals, those of each map in a row.
+        The numbers of all free cells except goals: first those of map 0, then those of
+        map 1, and so on.
     first_N, count_N
-        Where in `free_cells` those of each episode's map begin, and how many they are.
+        Where in `free_cells` the cells of each episode's map begin, and their count.
     """
     is_random_N = random.random(len(start_N)) < p_r
     random_cell_N = free_cells[first_N + random.integers(count_N)]

@@ -7,10 +7,12 @@ from ddqn_planner.grid.arguments import real
 
 
 def _number(default: Any, source: str, low: float, high: float) -> Any:
+    """Declare a number from `low` to `high`; `source` tells where `default` is from."""
     return field(default=default, metadata={"source": source, "range": (low, high)})
 
 
 def _choice(*choices: str, source: str) -> Any:
+    """Declare a text, one of `choices`; the first one is the default."""
     return field(default=choices[0], metadata={"source": source, "choices": choices})
 
 
@@ -18,7 +20,8 @@ def _choice(*choices: str, source: str) -> Any:
 class HyperParameters:
     """The paper's Table 1, and our values where it gives none."""
 
-    # p_r = 0 switches off improvement 1 (initialisation), alpha = beta = 0 improvement 2 (reward).
+    # p_r = 0 switches off improvement 1 (initialisation), alpha = beta = 0 switches off
+    # improvement 2 (reward).
     network: str = _choice(
         "paper", "propagation", "any_map", source="ours: the Q-network, see model/"
     )
@@ -85,6 +88,7 @@ class HyperParameters:
 
 
 def _check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
+    """Raise a ValueError unless the value of a parameter is one of its choices."""
     if not isinstance(value, str) or value not in choices:
         raise ValueError(f"{name} is {value!r}; give one of {', '.join(choices)}")
 
@@ -92,6 +96,10 @@ def _check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
 def _checked_number(
     name: str, value: object, limits: tuple[float, float], is_whole: bool
 ) -> float:
+    """Return the value of a parameter as a Python number, an int if `is_whole`.
+
+    A ValueError if it is no such number, or outside its limits.
+    """
     number = real(value)
     low, high = limits
     if isinstance(value, bool) or not low <= number <= high:

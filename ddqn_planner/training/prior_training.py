@@ -1,6 +1,6 @@
 """Trains the prior: a small network that predicts from the map how slow places are."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -41,18 +41,41 @@ MIN_SUM = 1e-9  # in place of a sum of 0 that divides
 def prior_of(
     grid: GridMap, places: Places, older: Prior | None, seed: int = 0
 ) -> Prior | None:
-    """Train a prior on the places that are free on a map; few change nothing."""
-    cells, inside = cells_of(places.position, grid)
+    """Train a prior on the places that were driven and are free on a map.
+
+    Fewer than FEWEST_PLACES of them change nothing: the result is `older`.
+    """
+    cells, is_inside = cells_of(places.position, grid)
     x, y = cells.T
-    seen = inside & ~grid.occupancy[y, x] & (places.weight > 0)
-    if seen.sum() < FEWEST_PLACES:
+    is_usable = is_inside & ~grid.occupancy[y, x] & (places.weight > 0)
+    if is_usable.sum() < FEWEST_PLACES:
         return older
-    weight = places.weight[seen]
-    log = places.sum_of_log[seen] / weight
-    limited_weight = np.minimum(weight, LARGEST_WEIGHT)
-    features = map_features(grid)[y[seen], x[seen]]
-    new = np.column_stack([places.position[seen], features, log, limited_weight])
-    return train_prior(new.astype(np.float32), older, seed)
+    weight = places.weight[is_usable]
+    log_slowness = places.sum_of_log[is_usable] / weight
+    features = map_features(grid)[y[is_usable], x[is_usable]]
+    rows = np.column_stack(
+        [
+            places.position[is_usable],
+            features,
+            log_slowness,
+            np.minimum(weight, LARGEST_WEIGHT),
+        ]
+    )
+    return train_prior(rows.astype(np.float32), older, seed)
+
+
+class _Columns(NamedTuple):
+    """The columns of the table `Prior.replay`, which has a row for each of N places."""
+
+    position: Float32  # (N, 2): metres
+    features: Float32  # (N, FEATURES)
+    log_slowness: Float32  # (N,)
+    weight: Float32  # (N,)
+
+    @classmethod
+    def of(cls, rows: Float32) -> "_Columns":
+        """Return the columns of rows, which share their memory."""
+        return cls(rows[:, :2], rows[:, 2:-2], rows[:, -2], rows[:, -1])
 
 
 def train_prior(new: Float32, older: Prior | None = None, seed: int = 0) -> Prior:
@@ -66,29 +89,31 @@ def train_prior(new: Float32, older: Prior | None = None, seed: int = 0) -> Prio
     new
         Places of one map, in the order in which they were first driven.
     older
-        A prior whose places are replayed, so that it does not forget other maps. On a
-        new map it is returned itself as long as it predicts these places better.
+        A prior whose places are replayed, so that the new one predicts other maps, too.
+        On a new map it is returned itself if it predicts the places better.
     """
     random = np.random.default_rng(as_seed(seed))
-    old = new[:0] if older is None else _without(older.replay, new)
-    rows = np.concatenate([old, new])
-    features = rows[:, 2:-2]
-    weight = rows[:, -1] / rows[:, -1].mean()
-    mean = features.mean(axis=0)
-    scale = np.maximum(features.std(axis=0), SMALLEST_SCALE)
-    scaled = np.clip((features - mean) / scale, -UNUSUAL, UNUSUAL)
+    old = new[:0] if older is None else _not_measured_anew(older.replay, new)
+    places = _Columns.of(np.concatenate([old, new]))
+    new_places = _Columns.of(new)
+    mean = places.features.mean(axis=0)
+    scale = np.maximum(places.features.std(axis=0), SMALLEST_SCALE)
+    scaled = np.clip((places.features - mean) / scale, -UNUSUAL, UNUSUAL)
     # Other maps may be slower as a whole: this column learns their level.
-    is_old = (np.arange(len(rows)) < len(old)).astype(np.float32)
-    level = np.average(new[:, -2], weights=new[:, -1])
-    target = rows[:, -2] - level  # log slowness
-    block_size = np.clip(len(rows) // BLOCKS, SMALLEST_BLOCK, LARGEST_BLOCK)
-    block = np.arange(len(rows)) // block_size
-    fold = random.permutation(block[-1] + 1)[block] % FOLDS
+    count = len(places.weight)
+    is_old = (np.arange(count) < len(old)).astype(np.float32)
+    level = np.average(new_places.log_slowness, weights=new_places.weight)
+    target = places.log_slowness - level
+    weight = places.weight / places.weight.mean()
+    block = _blocks(count)
+    fold_of_block = random.permutation(block[-1] + 1) % FOLDS
+    # Network k leaves out fold k, and the last network no place.
+    is_left_out = fold_of_block[block] == np.arange(FOLDS + 1)[:, None]
     training = _train(
         np.column_stack([scaled, is_old]),
         target,
         weight,
-        left_out=(fold == np.arange(FOLDS + 1)[:, None]).astype(np.float32),
+        left_out=is_left_out.astype(np.float32),
         seed=seed,
     )
     share = _share_to_believe(block, weight, training.predicted, target)
@@ -96,24 +121,21 @@ def train_prior(new: Float32, older: Prior | None = None, seed: int = 0) -> Prio
     is_new_map = older is not None and len(old) == len(older.replay)
     if older is not None and is_new_map:
         predicted = (share * training.predicted)[len(old) :]
-        error_of_older = _error(older.log_slowness(new[:, 2:-2]), new)
-        if error_of_older < _error(predicted, new):
+        predicted_by_older = older.log_slowness(new_places.features)
+        if _error(predicted_by_older, new_places) < _error(predicted, new_places):
             return older
     replay = [_some_rows(old, random), _some_rows(new, random)]
-    # The last network leaves out no place.
-    direct, weights_1, bias_1, weights_2, bias_2, weights_3 = (
-        tensor[-1].numpy() for tensor in training.weights
-    )
+    last = _Weights(*(tensor[-1] for tensor in training.weights))
     arrays = {
         "mean": mean,
         "scale": scale,
         "level": level,
-        "direct": share * direct[:FEATURES, 0],
-        "weights_1": weights_1,
-        "bias_1": bias_1[0],
-        "weights_2": weights_2,
-        "bias_2": bias_2[0],
-        "weights_3": share * weights_3[:, 0],
+        "direct": share * last.direct[:FEATURES, 0].numpy(),
+        "weights_1": last.weights_1,
+        "bias_1": last.bias_1[0],
+        "weights_2": last.weights_2,
+        "bias_2": last.bias_2[0],
+        "weights_3": share * last.weights_3[:, 0].numpy(),
         "replay": np.concatenate(replay),
     }
     return Prior(
@@ -121,11 +143,18 @@ def train_prior(new: Float32, older: Prior | None = None, seed: int = 0) -> Prio
     )
 
 
-def _without(old: Float32, new: Float32) -> Float32:
-    """Return the rows of places that no new row measures anew."""
+def _not_measured_anew(old: Float32, new: Float32) -> Float32:
+    """Return the old rows whose position and features are those of no new row."""
     measured = {place.tobytes() for place in new[:, :-2]}
     is_other_place = [place.tobytes() not in measured for place in old[:, :-2]]
     return old[is_other_place]
+
+
+def _blocks(count: int) -> NDArray[np.int64]:
+    """Return the number of the block of each of `count` places in a row: (count,)."""
+    size = np.clip(count // BLOCKS, SMALLEST_BLOCK, LARGEST_BLOCK)
+    block: NDArray[np.int64] = np.arange(count) // size
+    return block
 
 
 def _some_rows(rows: Float32, random: np.random.Generator) -> Float32:
@@ -136,30 +165,40 @@ def _some_rows(rows: Float32, random: np.random.Generator) -> Float32:
 
 def _share_to_believe(
     block: NDArray[np.int64], weight: Float32, predicted: Float32, target: Float32
-) -> Any:
-    """Return the share of a prediction that fits best; 0 if that is in doubt."""
-    fit = np.bincount(block, weight * predicted * target)  # by block
-    size = np.bincount(block, weight * predicted * predicted)
-    total_size = max(size.sum(), MIN_SUM)
-    share = fit.sum() / total_size
-    standard_error = np.linalg.norm(fit - share * size) / total_size
+) -> float:
+    """Return by which share of the prediction to predict, 0 to 1.
+
+    It is the share that fits the target best by weighted least squares, less a part
+    that grows with the standard error of the share; 0 if this error is too large. All
+    arrays are (N,); the errors of the places of a block are taken for dependent.
+    """
+    product = np.bincount(block, weight * predicted * target)  # (blocks,)
+    square = np.bincount(block, weight * predicted * predicted)
+    total_square = max(square.sum(), MIN_SUM)
+    share = product.sum() / total_square
+    error_of_block = product - share * square
+    standard_error = np.linalg.norm(error_of_block) / total_square
     # Of fewer blocks the errors are greater.
-    certain_share = max(share * (1 - 2 / len(fit)), MIN_SUM)
+    certain_share = max(share * (1 - 2 / len(product)), MIN_SUM)
     doubt = DOUBT * standard_error / certain_share
-    return min(share, 1) * (1 - min(doubt, 1) ** 2)
+    believed: float = min(share, 1) * (1 - min(doubt, 1) ** 2)
+    return believed
 
 
-def _error(predicted: Float32, places: Float32) -> float:
-    """Return the error of a predicted log slowness of places, whatever their level."""
-    weight = places[:, -1]
-    error = places[:, -2] - predicted
-    return float(weight @ (error - np.average(error, weights=weight)) ** 2)
+def _error(predicted: Float32, places: _Columns) -> float:
+    """Return the weighted squared error of the predicted log slowness (N,) of places.
+
+    An error that all places have in common does not count.
+    """
+    error = places.log_slowness - predicted
+    common_error = np.average(error, weights=places.weight)
+    return float(places.weight @ (error - common_error) ** 2)
 
 
 class _Weights(NamedTuple):
     """The weights of K networks of `Prior`.
 
-    Their inputs are F features, and whether a place is one of other maps.
+    The inputs of a network are F features, and 1 for a place of another map, else 0.
     """
 
     direct: Tensor  # (K, F + 1, 1)
@@ -171,16 +210,27 @@ class _Weights(NamedTuple):
 
 
 class _Training(NamedTuple):
-    """What `_train` returns, of the step with the least error."""
+    """The networks after the step with the least error."""
 
-    predicted: Float32  # (N,): the log slowness of each place, by networks without it
+    # (N,): the log slowness of each place, by the network that left the place out
+    predicted: Float32
     weights: _Weights
 
 
 def _train(
     inputs: Float32, target: Float32, weight: Float32, left_out: Float32, seed: int
 ) -> _Training:
-    """Train K networks on N places; network k leaves out those of row k, (K, N)."""
+    """Train K networks on N places.
+
+    Parameters
+    ----------
+    inputs, target, weight
+        (N, I) features, (N,) log slowness, and (N,) how much each place counts.
+    left_out
+        (K, N): 1 where network k leaves out a place, else 0.
+    seed
+        Of the first weights.
+    """
     x_NI = torch.from_numpy(inputs)
     target_N = torch.from_numpy(target)
     weight_N = torch.from_numpy(weight)
@@ -212,7 +262,11 @@ def _train(
 def _initial_weights(
     x_NI: Tensor, target_N: Tensor, weight_KN: Tensor, seed: int
 ) -> _Weights:
-    """Return networks that predict as well as linear ones can; few steps bend them."""
+    """Return K networks that predict as well as linear ones can, before their training.
+
+    `x_NI` are the inputs, `target_N` the log slowness, and `weight_KN` how much each
+    network counts each of N places.
+    """
     networks = len(weight_KN)
     weights = _Weights(
         direct=torch.zeros(networks, FEATURES + 1, 1),
@@ -223,7 +277,7 @@ def _initial_weights(
         weights_3=torch.zeros(networks, UNITS, 1),
     )
     generator = torch.Generator().manual_seed(seed)
-    for layer in (weights.weights_1, weights.weights_2):
+    for layer in (weights.weights_1, weights.weights_2):  # changed in place
         _, inputs, units = layer.shape
         layer += torch.randn((inputs, units), generator=generator) / inputs**0.5
     # The normal equations of a ridge regression.
@@ -236,7 +290,7 @@ def _initial_weights(
 
 
 def _outputs(weights: _Weights, x_KNI: Tensor) -> Tensor:
-    """Return what each network predicts of the places: (K, N)."""
+    """Return what each of K networks predicts of each of N places: (K, N)."""
     features = x_KNI[..., :FEATURES]
     first = torch.baddbmm(weights.bias_1, features, weights.weights_1).tanh()
     second = torch.baddbmm(weights.bias_2, first, weights.weights_2).tanh()

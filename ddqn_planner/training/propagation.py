@@ -1,4 +1,4 @@
-"""Double DQN of the propagation networks, in torch: their states on given maps, and updates."""
+"""Double DQN of the propagation networks, in torch: Q on the maps of a training."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple, TypeAlias
@@ -17,8 +17,8 @@ from ddqn_planner.model.move_costs import patches
 from ddqn_planner.training.double_dqn import NextQ, Q, Transitions, double_dqn_gradient
 from ddqn_planner.training.environment import GridVectorEnvironment
 
-# Dimensions: B = a batch, A = 8 actions, F = filters, I = features of a 3x3 patch,
-# X = I + 9 of a state, S maps, C = H * W cells (cell y * W + x), U = different features.
+# Dimensions: B = a batch, A = 8 actions, F = filters, I = features of a 3x3 patch, S
+# maps, C = H * W cells (cell y * W + x), U = the different rows of cells' features.
 
 Tensors: TypeAlias = Mapping[str, Tensor]
 Floats: TypeAlias = NDArray[np.float32]
@@ -50,11 +50,11 @@ class PropagationLearner:
         self.environment = environment
         self.uses_costs = network.uses_costs
         self._next_q_of = next_q_of
-        self._parts = [
+        # Tensors of torch that share the memory of `parts`.
+        self._online, self._target, self._mean, self._square = [
             {name: torch.from_numpy(tensor) for name, tensor in part.items()}
             for part in parts
         ]
-        self._online, self._target, self._mean, self._square = self._parts
         features = []
         for scenario in environment.scenarios:
             patch_C9 = patches(scenario.grid.occupancy, scenario.grid.cost)
@@ -67,15 +67,16 @@ class PropagationLearner:
         self.settle()
 
     def settle(self) -> None:
-        """Settle V on every map, by the target network."""
+        """Compute V, and Q by the target network, on every map."""
         environment = self.environment
         feature_UI = torch.from_numpy(self._feature_UI)
         success_UA = _activations(self._target, feature_UI)[-1].numpy()
         cost_UA = self._cost(self._target, feature_UI).numpy()
         success_SCA = success_UA[self._feature_number_SC]
         cost_SCA = cost_UA[self._feature_number_SC]
-        given_reward_SCA = environment.free_reward.swapaxes(1, 2)
-        reward_SCA = -cost_SCA if self.uses_costs else given_reward_SCA
+        reward_SCA = environment.free_reward.swapaxes(1, 2)
+        if self.uses_costs:
+            reward_SCA = -cost_SCA
         return_SCA, self._q_SCA = value_iteration(
             success_SCA,
             reward_SCA,
@@ -84,42 +85,46 @@ class PropagationLearner:
             environment.parameters.gamma,
             environment.parameters.obstacle_reward,
         )
-        # A state: the features; the return r + γ V(s') of each move, or γ V(s') where r
-        # is learned; and r_o. A gradient through V would diverge: none flows.
-        feature_SCI = self._feature_UI[self._feature_number_SC]
-        collision_SC1 = np.full_like(
-            return_SCA[..., :1], environment.parameters.obstacle_reward
-        )
-        self._state_SCX = np.concatenate(
-            [feature_SCI, return_SCA + cost_SCA, collision_SC1], axis=2
-        )
+        # r + γ V(s') of each move, or γ V(s') where the network learns r. A gradient
+        # through V would diverge: V is a constant for the updates.
+        self._return_without_cost_SCA = return_SCA + cost_SCA
 
     def q_values(self, scenario: Integers, cell: Integers) -> Floats:
-        """Return Q(s, a) of robots in `cell` (B,) on the maps `scenario` (B,): (B, 8)."""
+        """Return Q(s, a), (B, 8), of robots in cells (B,) of maps `scenario` (B,)."""
         q_values: Floats = self._evaluate(scenario, cell).q.numpy()
         return q_values
 
     def _evaluate(self, scenario: Integers, cell: Integers) -> "_Evaluation":
-        # Q(s, a) = p (r + γ V(s')) + (1 - p) r_o
-        state_BX = torch.from_numpy(self._state_SCX[scenario, cell])
-        widths = [self._feature_UI.shape[1], len(MOVES), 1]
-        feature_BI, return_BA, collision_B1 = torch.split(state_BX, widths, dim=1)
-        gain_BA = return_BA - self._cost(self._online, feature_BI) - collision_B1
+        """Evaluate θ for robots in `cell` (B,) on the maps `scenario` (B,).
+
+        Q(s, a) = p (r + γ V(s')) + (1 - p) r_o
+        """
+        feature_number = self._feature_number_SC[scenario, cell]
+        feature_BI = torch.from_numpy(self._feature_UI[feature_number])
+        return_BA = torch.from_numpy(self._return_without_cost_SCA[scenario, cell])
+        r_o = self.environment.parameters.obstacle_reward
+        gain_BA = return_BA - self._cost(self._online, feature_BI) - r_o
         activations = _activations(self._online, feature_BI)
         success_BA = activations[-1]
-        return _Evaluation(collision_B1 + success_BA * gain_BA, gain_BA, activations)
+        return _Evaluation(r_o + success_BA * gain_BA, gain_BA, activations)
 
     def _cost(self, weights: Tensors, feature_BI: Tensor) -> Tensor:
-        """Return length times cost multiplier of each move, or 0 if r is given: (B, 8)."""
+        """Return length times cost multiplier of each move: (B, 8).
+
+        0 if the network learns no costs, and the environment's reward counts.
+        """
         if not self.uses_costs:
             return torch.zeros(len(feature_BI), len(MOVES))
         return LENGTHS_A * (1 + _layer(weights, "prices", feature_BI).relu())
 
     def update(self, batch: Transitions, number: int) -> None:
-        """Make the update of this number."""
+        """Change θ by a batch; `number` counts the updates, from 1 on.
+
+        Each `target_interval` updates θ⁻ becomes θ.
+        """
         count = len(batch.cell)
         p = self.environment.parameters
-        # The states, and after them the next states.
+        # The states, and after them the next states: 2B.
         scenario = np.tile(batch.scenario, 2)
         cell = np.concatenate([batch.cell, batch.next_cell])
         evaluation = self._evaluate(scenario, cell)
@@ -127,12 +132,12 @@ class PropagationLearner:
         target_next_BA = self._q_SCA[batch.scenario, batch.next_cell]
         next_q = self._next_q_of(online_next_BA, target_next_BA)
         by_q_BA = torch.from_numpy(double_dqn_gradient(batch, q_BA, next_q))
-        of_states = _Evaluation(
+        present_states = _Evaluation(
             evaluation.q[:count],
             evaluation.gain[:count],
             [activation[:count] for activation in evaluation.activations],
         )
-        gradients = self._gradients(by_q_BA, of_states)
+        gradients = self._gradients(by_q_BA, present_states)
         self._take_step(gradients, number, p.learning_rate)
         if number % p.target_interval == 0:
             for name, tensor in self._target.items():
@@ -142,12 +147,16 @@ class PropagationLearner:
     def _gradients(
         self, by_q_BA: Tensor, evaluation: "_Evaluation"
     ) -> dict[str, Tensor]:
-        """Return the gradients by all weights: by hand, in half of autograd's time."""
+        """Return the gradients by all weights, from the gradient `by_q_BA` by Q.
+
+        Written by hand: it takes half of autograd's time.
+        """
         *inputs, success_BA = evaluation.activations
         feature_BI = inputs[0]
         by_gain_BA = by_q_BA * success_BA
         gradients: dict[str, Tensor] = {}
         if self.uses_costs:
+            # A multiplier of 1 is one that ReLU clips: there the gradient is 0.
             is_above_1_BA = self._cost(self._online, feature_BI) > LENGTHS_A
             by_price_BA = by_gain_BA * -LENGTHS_A * is_above_1_BA
             gradients |= _layer_gradients("prices", by_price_BA, feature_BI)
@@ -161,7 +170,7 @@ class PropagationLearner:
         return gradients
 
     def _take_step(self, gradients: Tensors, number: int, learning_rate: float) -> None:
-        """Take Adam's step of this number."""
+        """Change θ by Adam; `number` counts the updates, from 1 on."""
         names = list(self._online)
         adam(
             params=[self._online[name] for name in names],
@@ -182,17 +191,17 @@ class PropagationLearner:
 
 
 class _Evaluation(NamedTuple):
-    """What the network computes of a batch of states."""
+    """The results of the network for a batch of states."""
 
     q: Tensor  # (B, 8)
-    gain: Tensor  # (B, 8): what success gains over a collision
+    gain: Tensor  # (B, 8): r + γ V(s') - r_o, which a move gains over a collision
     activations: list[Tensor]  # see `_activations`
 
 
 def _layer_gradients(
     layer: str, by_output: Tensor, input_BF: Tensor
 ) -> dict[str, Tensor]:
-    """Return the gradients by weights and biases, given that by the layer's output."""
+    """Return the gradients by weights and biases, from that by the layer's output."""
     return {
         f"{layer}.weight": by_output.T @ input_BF,
         f"{layer}.bias": by_output.sum(0),
@@ -200,6 +209,7 @@ def _layer_gradients(
 
 
 def _layer(weights: Tensors, name: str, input_BF: Tensor) -> Tensor:
+    """Return the output of a layer before its activation function."""
     return functional.linear(
         input_BF, weights[f"{name}.weight"], weights[f"{name}.bias"]
     )
@@ -224,22 +234,35 @@ def value_iteration(
     gamma: float,
     collision: float,
 ) -> tuple[Floats, Floats]:
-    """Iterate V until it settles; return r + γ V(s') and Q(s, a): (S, C, 8) each.
+    """Iterate V until it settles; return r + γ V(s') and Q(s, a): (S, C, A) each.
 
     V(s) = max_a Q(s, a), Q(s, a) = p (r + γ V(s')) + (1 - p) r_o, and V(goal) = 0. Off
-    the map V is r_o, which with γ = 1 must be less than the return of any path. Into
-    occupied cells p is 0.
+    the map V is r_o, which with γ = 1 must be less than the return of any path.
+
+    Parameters
+    ----------
+    success_SCA
+        p, which is 0 for moves into occupied cells.
+    reward_SCA
+        r of moves that succeed.
+    goal_S
+        The cell of each map's goal.
+    neighbours_AC
+        The cell to which each move leads; C off the map.
+    gamma, collision
+        γ and r_o.
     """
     maps, cells, _ = success_SCA.shape
     discount = np.float32(gamma)
     r_o = np.float32(collision)
+    # Q(s, a) = base + gain V(s')
     gain_SCA = discount * success_SCA
     base_SCA = success_SCA * reward_SCA + (1 - success_SCA) * r_o
-    # The goal is worth 0, whatever its moves lead to.
+    # V of the goal is 0, wherever its moves lead to.
     gain_SCA[np.arange(maps), goal_S] = 0.0
     base_SCA[np.arange(maps), goal_S] = 0.0
     # From below, as if every move collided: values then rise outwards from the goal.
-    value_SC = np.full((maps, cells + 1), r_o)
+    value_SC = np.full((maps, cells + 1), r_o)  # the last one is off the map
     neighbours_CA = np.ascontiguousarray(neighbours_AC.T)
     _settle(
         value_SC,
@@ -255,7 +278,10 @@ def value_iteration(
 def _settle(
     value_SC: Floats, gain_SCA: Floats, base_SCA: Floats, neighbours_CA: Integers
 ) -> None:
-    """Iterate V(s) = max_a base + gain V(s') on each map until it settles."""
+    """Iterate V(s) = max_a base + gain V(s') on each map, in place, until it settles.
+
+    `value_SC` has one cell more than the maps, for all that is off the map.
+    """
     maps, cells, moves = gain_SCA.shape
     for s in range(maps):
         value = value_SC[s]

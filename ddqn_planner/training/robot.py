@@ -33,9 +33,12 @@ from ddqn_planner.training.propagation import value_iteration
 Floats: TypeAlias = NDArray[np.float32]
 Integers: TypeAlias = NDArray[np.int64]
 
-# Shapes: B = a batch, U units, K = primitives of each of N headings (headings with few
-# have some twice), M maps, which repeat in all directions, C poses, numbers
-# (y * W + x) * 16 + heading.
+# Dimensions: B = a batch, U units, V cells of a unit's view and a last place for all
+# cells outside it, N headings, K primitives of each heading (a heading with fewer has
+# some twice), M maps, C poses.
+# A map is a square of W * W cells that repeats in all directions, with one obstacle and
+# a goal. A pose is the number (y * W + x) * N + heading. In `Transitions`, `scenario`
+# is the number of a map, and `cell` and `next_cell` are poses.
 
 # Every episode is one random primitive from any pose. The batch and the environments
 # are per unit. A collision costs much more than a primitive, so that all successes
@@ -53,7 +56,7 @@ ROBOT: Final = HyperParameters(
     environments=12,
 )
 PER_UNIT: Final = ("batch_size", "learning_starts", "environments")
-LARGEST_COUNT: Final = 4096  # of these for all units
+LARGEST_COUNT: Final = 4096  # of each of the three, for all units
 # Of a network that knows nothing.
 FIRST_WEIGHT: Final = 0.3
 FIRST_THRESHOLD: Final = 1.0
@@ -67,7 +70,19 @@ FREE_BORDER: Final = 5  # cells by which a map is larger than what the robot see
 
 
 class RobotTrainer:
-    """Trains a `RobotNetwork` by Double DQN; the same arguments give the same network."""
+    """Trains a `RobotNetwork` by Double DQN; the same arguments give the same network.
+
+    Parameters
+    ----------
+    footprint, padding
+        The body, see `read_footprint`.
+    motion, turning_radius, resolution
+        See `make_motions`; metres, and metres per cell.
+    lattice
+        A file of motions that replaces the three; then `motion` must be None.
+    seed
+        Of all random draws.
+    """
 
     def __init__(
         self,
@@ -92,10 +107,11 @@ class RobotTrainer:
         seeds = np.random.SeedSequence(self.seed).spawn(4)
         map_generator, *generators = [np.random.default_rng(item) for item in seeds]
         self._initial, self._exploration, self._sampling = generators
-        side = self.network.swept_by_unit.shape[1]
+        side = self.network.swept_by_unit.shape[1]  # of a unit's view, cells
         self.width = side + FREE_BORDER
         self._draw_maps(map_generator)
         self._tabulate_moves(motions)
+        self._list_starts()
         self._tabulate_places(side)
         self._replay = ReplayBuffer(self.parameters.replay_capacity)
         self.steps = 0
@@ -103,25 +119,28 @@ class RobotTrainer:
         tensors = self.network.tensors
         tensors["weight"][:] = FIRST_WEIGHT
         tensors["threshold"][:] = FIRST_THRESHOLD
-        # A unit's cells in a row, and a last one of 0 for what it does not see.
-        last_cell = ((0, 0), (0, 1))
-        self._weight = np.pad(tensors["weight"].reshape(units, -1), last_cell)
-        self._swept = np.pad(self.network.swept_by_unit.reshape(units, -1), last_cell)
-        self._threshold = tensors["threshold"]
+        # (U, V): the weight of each place in a unit's view, and whether the body sweeps
+        # it. An obstacle outside the view has the weight 0.
+        outside = ((0, 0), (0, 1))
+        self._weight_UV = np.pad(tensors["weight"].reshape(units, -1), outside)
+        self._swept_UV = np.pad(self.network.swept_by_unit.reshape(units, -1), outside)
+        self._threshold_U = tensors["threshold"]  # the network's own memory
 
     def _draw_maps(self, random: np.random.Generator) -> None:
-        """Draw maps of one obstacle, so that it is known what was hit."""
+        """Draw the goal and the obstacle of each map.
+
+        With one obstacle per map, a collision tells which place the body swept.
+        """
         cells = self.width**2
         maps = max(4, min(16, 60_000 // cells))  # fewer, if they are large
-        # The first of three cells is not used, but drawn: the draws belong to what one
-        # seed gives.
-        drawn = [random.choice(cells, 3, replace=False) for _ in range(maps)]
-        _, goal, obstacle = np.transpose(drawn)
-        self.goal_M = goal * HEADINGS
-        self.obstacle_M2 = np.column_stack(np.divmod(obstacle, self.width))  # y, x
+        # The first of three cells is not used. Without it, a seed would draw others.
+        drawn_M3 = [random.choice(cells, 3, replace=False) for _ in range(maps)]
+        _, goal_cell_M, obstacle_M = np.transpose(drawn_M3)
+        self.goal_M = goal_cell_M * HEADINGS  # the pose with heading 0
+        self.obstacle_y_M, self.obstacle_x_M = np.divmod(obstacle_M, self.width)
 
     def _tabulate_moves(self, motions: Motions) -> None:
-        """Tabulate where primitives lead, what they cost, and where episodes start."""
+        """Tabulate where each primitive leads from each pose, and its reward."""
         primitives = [
             np.flatnonzero(motions.start == heading) for heading in range(HEADINGS)
         ]
@@ -129,37 +148,44 @@ class RobotTrainer:
         self.primitive_KN = np.transpose(
             [np.resize(numbers, count) for numbers in primitives]
         )
-        cell = np.arange(self.width**2)[:, None]
-        y, x = np.divmod(cell, self.width)
-        dx_KN, dy_KN = np.moveaxis(motions.offset[self.primitive_KN], 2, 0)
-        # (K, cells, N)
-        next_y = (y + dy_KN[:, None]) % self.width
-        next_x = (x + dx_KN[:, None]) % self.width
-        next_heading = motions.end[self.primitive_KN][:, None]
-        next_pose = (next_y * self.width + next_x) * HEADINGS + next_heading
-        self.next_KC = next_pose.reshape(count, -1)
-        self.reward_KC = np.tile(-motions.cost[self.primitive_KN], self.width**2)
-        # Episodes start anywhere but at the goal, on obstacles, too.
-        is_start_MC = np.arange(self.next_KC.shape[1]) != self.goal_M[:, None]
+        pose_C = np.arange(self.width**2 * HEADINGS)
+        cell_C, heading_C = np.divmod(pose_C, HEADINGS)
+        y_C, x_C = np.divmod(cell_C, self.width)
+        primitive_KC = self.primitive_KN[:, heading_C]
+        dx_KC, dy_KC = np.moveaxis(motions.offset[primitive_KC], 2, 0)  # cells
+        next_x_KC = (x_C + dx_KC) % self.width
+        next_y_KC = (y_C + dy_KC) % self.width
+        next_cell_KC = next_y_KC * self.width + next_x_KC
+        self.next_KC = next_cell_KC * HEADINGS + motions.end[primitive_KC]
+        self.reward_KC = -motions.cost[primitive_KC]
+
+    def _list_starts(self) -> None:
+        """List the poses in which episodes start: all but the goal."""
+        poses = self.width**2 * HEADINGS
+        is_start_MC = np.arange(poses) != self.goal_M[:, None]
+        # Those of map 0, then those of map 1, and so on; each map has poses - 1.
         _, self._starts = np.nonzero(is_start_MC)
 
     def _tabulate_places(self, side: int) -> None:
-        """Tabulate which cell of its view an obstacle is in for a robot.
+        """Tabulate in which place of the robot's view, a square, the obstacle lies.
 
-        By the quarters that the robot has turned, and how many rows and columns away
-        the obstacle lies; side * side is a place that it does not see.
+        The table is indexed by the quarters that the robot has turned, and by how many
+        rows and columns the obstacle lies away. Place side * side is outside the view.
         """
         view = np.arange(side * side).reshape(side, side)
-        offsets = np.arange(side) - side // 2
+        offsets = (
+            np.arange(side) - side // 2
+        )  # negative ones count from the table's end
         self._place = np.full((4, self.width, self.width), side * side)
         for quarter in range(4):
             turned = np.rot90(view, -quarter)
             self._place[quarter][np.ix_(offsets, offsets)] = turned
 
     def run(self, until: int) -> Iterator[BodyCertificate]:
-        """Train until all is proved, or so many steps are done; yield what is proved so far.
+        """Train until the body is proved with a margin, or until step `until`.
 
-        A step is one transition of one robot.
+        A generator: it yields what is proved so far. A step is one transition of one
+        robot.
         """
         until = as_whole("the number of steps", until, 1, MOST_STEPS)
         self._settle()
@@ -173,15 +199,17 @@ class RobotTrainer:
                 if self.steps >= self.parameters.learning_starts:
                     self._update()
             weight = self.network.tensors["weight"]
-            weight[:] = self._weight[:, :-1].reshape(weight.shape)
+            weight[:] = self._weight_UV[:, :-1].reshape(weight.shape)
             certificate = self.network.certificate()
             yield certificate
 
     def metadata(self) -> ModelMetadata:
-        """Return what the model file says of the network as it is now."""
+        """Return what the model file says of the network as it is now.
+
+        The fingerprint is that of the first of the maps, which have one obstacle each.
+        """
         occupancy = np.zeros((self.width, self.width), dtype=np.bool_)
-        y, x = self.obstacle_M2[0]
-        occupancy[y, x] = True
+        occupancy[self.obstacle_y_M[0], self.obstacle_x_M[0]] = True
         return ModelMetadata(
             network=self.network.name,
             sizes=self.network.sizes,
@@ -194,23 +222,23 @@ class RobotTrainer:
         )
 
     def _step(self, robots: int) -> None:
-        """Let so many robots try a random primitive, and remember what came of it."""
+        """Let as many robots try a random primitive, and add the transitions."""
         p = self.parameters
         maps = len(self.goal_M)
-        starts = len(self._starts) // maps  # of each map
+        starts_per_map = len(self._starts) // maps
         scenario = self._initial.integers(maps, size=robots)
         pose = initial_cells(
-            self.goal_M[scenario],
-            self._starts,
-            scenario * starts,
-            np.full(robots, starts),
-            p.p_r,
-            self._initial,
+            start_N=self.goal_M[scenario],  # none: p_r is 1
+            free_cells=self._starts,
+            first_N=scenario * starts_per_map,
+            count_N=np.full(robots, starts_per_map),
+            p_r=p.p_r,
+            random=self._initial,
         )
         action = self._exploration.integers(len(self.primitive_KN), size=robots)
         unit_BK, place_B = self._view(scenario, pose)
         unit_B = unit_BK[np.arange(robots), action]
-        legal = ~self._swept[unit_B, place_B]
+        legal = ~self._swept_UV[unit_B, place_B]
         next_pose = np.where(legal, self.next_KC[action, pose], pose)
         collision = np.float32(p.obstacle_reward)
         reward = np.where(legal, self.reward_KC[action, pose], collision)
@@ -222,10 +250,10 @@ class RobotTrainer:
         self.steps += robots
 
     def _update(self) -> None:
-        """Make one Double DQN update with a batch from the replay buffer."""
+        """Change weights and thresholds by the Double DQN gradient of a batch."""
         p = self.parameters
         batch = self._replay.sample(p.batch_size, self._sampling)
-        # The states, and after them the next states.
+        # The states, and after them the next states: 2B.
         scenario = np.tile(batch.scenario, 2)
         pose = np.concatenate([batch.cell, batch.next_cell])
         unit_2BK, place_2B = self._view(scenario, pose)
@@ -238,45 +266,52 @@ class RobotTrainer:
         by_q_BK = double_dqn_gradient(
             batch, q_BK, next_q(p.target, online_next_BK, target_next_BK)
         )
-        # The gradient by the logit of the success of each action that was taken.
+        # By the chain rule: the gradient by the success of each action that was taken,
+        # and by its logit.
         rows = np.arange(p.batch_size)
         success_B = success_2BK[rows, batch.action]
         by_success_B = (by_q_BK * gain_2BK[: p.batch_size])[rows, batch.action]
         by_logit_B = by_success_B * (success_B * (1 - success_B))
-        units = len(self._weight)
-        step_B = p.learning_rate * units * by_logit_B
+        step_B = p.learning_rate * len(self._weight_UV) * by_logit_B
+        # The logit is the threshold of the action's unit minus the weight of the place.
         unit_B = unit_2BK[rows, batch.action]
         place_B = place_2B[: p.batch_size]
         # All transitions of a unit move its threshold, and few move a weight: the
         # threshold must not jump.
-        np.subtract.at(self._threshold, unit_B, THRESHOLD_RATE * step_B)
-        np.add.at(self._weight, (unit_B, place_B), step_B)
-        self._weight -= np.float32(DECAY)
-        np.maximum(self._weight, 0, out=self._weight)
-        self._weight[:, -1] = 0
+        np.subtract.at(self._threshold_U, unit_B, THRESHOLD_RATE * step_B)
+        np.add.at(self._weight_UV, (unit_B, place_B), step_B)
+        self._weight_UV -= np.float32(DECAY)
+        np.maximum(self._weight_UV, 0, out=self._weight_UV)
+        self._weight_UV[:, -1] = 0  # outside the view
         self.updates += 1
         if self.updates % p.target_interval == 0:
             self._settle()
 
     def _view(self, scenario: Integers, pose: Integers) -> tuple[Integers, Integers]:
-        """Return the unit of each action, (B, K), and the place of the obstacle, (B,)."""
+        """Return the unit of each action (B, K), and the place of the obstacle (B,).
+
+        Robots are in poses (B,) on maps (B,). A place is an index of the robot's view.
+        """
         cell, heading = np.divmod(pose, HEADINGS)
         y, x = np.divmod(cell, self.width)
-        obstacle_y, obstacle_x = self.obstacle_M2[scenario].T
         quarter = heading // (HEADINGS // 4)
-        rows = (obstacle_y - y) % self.width
-        columns = (obstacle_x - x) % self.width
+        rows = (self.obstacle_y_M[scenario] - y) % self.width
+        columns = (self.obstacle_x_M[scenario] - x) % self.width
         unit_BK = self.network.unit[self.primitive_KN[:, heading]].T
         return unit_BK, self._place[quarter, rows, columns]
 
     def _success(self, unit_BK: Integers, place_B: Integers) -> Floats:
-        """Return p(s, a) of what `_view` returns: (B, K)."""
-        logit_BK = self._threshold[unit_BK] - self._weight[unit_BK, place_B[:, None]]
+        """Return p(s, a), (B, K): that the action's unit passes the obstacle."""
+        weight_BK = self._weight_UV[unit_BK, place_B[:, None]]
+        logit_BK = self._threshold_U[unit_BK] - weight_BK
         success_BK: Floats = 0.5 + 0.5 * np.tanh(0.5 * logit_BK)
         return success_BK
 
     def _settle(self) -> None:
-        """As the target network, settle V on every map."""
+        """Compute Q and r + γ V(s') of all poses by the present weights.
+
+        They stay the same until the next call, as a target network's do.
+        """
         p = self.parameters
         actions, poses = self.next_KC.shape
         maps = len(self.goal_M)

@@ -1,4 +1,4 @@
-"""A training run: a trainer with a folder for its episodes, its checkpoint and its model."""
+"""A training run: a trainer, and a folder for its episodes, checkpoint and model."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -11,12 +11,24 @@ from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import Trainer
 
 SAVE_INTERVAL = 5_000  # environment steps between two checkpoints
-# A folder with one of these files belongs to a training.
-MARKS = LOCK, CHECKPOINT = "training.lock", "checkpoint.safetensors"
+LOCK = "training.lock"
+CHECKPOINT = "checkpoint.safetensors"
 
 
 class TrainingRun(WorkFolder):
-    """Trains into a folder, or continues there; an error says why it cannot, or what differs."""
+    """Trains into a folder, or continues a training there.
+
+    A ValueError says why the folder is not of this training.
+
+    Attributes
+    ----------
+    requests : set of str
+        "save": save after the present step. "stop": save then, and end.
+    saved_at : int
+        The step at which the run saved last, or began.
+    model : bytes
+        The model's file of the last save.
+    """
 
     def __init__(
         self,
@@ -27,7 +39,8 @@ class TrainingRun(WorkFolder):
         trainer_class: type[Trainer] = Trainer,
     ) -> None:
         after = f"the training continues and tries again every {SAVE_INTERVAL} steps"
-        super().__init__(folder, MARKS, "training", "trains", after)
+        # A folder with one of the two files belongs to a training.
+        super().__init__(folder, (LOCK, CHECKPOINT), "training", "trains", after)
         self.model_path = self.folder / "model.safetensors"
         self.checkpoint_path = self.folder / CHECKPOINT
         with self.opening(), _memory_with_remedy():
@@ -38,36 +51,44 @@ class TrainingRun(WorkFolder):
                 self.folder / "episodes.csv", self.trainer.episodes
             )
             self.callback(self._record.close)
-        self.asked: set[str] = set()  # to save after the step under way, to stop
-        first = self.saved_at = self.trainer.steps
+        self.requests: set[str] = set()
+        self.saved_at = self.trainer.steps
         self.description = (
-            f"training in {self.folder} from step {first} to {parameters.steps}"
+            f"training in {self.folder} from step {self.saved_at} to {parameters.steps}"
         )
 
     def steps(self, every: int = SAVE_INTERVAL) -> Iterator[list[Episode]]:
-        """Train until the end or "stop" is asked for, and save; yield as `Trainer.run` does."""
-        until = self.trainer.parameters.steps
+        """Train to the last step or until `requests` has "stop"; save at intervals.
+
+        A generator: it yields the episodes that ended, as `Trainer.run` does, and the
+        caller may add to `requests` meanwhile.
+        """
+        last_step = self.trainer.parameters.steps
         with _memory_with_remedy():
-            for finished in self.trainer.run(until, every):
-                for episode in finished:
+            for episodes in self.trainer.run(last_step, every):
+                for episode in episodes:
                     self._record.append(record(episode))
-                due = (
-                    self.trainer.steps // SAVE_INTERVAL
-                    != self.saved_at // SAVE_INTERVAL
-                )
-                if (due or "save" in self.asked) and self.trainer.steps < until:
-                    self.asked.discard("save")
+                intervals = self.trainer.steps // SAVE_INTERVAL
+                is_due = intervals != self.saved_at // SAVE_INTERVAL
+                is_last = self.trainer.steps >= last_step  # saved below
+                if (is_due or "save" in self.requests) and not is_last:
+                    self.requests.discard("save")
                     self.try_to_save()
-                yield finished
-                if "stop" in self.asked:
+                yield episodes
+                if "stop" in self.requests:
                     break
             self.try_to_save()
 
     def try_to_save(self) -> None:
-        """Write the model, the checkpoint and the episodes; if that fails, old files stay."""
-        self.saved_at, self.model = self.trainer.steps, self.trainer.model_bytes()
+        """Write the model, the checkpoint and the episodes.
+
+        After an OSError the old files stay, and `save_error` says why.
+        """
+        self.saved_at = self.trainer.steps
+        self.model = self.trainer.model_bytes()
         with self.saving():
-            # A kill between the two leaves a model that is newer than the checkpoint: no harm.
+            # A kill between the two leaves a model that is newer than the checkpoint,
+            # which does no harm.
             write_atomically(self.model_path, self.model)
             self.trainer.save_checkpoint(self.checkpoint_path)
             self._record.flush()
@@ -75,11 +96,12 @@ class TrainingRun(WorkFolder):
 
 @contextmanager
 def _memory_with_remedy() -> Iterator[None]:
-    """Say what to do where the memory is too small."""
+    """Run a block; a MemoryError in it says what to make smaller."""
     try:
         yield
     except MemoryError as error:
         raise MemoryError(
-            "the training does not fit into the memory; take a smaller map, or smaller filters, "
-            "hidden_units, batch_size, environments, max_episode_steps or replay_capacity"
+            "the training does not fit into the memory; take a smaller map, or smaller "
+            "filters, hidden_units, batch_size, environments, max_episode_steps or "
+            "replay_capacity"
         ) from error

@@ -1,4 +1,4 @@
-"""The training loop: episodes in, a Q-network out. Checkpoints continue it bit for bit."""
+"""The training loop: episodes in, a Q-network out. Checkpoints resume it exactly."""
 
 from __future__ import annotations
 
@@ -50,15 +50,15 @@ class CheckpointError(ValueError):
 
 
 class Learner(Protocol):
-    """Updates a network, and evaluates it; B = a batch."""
+    """Updates the network of a trainer, and evaluates it; B = a batch."""
 
     def q_values(
         self, scenario: NDArray[np.int64], cell: NDArray[np.int64]
     ) -> NDArray[np.float32]:
-        """Return Q(s, a) of robots in `cell` (B,) on the maps `scenario` (B,): (B, 8)."""
+        """Return Q(s, a), (B, 8), of robots in cells (B,) of maps `scenario` (B,)."""
 
     def update(self, batch: Transitions, number: int) -> None:
-        """Make the update of this number."""
+        """Change the weights by a batch; `number` counts the updates, from 1 on."""
 
     def settle(self) -> None:
         """Take over weights that were changed from outside."""
@@ -81,6 +81,7 @@ class Trainer:
         self.episodes = 0
 
         weight_seed, *generator_seeds = np.random.SeedSequence(self.seed).spawn(4)
+        # They draw initial cells, actions, and batches.
         self._generators = [np.random.default_rng(seed) for seed in generator_seeds]
         initial, self._exploration, self._sampling = self._generators
         self.environment = GridVectorEnvironment(self.scenarios, parameters, initial)
@@ -108,7 +109,7 @@ class Trainer:
             )
 
     def _initial_network(self, seed: int) -> QNetwork:
-        """Return the network with random weights."""
+        """Return the network that the parameters name, with random weights."""
         network_class = NETWORKS[self.parameters.network]
         height, width = self.environment.shape
         values = {**asdict(self.parameters), "height": height, "width": width}
@@ -125,29 +126,31 @@ class Trainer:
 
     @property
     def epsilon(self) -> float:
-        """Probability of a random action now: it falls linearly, then stays the same."""
+        """Present probability of a random action: it falls linearly, then stays."""
         p = self.parameters
         fraction = min(self.steps / p.epsilon_steps, 1.0)
         return p.epsilon_start + fraction * (p.epsilon_end - p.epsilon_start)
 
     def run(self, until: int, every: int = 10**9) -> Iterator[list[Episode]]:
-        """Train until step `until`.
+        """Train until step `until`: a generator.
 
-        Yields the episodes that ended, often and at each multiple of `every` steps.
+        It yields the episodes that have ended since it yielded last, maybe none. It
+        does so often, and at each multiple of `every` steps.
         """
         while self.steps < until:
-            pause = min(until, (self.steps // every + 1) * every)
+            next_multiple = (self.steps // every + 1) * every
+            pause = min(until, next_multiple)
             if self._learner is None:
                 self._play(pause)
             else:
                 self._step(self._learner)
             yield self._end_episodes()
 
-    def _play(self, until: int) -> None:
-        """Make some steps in compiled code, until an episode ends."""
+    def _play(self, last_step: int) -> None:
+        """Make some steps in compiled code, until an episode ends or to `last_step`."""
         counters = Counters(self.steps, self.updates, self._replay.added)
         counters = play(
-            self._training, self._exploration, self._sampling, counters, until
+            self._training, self._exploration, self._sampling, counters, last_step
         )
         self.steps, self.updates, self._replay.added = counters
 
@@ -172,9 +175,10 @@ class Trainer:
             discount=np.where(outcome.terminated, 0.0, p.gamma).astype(np.float32),
         )
         self._replay.add(transitions)
-        intervals = self.steps // p.update_interval
+        # An update is due for each multiple of the interval that the steps pass.
+        passed_multiples = self.steps // p.update_interval
         self.steps += p.environments
-        updates_due = self.steps // p.update_interval - intervals
+        updates_due = self.steps // p.update_interval - passed_multiples
         if self.steps > p.learning_starts:
             for _ in range(updates_due):
                 self.updates += 1
@@ -234,7 +238,7 @@ class Trainer:
         return Planner(type(network)(network.sizes, tensors), metadata)
 
     def model_bytes(self) -> bytes:
-        """Return what a model file of now holds; a ValueError if the training diverged."""
+        """Return the present network's file; a ValueError if the training diverged."""
         if not all(
             np.isfinite(tensor).all() for tensor in self.network.tensors.values()
         ):
@@ -246,26 +250,35 @@ class Trainer:
         return model_bytes(planner.network, planner.metadata)
 
     def _description(self) -> dict[str, Any]:
-        """Return what of a checkpoint is no array; the names are those of version 0.1."""
+        """Return the JSON object of a checkpoint.
+
+        Its arrays are in `_tensors`. The keys are those of the first version, so that
+        old checkpoints load.
+        """
         environment = self.environment
-        paths = zip(environment.visited, environment.steps, strict=True)
+        paths = [
+            cells[: moves + 1].tolist()
+            for cells, moves in zip(environment.visited, environment.steps, strict=True)
+        ]
+        scenarios = [
+            [scenario.grid.fingerprint, [*scenario.start], [*scenario.goal]]
+            for scenario in self.scenarios
+        ]
+        states = [generator.bit_generator.state for generator in self._generators]
         return {
             "seed": self.seed,
             "move_rule": self.scenarios[0].move_rule.value,
             "parameters": asdict(self.parameters),
-            "scenarios": [
-                [scenario.grid.fingerprint, [*scenario.start], [*scenario.goal]]
-                for scenario in self.scenarios
-            ],
+            "scenarios": scenarios,
+            # In the order in which `_restore_arrays` reads them.
             "counters": [self.steps, self.updates, self.episodes, self._replay.added],
-            "walked": [cells[: steps + 1].tolist() for cells, steps in paths],
-            "generators": [
-                generator.bit_generator.state for generator in self._generators
-            ],
+            "walked": paths,
+            "generators": states,
         }
 
     def save_checkpoint(self, path: Path) -> None:
-        """Write all that `restore` needs; after an OSError, an old file is unchanged."""
+        """Write all that `restore` needs; after an OSError an old file is unchanged."""
+        # The file has arrays in the order of C alone.
         tensors = {
             name: np.asarray(tensor, order="C")
             for name, tensor in self._tensors().items()
@@ -275,13 +288,15 @@ class Trainer:
         write_atomically(as_path(path), safetensors.numpy.save(tensors, metadata))
 
     def restore(self, path: Path) -> None:
-        """Continue from a checkpoint of this training, whatever its `steps`.
+        """Continue from a checkpoint of this training.
+
+        The checkpoint's parameters may differ in `steps` alone.
 
         Raises
         ------
         CheckpointError
             If the file is not a complete checkpoint, or one of another training. Then
-            this trainer may have taken over a part of it: make another one.
+            this trainer may have read a part of it, and must not be used any more.
         """
         try:
             open_regular(as_path(path)).close()  # safe_open would wait for a pipe
@@ -310,7 +325,7 @@ class Trainer:
             ) from error
 
     def _check_training(self, saved: dict[str, Any]) -> None:
-        """Raise a CheckpointError unless a checkpoint's description is of this training."""
+        """Raise a CheckpointError unless a saved `_description` is of this training."""
         current = self._description()
         if saved["scenarios"] != current["scenarios"]:
             raise CheckpointError(
@@ -329,7 +344,7 @@ class Trainer:
             raise CheckpointError(f"was made with {changed}; give those values")
 
     def _restore_arrays(self, file: Any, counters: list[int]) -> None:
-        """Read the counters and arrays of a checkpoint, a file of safetensors."""
+        """Set the counters, and read the arrays of an open file of safetensors."""
         # First the counters, as they tell how many transitions there are.
         self.steps, self.updates, self.episodes, self._replay.added = counters
         tensors = self._tensors()
@@ -345,7 +360,7 @@ class Trainer:
             tensor[...] = file.get_tensor(name)
 
     def _restore_episodes(self, saved: dict[str, Any]) -> None:
-        """Take over the episodes that have not ended, and the random generators."""
+        """Restore the paths of unfinished episodes, and the random generators."""
         paths = zip(self.environment.visited, saved["walked"], strict=True)
         for visited, cells in paths:
             visited[: len(cells)] = cells
@@ -354,7 +369,7 @@ class Trainer:
             generator.bit_generator.state = state
 
     def _tensors(self) -> dict[str, NDArray[Any]]:
-        """Return the arrays of a checkpoint, which share the trainer's memory."""
+        """Return the arrays of a checkpoint; they share the trainer's memory."""
         online, target, mean, square = self._parts
         environment = self.environment
         tensors: dict[str, NDArray[Any]] = {
@@ -381,11 +396,11 @@ class Trainer:
 def _initial_tensors(
     shapes: Mapping[str, tuple[int, ...]], seed: int
 ) -> dict[str, NDArray[np.float32]]:
-    """Draw weights and biases as torch does for its layers."""
+    """Return random weights and biases, drawn as torch draws them for its layers."""
     generator = torch.Generator().manual_seed(seed)
     tensors = {}
     for name, shape in shapes.items():
-        layer, _, _ = name.partition(".")
+        layer, _, _ = name.partition(".")  # of "layer.weight" or "layer.bias"
         inputs = math.prod(shapes[f"{layer}.weight"][1:])
         bound = inputs**-0.5
         tensor = np.empty(shape, np.float32)
@@ -398,6 +413,7 @@ def _initial_tensors(
 
 
 def _digest(text: str, tensors: Mapping[str, NDArray[Any]]) -> str:
+    """Return SHA-256 of a checkpoint's description and arrays, in hexadecimal."""
     digest = hashlib.sha256(text.encode())
     for name in sorted(tensors):
         digest.update(name.encode())

@@ -20,13 +20,7 @@ from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import as_seed
 from ddqn_planner.model import AnyMapQNetwork
 from ddqn_planner.model.move_costs import patches
-from ddqn_planner.training.compiled_learner import (
-    adam,
-    differentiate,
-    evaluate,
-    look,
-    networks_of,
-)
+from ddqn_planner.training.compiled_learner import adam
 from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions
 from ddqn_planner.training.environment import Scenario, paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -150,32 +144,21 @@ def check_same(compiled: Trainer, of_torch: Trainer) -> None:
         assert error <= 1e-3 * np.abs(expected[name]).mean(dtype=np.float64), name
 
 
-def test_weights_whose_gradients_fade_move_as_those_of_torch(small: Scenario) -> None:
-    parameters = HyperParameters(hidden_units=6, filters=4)
-    trainer = Trainer([small], parameters, seed=2)
-    zeros = (
-        {name: 0 * t for name, t in trainer.network.tensors.items()} for _ in range(3)
-    )
-    e, parts = trainer.environment, (trainer.network.tensors, *zeros)
-    windows, networks = networks_of(e.background, e.shape, parts, states=1)
-    online, gradient, *moments = networks
-    moved = [each.weights for each in (online, gradient, *moments)]
-    weight = torch.tensor(online.weights)
+def test_weights_whose_gradients_fade_move_as_those_of_torch() -> None:
+    random = np.random.default_rng(0)
+    weights, gradient = random.normal(size=(2, 200)).astype(np.float32)
+    gradient[::7] = 0  # of features that are off
+    slopes, mean, square = np.zeros((3, 200), np.float32)
+    weight = torch.tensor(weights)
     optimiser = torch.optim.Adam([weight], 0.01)
     for update in range(1, 701):
-        if update in (
-            1,
-            700,
-        ):  # until the last one, Adam's mean of the first fades to 0
-            look(online, windows)
-            evaluate(online, windows, np.array([0]), np.array([0]))
-            gradient.q[0] = 1
-            differentiate(online, windows, gradient, 1)
-        weight.grad = torch.tensor(gradient.weights)
+        if update in (1, 700):  # until the last one, the first one's mean fades to 0
+            slopes[:] = gradient
+        weight.grad = torch.tensor(slopes)
         optimiser.step()
-        adam(*moved, 0.01, update)
-        assert not gradient.weights.any()
-    torch.testing.assert_close(torch.tensor(online.weights), weight)
+        adam(weights, slopes, mean, square, 0.01, update)
+        assert not slopes.any()
+    torch.testing.assert_close(torch.tensor(weights), weight)
 
 
 @pytest.mark.parametrize("target", [*TARGETS])
