@@ -29,19 +29,26 @@ __all__ = [
     "simplify",
 ]
 
-_LAYERS = {"Experience": "experience"}
-_LAYERS |= dict.fromkeys(("GridMap", "MoveRule", "inflate", "load_map"), "grid")
-"""Where a name is, unless in `planning`."""
+# The packages of the public names; all others are in `planning`.
+_PACKAGES = {
+    "Experience": "experience",
+    "GridMap": "grid",
+    "MoveRule": "grid",
+    "inflate": "grid",
+    "load_map": "grid",
+}
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name at its first use, so that a program loads only what it uses."""
+    """Import a public name at its first use, so that a program loads what it uses."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"{__name__}.{_LAYERS.get(name, 'planning')}"), name)
+    package = import_module(f"{__name__}.{_PACKAGES.get(name, 'planning')}")
+    value = getattr(package, name)
     globals()[name] = value
     return value
 
 
 def __dir__() -> list[str]:
+    """List the public names, too, before they are imported."""
     return sorted([*globals(), *__all__])

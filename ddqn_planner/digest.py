@@ -1,4 +1,4 @@
-"""Digests of functions: another one for whatever may change their compiled code."""
+"""Digests of functions, which differ if their compiled code may differ."""
 
 import hashlib
 import pickle
@@ -8,16 +8,26 @@ from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
+MISSING = object()  # in place of the value of an attribute that does not exist
 
 
 def digest_of(function: FunctionType, options: Mapping[str, object]) -> str:
-    """Return 16 hexadecimal digits for a function, all constants that it reads, and options."""
-    description = repr((_Describer().of(function), sorted(options.items())))
+    """Return 16 hexadecimal digits for a function and the options of its compilation.
+
+    They depend on its code, and on all globals that it reads: constants, and functions
+    with their own code and globals.
+    """
+    description = repr((_Describer().describe(function), sorted(options.items())))
     return hashlib.sha256(description.encode()).hexdigest()[:16]
 
 
 def global_names(code: CodeType) -> set[str]:
-    """Return the names of globals and attributes that code uses, with those of functions in it."""
+    """Return the names of globals and attributes that code uses.
+
+    Those of the functions that are defined in the code are among them.
+    """
     names = set(code.co_names)
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
@@ -26,92 +36,110 @@ def global_names(code: CodeType) -> set[str]:
 
 
 class _Describer:
-    """Turns values into plain ones whose texts differ, the same in each process."""
+    """Describes values by tuples, lists and texts, whose `repr` tells values apart.
+
+    The description of a value is the same in each process.
+    """
 
     def __init__(self) -> None:
-        # Those that were described: functions may call each other.
+        # The functions that have been described: functions may call each other.
         self._functions: set[FunctionType] = set()
 
-    def of(self, value: Any, names: frozenset[str] = frozenset()) -> object:
-        """Return the description of a value; of a module or a class, the attributes in `names`."""
+    def describe(self, value: Any, names: frozenset[str] = frozenset()) -> object:
+        """Return the type of a value, and what the value is.
+
+        Of a module or a class, the attributes in `names` are described.
+        """
         kind = _name_of(type(value))
         match value:
-            case np.ndarray() if value.dtype.hasobject:
-                return kind, value.shape, self.of(value.tolist())
-            case np.ndarray() | np.generic():
-                content = hashlib.sha256(value.tobytes()).hexdigest()
-                return kind, repr(value.dtype), value.shape, content
             case Enum():
-                return kind, value.name, self.of(value.value)
+                return kind, value.name, self.describe(value.value)
             case None | bool() | int() | float() | complex() | str() | bytes():
                 return kind, repr(value)
-            case tuple() | list():
-                fields = getattr(value, "_fields", ())
-                return kind, fields, [self.of(item) for item in value]
-            case set() | frozenset():
-                return kind, sorted(repr(self.of(item)) for item in value)
-            case dict():
-                return kind, [
-                    (self.of(key), self.of(item)) for key, item in value.items()
-                ]
+            case np.ndarray() | np.generic():
+                return kind, self._array(value)
+            case tuple() | list() | set() | frozenset() | dict():
+                return kind, self._container(value)
             case CodeType():
-                return kind, self._of_code(value)
+                return kind, self._code(value)
             case FunctionType():
-                return kind, self._of_function(value)
+                return kind, self._function(value)
             case ModuleType() | type():
                 fields = getattr(value, "_fields", ())  # of a NamedTuple
-                return (
-                    kind,
-                    _name_of(value),
-                    fields,
-                    list(self._attributes(value, names)),
-                )
+                attributes = list(self._attributes(value, names))
+                return kind, _name_of(value), fields, attributes
+        return kind, self._object(value)
+
+    def _array(self, array: NDArray[Any] | np.generic) -> object:
+        """Describe an array, or a NumPy number."""
+        if array.dtype.hasobject:
+            return array.shape, self.describe(array.tolist())
+        content = hashlib.sha256(array.tobytes()).hexdigest()
+        return repr(array.dtype), array.shape, content
+
+    def _container(self, container: Any) -> object:
+        """Describe a tuple, list, set or dictionary by its items."""
+        if isinstance(container, dict):
+            return [
+                (self.describe(key), self.describe(item))
+                for key, item in container.items()
+            ]
+        items = [self.describe(item) for item in container]
+        if isinstance(container, (set, frozenset)):
+            return sorted(map(repr, items))  # a set has another order in each process
+        return getattr(container, "_fields", ()), items
+
+    def _object(self, value: Any) -> object:
+        """Describe a value of any other type, if that is possible."""
         if hasattr(value, "py_func"):  # compiled
-            return kind, self.of(value.py_func)
+            return self.describe(value.py_func)
         if hasattr(value, "__name__"):  # built in, or of NumPy
-            return kind, _name_of(value)
+            return _name_of(value)
         try:
-            return kind, pickle.dumps(value)
+            return pickle.dumps(value)
         except Exception:  # then numba can hardly make a constant of it
-            return kind
+            return None
 
     def _attributes(self, owner: Any, names: frozenset[str]) -> Iterator[object]:
-        # Not by `getattr` of a module, which may import another one.
-        is_module = isinstance(owner, ModuleType)
+        """Yield name and description of the attributes that a module or class has."""
         for name in sorted(names):
-            value = (
-                vars(owner).get(name, owner)
-                if is_module
-                else getattr(owner, name, owner)
-            )
-            if value is not owner:
-                yield name, self.of(value, names - {name})
+            # Not by `getattr` of a module, which may import another one.
+            if isinstance(owner, ModuleType):
+                value = vars(owner).get(name, MISSING)
+            else:
+                value = getattr(owner, name, MISSING)
+            if value is not MISSING:
+                yield name, self.describe(value, names - {name})
 
-    def _of_code(self, code: CodeType) -> object:
+    def _code(self, code: CodeType) -> object:
+        """Describe the code of a function, with its constants."""
         counts = code.co_argcount, code.co_kwonlyargcount, code.co_flags
         names = code.co_names, code.co_freevars
-        return (
-            code.co_code,
-            counts,
-            names,
-            [self.of(constant) for constant in code.co_consts],
-        )
+        constants = [self.describe(constant) for constant in code.co_consts]
+        return code.co_code, counts, names, constants
 
-    def _of_function(self, function: FunctionType) -> object:
+    def _function(self, function: FunctionType) -> object:
+        """Describe a function with its defaults and all globals that it reads."""
         if function in self._functions:
             return function.__qualname__
         self._functions.add(function)
         names = frozenset(global_names(function.__code__))
         scope = function.__globals__
         constants = [
-            (name, self.of(scope[name], names)) for name in sorted(names & scope.keys())
+            (name, self.describe(scope[name], names))
+            for name in sorted(names & scope.keys())
         ]
-        defaults = self.of(function.__defaults__), self.of(function.__kwdefaults__)
-        enclosed = [self.of(cell.cell_contents) for cell in function.__closure__ or ()]
-        code = self._of_code(function.__code__)
+        defaults = (
+            self.describe(function.__defaults__),
+            self.describe(function.__kwdefaults__),
+        )
+        closure = function.__closure__ or ()
+        enclosed = [self.describe(cell.cell_contents) for cell in closure]
+        code = self._code(function.__code__)
         return function.__qualname__, code, constants, defaults, enclosed
 
 
 def _name_of(value: Any) -> str:
+    """Return the module and the name of a class, function or module."""
     name = getattr(value, "__qualname__", value.__name__)
     return f"{getattr(value, '__module__', '')}.{name}"

@@ -24,11 +24,13 @@ TEMPORARY = re.compile(r"\..+\.[0-9a-f]{16}")
 URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
 # $HOME, ${HOME}, and $(find-pkg-share ...) of launch files.
 VARIABLE = re.compile(r"(?P<name>\$(?:[A-Za-z_]\w*|\{[^/}]*\}|\([^)]*\)))[^/]*")
-MAX_NAME, MAX_PATH = 255, 4095  # bytes that Linux allows for a name, and for a path
-# Bytes of records that are kept while a disk is full; those beyond are left out.
-MAX_REST = 2**24
+# Bytes that Linux allows for a name, and for a path.
+MAX_NAME = 255
+MAX_PATH = 4095
+# Bytes of records that wait in memory while a disk is full; later records are lost.
+MAX_PENDING_BYTES = 2**24
 MAX_RECORD_BYTES = 2**30  # of an ``episodes.csv``: 20,000 of the longest drives
-MAX_ROW = 2**20  # bytes of a row there
+MAX_ROW_BYTES = 2**20  # of a row there
 
 KINDS: Final = {
     stat.S_IFDIR: "a folder",
@@ -43,22 +45,21 @@ class FileWriteError(OSError):
     """A file cannot be written; `strerror` says why."""
 
     def __init__(self, path: Path, error: OSError) -> None:
-        reason, remedy = (
-            error.strerror or str(error),
-            "give another path, or allow writing there",
-        )
+        reason = error.strerror or str(error)
+        remedy = "give another path, or allow writing there"
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             remedy = "make room there, or give another path"
         elif error.errno == errno.EINVAL:
             remedy = "give the path of a regular file"
         elif error.errno in (errno.EEXIST, errno.ENOTDIR):
-            reason, remedy = f"{path.parent} is no folder", "give a path in a folder"
+            reason = f"{path.parent} is no folder"
+            remedy = "give a path in a folder"
         super().__init__(f"{path} cannot be written ({reason}); {remedy}")
         self.strerror = reason
 
 
 def kind_of(path: str | Path) -> str:
-    """Return what a path is in words, as "a named pipe"; empty for a regular file, or for none."""
+    """Return what a path is, as "a named pipe", or "" for a regular or missing file."""
     try:
         mode = os.stat(path).st_mode
     except (OSError, ValueError):
@@ -67,18 +68,22 @@ def kind_of(path: str | Path) -> str:
 
 
 def _kind(mode: int) -> str:
+    """Return what a mode of `os.stat` stands for; "" for a regular file."""
     return "" if stat.S_ISREG(mode) else KINDS.get(stat.S_IFMT(mode), "no file")
 
 
 def open_regular(path: Path, limit: float = math.inf) -> BinaryIO:
-    """Open a regular file to read its bytes; a ValueError for another, or for a larger one."""
-    if kind := kind_of(path):  # to open a device may change it
+    """Open a regular file of at most `limit` bytes to read it, else raise a ValueError."""
+    kind = kind_of(path)
+    if kind:  # to open a device may change it
         raise ValueError(f"{path} is {kind}; give a regular file")
-    # It may be another one by now, and to open a pipe would wait for its writer.
+    # The path may be that of a pipe by now: O_NONBLOCK, as to open a pipe would wait for
+    # its writer.
     file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
     try:
         status = os.fstat(file.fileno())
-        if kind := _kind(status.st_mode):
+        kind = _kind(status.st_mode)
+        if kind:
             raise ValueError(f"{path} is {kind}; give a regular file")
         if status.st_size > limit:
             raise ValueError(
@@ -91,7 +96,7 @@ def open_regular(path: Path, limit: float = math.inf) -> BinaryIO:
 
 
 def read_file(path: Path, limit: int) -> bytes:
-    """Return the bytes of a regular file; a ValueError for another, or for a larger one."""
+    """Return the bytes of a regular file of at most `limit`, else raise a ValueError."""
     with open_regular(path, limit) as file:
         content = file.read(limit + 1)
     if content is None:  # a file of the kernel that has nothing to read now
@@ -102,9 +107,10 @@ def read_file(path: Path, limit: int) -> bytes:
 
 
 def read_rows(path: Path) -> Iterator[bytes]:
-    """Yield the rows of a record, with their ends; one that is too long in pieces."""
+    """Yield the rows of a file with their line ends; a row that is too long in pieces."""
     with open_regular(path, MAX_RECORD_BYTES) as file:
-        yield from iter(lambda: file.readline(MAX_ROW), b"")
+        while row := file.readline(MAX_ROW_BYTES):
+            yield row
 
 
 def open_to_append(path: Path) -> BinaryIO:
@@ -118,16 +124,18 @@ def open_to_append(path: Path) -> BinaryIO:
 
 
 def _refuse_other_kinds(path: Path) -> None:
-    """Raise an OSError if a path is something else than a regular file, or a missing one."""
-    if kind := kind_of(path):
+    """Raise an OSError unless a path is that of a regular file or of no file."""
+    kind = kind_of(path)
+    if kind:
         raise OSError(errno.EINVAL, f"it is {kind}")
 
 
 def as_path(path: Any, name: str = "path") -> Path:
-    """Return what a person calls a path; ValueError for what is none.
+    """Return the path that a person means; a ValueError says why there can be none.
 
-    ``~`` and ``~user`` are home folders, as a shell reads them, and ``file://`` is left out. What
-    nothing has replaced, as ``$HOME``, is an error, unless there is a file of that name.
+    ``~`` and ``~user`` are home folders, as a shell reads them, and ``file://`` is left
+    out. A variable as ``$HOME``, which no shell has replaced, is an error, unless there
+    is a file of that name. `name` is what errors call the path.
     """
     try:
         text = os.fspath(path)
@@ -157,7 +165,7 @@ def as_path(path: Any, name: str = "path") -> Path:
 
 
 def _check_name(text: str, problem: str) -> None:
-    """Raise a ValueError for what no file system can have as a path."""
+    """Raise a ValueError, which begins with `problem`, if no file can have this path."""
     if not text.strip():
         raise ValueError(f"{problem}; give a path")
     if "\0" in text:
@@ -174,26 +182,33 @@ def _check_name(text: str, problem: str) -> None:
 
 
 def _with_home(text: str, problem: str) -> str:
-    """Return a path that begins with ~ with the home folder instead."""
-    first, slash, rest = text.partition("/")
-    user = first[1:]
+    """Return a path that begins with ~ or ~user with the home folder in its place."""
+    first, slash, path_in_home = text.partition("/")
+    user = first.removeprefix("~")
     if user and os.path.lexists(first):  # a name, as that of an editor's copy
         return os.path.join(os.curdir, text)
-    home = os.environ.get("HOME", "") if not user else ""
+    home = _home_of(user)
     if not home:
-        with suppress(KeyError):
-            home = (pwd.getpwnam(user) if user else pwd.getpwuid(os.getuid())).pw_dir
-    if not home:
-        whose = f"a user {user!r}" if user else "this user"
+        owner = f"a user {user!r}" if user else "this user"
         remedy = f"give the full path, or ./{first} for a file of that name"
-        raise ValueError(f"{problem}, but no home folder of {whose} is known; {remedy}")
-    return home.rstrip("/") + slash + rest or "/"
+        raise ValueError(f"{problem}, but no home folder of {owner} is known; {remedy}")
+    return home.rstrip("/") + slash + path_in_home or "/"
+
+
+def _home_of(user: str) -> str:
+    """Return the home folder of a user, or of this user for ""; "" if it is unknown."""
+    try:
+        if user:
+            return pwd.getpwnam(user).pw_dir
+        return os.environ.get("HOME") or pwd.getpwuid(os.getuid()).pw_dir
+    except KeyError:
+        return ""
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a temporary file beside `path` and rename it; missing folders are made.
+    """Write a temporary file beside `path`, and rename it to `path`.
 
-    A FileWriteError names `path`, not the temporary file.
+    Missing folders are made. A FileWriteError names `path`, not the temporary file.
     """
     try:
         _refuse_other_kinds(path)
@@ -214,9 +229,14 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def check_writable(path: Path, option: str) -> None:
-    """Raise a ValueError, before hours of work, if a file could not be written afterwards."""
+    """Raise a ValueError if a file could not be written after hours of work.
+
+    To try it, an empty file is made in the folder and removed; missing folders are made.
+    `option` is what the error calls the file.
+    """
     remedy = f"give another {option}"
-    if kind := kind_of(path):
+    kind = kind_of(path)
+    if kind:
         raise ValueError(f"{option} is {path}, {kind}, no regular file; {remedy}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -236,20 +256,24 @@ def check_writable(path: Path, option: str) -> None:
 def check_distinct(
     outputs: Mapping[str, Path | None], inputs: Mapping[str, Path | None]
 ) -> None:
-    """Raise a ValueError if an output would replace another one, or a file that is read."""
-    taken = [(name, path) for name, path in inputs.items() if path is not None]
+    """Raise a ValueError if an output is one file with another output or an input.
+
+    Both map the names that an error uses to files, or to None for no file.
+    """
+    files = {name: path for name, path in inputs.items() if path is not None}
     for option, path in outputs.items():
         if path is None:
             continue
-        for name, other in taken:
-            if _is_same(path, other):
+        for name, file in files.items():
+            if _is_same(path, file):
                 raise ValueError(
                     f"{option} and {name} are one file, {path}; give another {option}"
                 )
-        taken.append((option, path))
+        files[option] = path
 
 
 def _is_same(path: Path, other: Path) -> bool:
+    """Return if two paths lead to one file, which need not exist."""
     if os.path.realpath(path) == os.path.realpath(other):
         return True
     try:
@@ -260,9 +284,10 @@ def _is_same(path: Path, other: Path) -> bool:
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Wait until no other process holds the lock of a file, and hold it; folders are made.
+    """Hold the lock of a file while the block runs; wait if another process holds it.
 
-    A FileWriteError names the file, not its lock.
+    The lock is a file of its own, beside the file, in folders that are made if they are
+    missing. A FileWriteError names the file at `path`, not its lock.
     """
     try:
         _refuse_other_kinds(path)
@@ -270,33 +295,50 @@ def locked(path: Path) -> Iterator[None]:
         lock = open_to_append(path.with_name(f".{path.name}.lock"))
     except OSError as error:
         raise FileWriteError(path, error) from error
-    with lock as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+    with lock:  # to close it unlocks it
+        fcntl.flock(lock, fcntl.LOCK_EX)
         yield
 
 
 def write_csv(
     path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]
 ) -> None:
-    """Write a table with a header row."""
+    """Write a CSV file: a row with the names of the columns, then the rows."""
     text = io.StringIO(newline="")
     csv.writer(text).writerows([columns, *rows])
     write_atomically(path, text.getvalue().encode())
 
 
-def differences(saved: Mapping[str, object], now: Mapping[str, object]) -> str:
-    """Return which of the present values were others, for an error; empty if none was."""
-    pairs = [(name, saved[name], value) for name, value in now.items()]
+def differences(saved: Mapping[str, object], present: Mapping[str, object]) -> str:
+    """Return, in words for an error, which saved values are not the present ones.
+
+    Only the names in `present` count. "" if all their values are the same.
+    """
     return ", ".join(
-        f"{name} {value} (now {new})" for name, value, new in pairs if value != new
+        f"{name} {saved[name]} (now {value})"
+        for name, value in present.items()
+        if saved[name] != value
     )
 
 
 class WorkFolder(ExitStack):
-    """A folder in which one process works until `close` or its end; a missing folder is made."""
+    """A folder in which one process works until `close` or its end.
 
-    # A folder with one of the files `marks` is the right one; the first of them is the lock. The
-    # other arguments are words of errors: what it should hold, what is done there, what then.
+    A missing folder is made. A ValueError if another process works there, or if the
+    folder is not empty and has none of the files `marks`.
+
+    Parameters
+    ----------
+    marks
+        Names of files that only such a folder contains. The first is the lock.
+    content
+        What the folder should hold, in the words of an error: "training".
+    works
+        What the process does there: "trains".
+    after
+        What follows if saving fails.
+    """
+
     def __init__(
         self,
         folder: str | Path,
@@ -309,12 +351,13 @@ class WorkFolder(ExitStack):
         folder.mkdir(parents=True, exist_ok=True)
         names = sorted(path.name for path in folder.iterdir())
         if names and not any((folder / name).is_file() for name in marks):
-            held = f"{folder} holds {reprlib.repr(names)} but no {content}"
-            raise ValueError(f"{held}; give a new or empty folder")
+            problem = f"{folder} holds {reprlib.repr(names)} but no {content}"
+            raise ValueError(f"{problem}; give a new or empty folder")
         super().__init__()
-        self.folder, self._after = folder, after
-        self.save_error = ""  # why the last save failed; empty if it did not
-        # Called after each save, whether it succeeded or not.
+        self.folder = folder
+        self._after = after
+        self.save_error = ""  # why the last save failed; empty if it succeeded
+        # Called with this folder after each save, also after one that failed.
         self.on_saved: Callable[[Any], None] = lambda _: None
         with self.opening():
             # The system closes the file, and so unlocks it, when the process ends.
@@ -341,7 +384,7 @@ class WorkFolder(ExitStack):
 
     @contextmanager
     def saving(self) -> Iterator[None]:
-        """Catch an OSError: `save_error` says it until the next block that saves."""
+        """Run a block that saves, and call `on_saved`; an OSError becomes `save_error`."""
         try:
             yield
             self.save_error = ""
@@ -354,22 +397,23 @@ class WorkFolder(ExitStack):
 
 
 class Appender:
-    """Appends records to a file; what a full disk does not take is kept, and written first."""
+    """Appends records to a file; while the disk is full, they wait in memory."""
 
     def __init__(self, path: Path) -> None:
         # Unbuffered: readers see every record, also after a crash.
         self._file = open_to_append(path)
-        self._rest = bytearray()
+        self._pending = bytearray()  # the bytes that are not in the file yet
         self.close = self._file.close
 
     def append(self, record: bytes) -> None:
-        """Append a record, now or later: `flush` says why it cannot be written."""
-        if len(self._rest) < MAX_REST:
-            self._rest += record
+        """Append a record, now or with a later one; `flush` tells why it waits."""
+        if len(self._pending) < MAX_PENDING_BYTES:
+            self._pending += record
         with suppress(OSError):
             self.flush()
 
     def flush(self) -> None:
-        """Write what is left of the records; an OSError if that fails."""
-        while self._rest:
-            del self._rest[: self._file.write(self._rest)]
+        """Write the records that wait; an OSError if that fails."""
+        while self._pending:
+            written_count = self._file.write(self._pending)  # maybe a part
+            del self._pending[:written_count]

@@ -1,4 +1,4 @@
-"""What the process keeps of its memory, and what it gives back to the system."""
+"""The memory that the process keeps, and the memory that it gives back to the system."""
 
 import ctypes
 import mmap
@@ -9,33 +9,34 @@ from contextlib import suppress
 from pathlib import Path
 
 LLVM = "/libllvmlite.so"
-TRIM_THRESHOLD, MMAP_THRESHOLD, ARENA_MAX = -1, -3, -8  # options of glibc's mallopt
+# Options of glibc's mallopt, see <malloc.h>.
+TRIM_THRESHOLD = -1
+MMAP_THRESHOLD = -3
+ARENA_MAX = -8
 
+# Set when compiled code is made or loaded: then LLVM has memory to give back.
 llvm_was_used = threading.Event()
-"""Compiled code was made or loaded since this was cleared: there is something to give back."""
 
 
 def reuse_small_arrays() -> None:
-    """Let glibc reuse the memory of arrays up to 16 MB, and return that of larger ones at once.
+    """Let glibc reuse the memory of arrays up to 16 MB.
 
-    New pages would cost small fields a third of their time. Kept, those of large arrays would let
-    the memory grow.
+    That of larger arrays is returned to the system at once. New pages would cost small
+    fields a third of their time. If the pages of large arrays were kept, the memory
+    would grow.
     """
     with suppress(AttributeError):  # another C library
         mallopt = ctypes.CDLL(None).mallopt
-        for option, value in (
-            (TRIM_THRESHOLD, 2**24),
-            (MMAP_THRESHOLD, 2**24),
-            (ARENA_MAX, 1),
-        ):
-            mallopt(option, value)
+        mallopt(TRIM_THRESHOLD, 2**24)
+        mallopt(MMAP_THRESHOLD, 2**24)
+        mallopt(ARENA_MAX, 1)
 
 
 def give_back() -> None:
-    """Give back freed memory, some 15 MB, and take the pages of LLVM out of the process, 70 MB.
+    """Give back freed memory, some 15 MB, and the pages of LLVM's code, 70 MB.
 
-    LLVM loads compiled code, and is not needed to run that code. The system has the pages in its
-    cache of files: it maps those that are needed again, and may use the memory of the others.
+    LLVM loads compiled code, and is not needed to run it. If a page is needed again, the
+    system maps it from the file.
     """
     with suppress(AttributeError, OSError):  # another system or C library
         c_library = ctypes.CDLL(None)
@@ -46,14 +47,18 @@ def give_back() -> None:
 
 
 def _unwritten_mappings(file: str) -> Iterator[tuple[int, int]]:
-    """Return the first address and the end of the mappings of a file that are as in the file."""
-    # The advice would lose what was written, as the linker has in some that are read-only by now.
+    """Yield the mappings of a file that the process has not changed: first address, end.
+
+    The end of the file's path is `file`. Changed pages would be lost by MADV_DONTNEED;
+    the linker has changed some mappings that are read-only by now.
+    """
     text = Path("/proc/self/smaps").read_text(encoding="utf-8")
     for mapping in re.split(r"\n(?=[0-9a-f]+-[0-9a-f]+ )", text):
+        # "first-end permissions ... path", then lines as "Anonymous:   0 kB"
         header, *lines = mapping.splitlines()
         addresses, permissions, *_ = header.split()
         sizes = dict(line.split(":", 1) for line in lines)
-        written = [sizes[kind].split()[0] for kind in ("Anonymous", "Swap")]
-        if header.endswith(file) and "w" not in permissions and written == ["0", "0"]:
-            first, end = (int(address, 16) for address in addresses.split("-"))
-            yield first, end
+        changed = [sizes[kind].split()[0] for kind in ("Anonymous", "Swap")]
+        if header.endswith(file) and "w" not in permissions and changed == ["0", "0"]:
+            first, end = addresses.split("-")
+            yield int(first, 16), int(end, 16)

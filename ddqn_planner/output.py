@@ -1,28 +1,31 @@
-"""What programs print: whoever reads it may stop, as ``head`` does, or have no room for it."""
+"""The output of programs: its reader may stop early, as ``head`` does."""
 
 import os
 import sys
 from collections.abc import Callable
 from typing import Final
 
-BROKEN_PIPE: Final = 141  # what a shell reports of a program that SIGPIPE ended
+BROKEN_PIPE: Final = 141  # a shell's exit code of a program that SIGPIPE ended
 
 
 def unless_cut_off(run: Callable[[], int]) -> int:
-    """Return what a program returns once its output is written, or 141 if nobody reads it."""
+    """Run a program, and write its output; return its exit code.
+
+    The code is 141 if the reader of the output has stopped.
+    """
     try:
         try:
             return run()
-        finally:  # also before it exits, as after its help
+        finally:  # also if the program exits, as after its help
             if sys.stdout is not None:
                 sys.stdout.flush()
     except BrokenPipeError:
-        discard_output()
+        _discard_output()
         return BROKEN_PIPE
 
 
-def discard_output() -> None:
-    """Throw away what is printed, and what is not yet written: Python writes it at its end."""
+def _discard_output() -> None:
+    """Send the output to /dev/null, so that Python's own flush at its end succeeds."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, sys.stdout.fileno())
     os.close(nowhere)

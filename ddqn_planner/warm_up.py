@@ -14,9 +14,10 @@ from ddqn_planner.planning.paths import rest_of_path
 
 
 def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
-    """Plan on small maps in all ways.
+    """Plan on small maps in all ways, so that all code of a planner is compiled.
 
-    Yield once after what most requests need, and once after the rest.
+    A generator: it yields once when the code of most requests is compiled, and once at
+    the end. With `learns`, the code of an `Experience` is compiled, too.
     """
     sizes = planner.metadata.sizes
     free = np.zeros((sizes.get("height", 8), sizes.get("width", 8)), np.bool_)
@@ -33,7 +34,8 @@ def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
         experience.apply(grid)
     if planner.pose_planner is not None:
         _plan_poses(planner)
-        yield from (None, None)  # there is no rest
+        yield
+        yield  # there is no other code
         return
     planner.plan(grid, start, goal, simplified=True)
     rule = planner.metadata.move_rule
@@ -46,7 +48,8 @@ def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
     # some directions only.
     obstacle = free.copy()
     obstacle[0, 0] = True
-    for forbidden in (None, 16 + free.astype(np.uint8)):
+    some_forbidden = np.full(free.shape, 0b10000, np.uint8)  # one move
+    for forbidden in (None, some_forbidden):
         blocked = GridMap(obstacle, forbidden=forbidden)
         planner.plan(blocked, start, goal, start_clearing_radius=1.0)
     if "height" not in sizes:
@@ -59,11 +62,11 @@ def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
 def _plan_poses(planner: Planner) -> None:
     """Plan where a wall divides a map, where it is open, and past an obstacle.
 
-    Then take the rest of the path.
+    Then compute the rest of the last path.
     """
     assert planner.pose_planner is not None
     resolution = planner.pose_planner.motions.resolution
-    # Cells of each room: so many that a field looks at the map before it is complete.
+    # Cells of each room: enough for a field that computes lower bounds before it grows.
     side = 2 * planner.pose_planner.body.reach + 48
     walled = np.zeros((side, 2 * side), np.bool_)
     walled[:, side] = True
