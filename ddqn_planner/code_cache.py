@@ -1,4 +1,4 @@
-"""Compiled code that numba keeps on disk, in files that may be damaged or may not be written."""
+"""Compiled code on disk: numba's cache, which here survives damaged and lost files."""
 
 import hashlib
 import logging
@@ -27,9 +27,10 @@ def write_checked(path: Path, value: object) -> None:
 
 
 def read_checked(path: Path) -> Any:
-    """Return the value that a file holds; ValueError if its checksum is another one."""
+    """Return the value of a file of `write_checked`; a ValueError if it is damaged."""
     content = read_file(path, MAX_BYTES)
-    checksum, pickled = content[:CHECKSUM_BYTES], content[CHECKSUM_BYTES:]
+    checksum = content[:CHECKSUM_BYTES]
+    pickled = content[CHECKSUM_BYTES:]
     if hashlib.sha256(pickled).digest() != checksum:
         raise ValueError("damaged or cut short")
     return pickle.loads(pickled)
@@ -38,19 +39,28 @@ def read_checked(path: Path) -> Any:
 class CodeFiles:
     """The files of one function: an index, and the code for each of its signatures.
 
-    They stand in for numba's ``IndexDataCacheFile``, under the same names. A power cut leaves files
-    of that class empty or with blocks of zeros; numba would unpickle them, and run the machine code
-    in them, which can end the process. So files are checked before anything else is done with them.
+    They replace numba's ``IndexDataCacheFile``, with files of the same names. After a
+    power cut, files of that class may be empty or have blocks of zeros; numba would
+    unpickle them, and run the machine code in them, which can end the process. So the
+    checksum of a file is compared before the file is unpickled.
+
+    Parameters
+    ----------
+    base
+        How the names of the files begin.
+    source_stamp
+        Changes if the file of the function changes: then its code is compiled again.
     """
 
     def __init__(self, folder: Path, base: str, source_stamp: object) -> None:
-        self._folder, self._base = folder, base
+        self._folder = folder
+        self._base = base
         self._index = folder / f"{base}.nbi"
         self._state = (numba.__version__, source_stamp)
         self.last_read = self._index
 
     def load(self, key: object) -> Any:
-        """Return what was saved for a key, None if nothing was."""
+        """Return the data that was saved for a key, or None if there is none."""
         name = self._read_index().get(key)
         if name is None:
             return None
@@ -62,19 +72,29 @@ class CodeFiles:
         return data if saved_key == key else None
 
     def save(self, key: object, data: object) -> None:
-        """Save the code of a key, and then its name, so that the index names complete files."""
+        """Save data for a key, and then its file's name in the index.
+
+        In this order, as the index then names complete files only.
+        """
         try:
             names = self._read_index()
         except Exception:  # the new index replaces a damaged one
             names = {}
         if key not in names:
-            numbered = (f"{self._base}.{number}.nbc" for number in count(1))
-            names[key] = next(name for name in numbered if name not in names.values())
+            names[key] = self._free_name(set(names.values()))
         write_checked(self._folder / names[key], (key, data))
         write_checked(self._index, (self._state, names))
 
+    def _free_name(self, names: set[str]) -> str:
+        """Return a name for a file of data that is not in `names`."""
+        for number in count(1):
+            name = f"{self._base}.{number}.nbc"
+            if name not in names:
+                break
+        return name
+
     def flush(self) -> None:
-        """Forget all code."""
+        """Empty the index; numba calls it to drop all code."""
         write_checked(self._index, (self._state, {}))
 
     def remove_last_read(self) -> None:
@@ -85,21 +105,23 @@ class CodeFiles:
             self.last_read.unlink(missing_ok=True)
 
     def _read_index(self) -> dict[object, str]:
-        """Return the names of the files by the keys that have one."""
+        """Return the names of the files of data, by key; none without an index."""
         try:
             state, names = self._read(self._index)
         except FileNotFoundError:
             return {}
-        # The code of another numba or of an older source is overwritten.
-        return dict(names) if state == self._state else {}
+        if state != self._state:
+            return {}  # of another numba or an older source: to be overwritten
+        return dict(names)
 
     def _read(self, path: Path) -> Any:
+        """Return the value of a file, and note its path in `last_read`."""
         self.last_read = path
         return read_checked(path)
 
 
 class CheckedCache(FunctionCache):
-    """A cache of numba whose errors cost a compilation, and no more."""
+    """Numba's cache of the code of one function; after an error it compiles again."""
 
     def __init__(self, function: Any) -> None:
         super().__init__(function)  # type: ignore[no-untyped-call]
@@ -108,11 +130,11 @@ class CheckedCache(FunctionCache):
         self._cache_file = self._files  # type: ignore[assignment]
 
     def load_overload(self, signature: Any, target: Any) -> Any:
-        """Return the code for a signature, None if there is none or it cannot be used."""
+        """Return the code for a signature, or None; a damaged file is removed."""
         llvm_was_used.set()
         try:
             return super().load_overload(signature, target)  # type: ignore[no-untyped-call]
-        except MemoryError:  # no fault of the file
+        except MemoryError:  # not because of the file
             raise
         except Exception as error:
             problem = _reason(error)
@@ -125,49 +147,56 @@ class CheckedCache(FunctionCache):
         return None
 
     def save_overload(self, signature: Any, result: Any) -> None:
-        """Keep the code for a signature, if that is possible."""
+        """Save the code for a signature; a warning if that is impossible."""
         llvm_was_used.set()
         try:
             super().save_overload(signature, result)  # type: ignore[no-untyped-call]
         except MemoryError:
             raise
         except Exception as error:
-            remedy = "make room there, or set NUMBA_CACHE_DIR to a folder that can be written"
             messages.warn(
-                f"cannot be kept in {self.cache_path} ({_reason(error)}); {remedy}"
+                f"cannot be kept in {self.cache_path} ({_reason(error)}); make room "
+                "there, or set NUMBA_CACHE_DIR to a folder that can be written"
             )
 
 
 def _reason(error: Exception) -> str:
-    """Return why, without the path, which the message names."""
+    """Return the text of an error without the path, which the message names already."""
     return getattr(error, "strerror", None) or str(error) or repr(error)
 
 
 class Messages(Listener):
-    """Logs once that functions are compiled, and the first problem with what is kept of them."""
+    """Logs the first compilation of a process, and the first problem of the cache."""
 
     def __init__(self) -> None:
-        self._has_announced = self._has_warned = False
+        self._has_announced = False
+        self._has_warned = False
 
     def on_start(self, event: Any) -> None:
-        """Announce a compilation; code that is loaded takes no time, and is no event."""
+        """Announce a compilation. Numba has no such event for code that it loads."""
         dispatcher = event.data["dispatcher"]
         is_ours = str(dispatcher.py_func.__module__).startswith("ddqn_planner.")
         if self._has_announced or not is_ours:
             return
         self._has_announced = True
         folder = dispatcher.stats.cache_path
-        lost = "set NUMBA_CACHE_DIR to a folder that can be written to keep the result"
-        LOGGER.warning(
-            "ddqn_planner compiles its functions, %s",
-            f"once, and keeps them in {folder}" if folder else f"at each start; {lost}",
-        )
+        if folder:
+            duration = f"once, and keeps them in {folder}"
+        else:
+            duration = (
+                "at each start; set NUMBA_CACHE_DIR to a folder that can be written to "
+                "keep the result"
+            )
+        LOGGER.warning("ddqn_planner compiles its functions, %s", duration)
 
     def on_end(self, event: Any) -> None:
         """Do nothing: the start was announced."""
 
     def warn(self, problem: str) -> None:
-        """Log a problem; later ones for debugging alone: a power cut may damage all files."""
+        """Log a problem: the first as a warning, later ones for debugging only.
+
+        A power cut may damage the files of all functions.
+        """
         level = logging.DEBUG if self._has_warned else logging.WARNING
         self._has_warned = self._has_announced = True
         LOGGER.log(level, "ddqn_planner's compiled code: %s", problem)

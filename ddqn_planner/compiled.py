@@ -1,4 +1,4 @@
-"""Functions that numba compiles. Nothing is imported or compiled before the first call."""
+"""Functions that numba compiles: at their first call, so that an import is fast."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -15,10 +15,15 @@ _importing = Lock()
 
 
 def compiled(function: Function, **options: Any) -> Function:
-    """Compile a function, and the compiled ones that it calls, at its first call; keep the code."""
+    """Return a function that is compiled at its first call, and kept on disk.
+
+    Compiled functions that it calls are compiled with it. `options` are those of
+    `numba.njit`. The attribute `dispatcher` of the result returns numba's object.
+    """
 
     @cache
     def dispatcher() -> Any:
+        # Numba knows its own objects alone: the globals become those of its objects.
         scope = dict(function.__globals__)
         for name in global_names(function.__code__):
             if hasattr(scope.get(name), "dispatcher"):
@@ -30,10 +35,11 @@ def compiled(function: Function, **options: Any) -> Function:
             closure=function.__closure__,
         )
         to_compile.__kwdefaults__ = function.__kwdefaults__
-        # numba looks at the file of a function alone to see whether the code it has kept is old.
+        # Numba uses its code on disk as long as the function's file is the same, even if
+        # a global of another file has changed. So the name of the code has a digest.
         digest = digest_of(to_compile, options)
         to_compile.__qualname__ = f"{function.__name__}_{digest}"
-        # Without checks of divisors and entries for C, which none needs, they compile sooner.
+        # Functions compile sooner without checks of divisors and without entries for C.
         settings = {
             "nogil": True,
             "error_model": "numpy",
@@ -44,9 +50,8 @@ def compiled(function: Function, **options: Any) -> Function:
             numba = _import_numba()
             from ddqn_planner.code_cache import CheckedCache
         compiling = numba.njit(**settings)(to_compile)
-        with suppress(
-            RuntimeError, OSError
-        ):  # no folder is writable: each process compiles again
+        # If no folder is writable, each process compiles again.
+        with suppress(RuntimeError, OSError):
             compiling._cache = CheckedCache(to_compile)
         return compiling
 
@@ -59,13 +64,16 @@ def compiled(function: Function, **options: Any) -> Function:
 
 
 def in_place(function: Function) -> Function:
-    """Compile a function that makes no array: without counts of references, sooner and faster."""
+    """Compile a function that makes no array: faster, without reference counts."""
     return compiled(function, _nrt=False)
 
 
 def inner(function: Function, **options: Any) -> Function:
-    """Let compiled functions call it without its entry for Python, so that they compile sooner."""
-    # For tuples of many arrays that entry is most of the code.
+    """Compile a function for Python, and another time for compiled functions to call.
+
+    The latter has no entry for Python, which is most of the code if parameters are
+    tuples of many arrays: so its callers compile sooner.
+    """
     with_entry = compiled(function, **options)
     without = compiled(function, no_cpython_wrapper=True, **options)
     with_entry.dispatcher = without.dispatcher  # type: ignore[attr-defined]
@@ -73,7 +81,10 @@ def inner(function: Function, **options: Any) -> Function:
 
 
 def inlined(function: Function) -> Function:
-    """Let functions which are `in_place` call a function compiled; Python calls it as it is."""
+    """Compile a function into the functions that call it, which must be `in_place`.
+
+    Python calls it as it is, not compiled.
+    """
     options = {"_nrt": False, "forceinline": True, "no_cpython_wrapper": True}
     function.dispatcher = compiled(function, **options).dispatcher  # type: ignore[attr-defined]
     return function
@@ -92,11 +103,12 @@ def specialised(function: Function, **parts: Callable[..., Any]) -> Function:
 
 @cache
 def _import_numba() -> Any:
-    """Import numba without scipy.linalg, which takes 0.2 s and no function here needs."""
+    """Import numba without scipy.linalg, which no function needs and takes 0.2 s."""
     import numba
     from numba.np import linalg
 
-    # numba imports it to check for a BLAS, and checks again when it compiles a function with one.
+    # Numba imports scipy.linalg to check for a BLAS. It checks again when it compiles a
+    # function that needs a BLAS.
     check = linalg.ensure_blas
     linalg.ensure_blas = lambda: None
     try:

@@ -73,11 +73,11 @@ def _kind(mode: int) -> str:
 
 
 def open_regular(path: Path, limit: float = math.inf) -> BinaryIO:
-    """Open a regular file of at most `limit` bytes to read it, else raise a ValueError."""
+    """Open a regular file of at most `limit` bytes to read, or raise a ValueError."""
     kind = kind_of(path)
     if kind:  # to open a device may change it
         raise ValueError(f"{path} is {kind}; give a regular file")
-    # The path may be that of a pipe by now: O_NONBLOCK, as to open a pipe would wait for
+    # The path may be that of a pipe by now. To open it without O_NONBLOCK would wait for
     # its writer.
     file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
     try:
@@ -96,7 +96,7 @@ def open_regular(path: Path, limit: float = math.inf) -> BinaryIO:
 
 
 def read_file(path: Path, limit: int) -> bytes:
-    """Return the bytes of a regular file of at most `limit`, else raise a ValueError."""
+    """Return the bytes of a regular file, at most `limit`, or raise a ValueError."""
     with open_regular(path, limit) as file:
         content = file.read(limit + 1)
     if content is None:  # a file of the kernel that has nothing to read now
@@ -107,7 +107,7 @@ def read_file(path: Path, limit: int) -> bytes:
 
 
 def read_rows(path: Path) -> Iterator[bytes]:
-    """Yield the rows of a file with their line ends; a row that is too long in pieces."""
+    """Yield the rows of a file with their line ends; a very long row in pieces."""
     with open_regular(path, MAX_RECORD_BYTES) as file:
         while row := file.readline(MAX_ROW_BYTES):
             yield row
@@ -165,7 +165,7 @@ def as_path(path: Any, name: str = "path") -> Path:
 
 
 def _check_name(text: str, problem: str) -> None:
-    """Raise a ValueError, which begins with `problem`, if no file can have this path."""
+    """Raise a ValueError that begins with `problem` if no file can have this path."""
     if not text.strip():
         raise ValueError(f"{problem}; give a path")
     if "\0" in text:
@@ -231,8 +231,8 @@ def write_atomically(path: Path, content: bytes) -> None:
 def check_writable(path: Path, option: str) -> None:
     """Raise a ValueError if a file could not be written after hours of work.
 
-    To try it, an empty file is made in the folder and removed; missing folders are made.
-    `option` is what the error calls the file.
+    To try it, an empty file is made in the folder and removed; missing folders are
+    made. `option` is what the error calls the file.
     """
     remedy = f"give another {option}"
     kind = kind_of(path)
@@ -384,7 +384,7 @@ class WorkFolder(ExitStack):
 
     @contextmanager
     def saving(self) -> Iterator[None]:
-        """Run a block that saves, and call `on_saved`; an OSError becomes `save_error`."""
+        """Run a block that saves, then `on_saved`; an OSError becomes `save_error`."""
         try:
             yield
             self.save_error = ""

@@ -1,4 +1,4 @@
-"""The memory that the process keeps, and the memory that it gives back to the system."""
+"""The memory that the process keeps, and that it gives back to the system."""
 
 import ctypes
 import mmap
@@ -35,8 +35,8 @@ def reuse_small_arrays() -> None:
 def give_back() -> None:
     """Give back freed memory, some 15 MB, and the pages of LLVM's code, 70 MB.
 
-    LLVM loads compiled code, and is not needed to run it. If a page is needed again, the
-    system maps it from the file.
+    LLVM loads compiled code, and is not needed to run it. If a page is needed again,
+    the system maps it from the file.
     """
     with suppress(AttributeError, OSError):  # another system or C library
         c_library = ctypes.CDLL(None)
@@ -47,7 +47,7 @@ def give_back() -> None:
 
 
 def _unwritten_mappings(file: str) -> Iterator[tuple[int, int]]:
-    """Yield the mappings of a file that the process has not changed: first address, end.
+    """Yield first address and end of the unchanged mappings of a file.
 
     The end of the file's path is `file`. Changed pages would be lost by MADV_DONTNEED;
     the linker has changed some mappings that are read-only by now.

@@ -40,7 +40,7 @@ def find_resource(folder: str, name: str) -> Path:
 
     A FileNotFoundError lists the files of the folder.
     """
-    # The folders lie beside the code, in each kind of installation; the copies in share/
+    # The folders lie beside the code in each kind of installation. The copies in share/
     # are for ROS tools.
     directory = Path(__file__).parent / folder
     if os.path.isfile(directory / name):

@@ -270,7 +270,7 @@ class GridEnvironment(gymnasium.Env[Observations, np.int64]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode, with probability p_r in a random cell, else at the start."""
+        """Start an episode: with probability p_r in a random cell, or at the start."""
         super().reset(seed=seed)
         self.vector.random = self.np_random
         self.vector.reset()

@@ -82,7 +82,8 @@ def test_a_robot_bumps_where_its_body_touches_an_obstacle() -> None:
         # The maps repeat in all directions.
         rows, columns = (np.arange(-reach, reach + 1) + at for at in (y, x))
         occupancy = np.zeros((width, width), dtype=bool)
-        occupancy[tuple(trainer.obstacle_M2[number])] = True
+        obstacle = trainer.obstacle_y_M[number], trainer.obstacle_x_M[number]
+        occupancy[obstacle] = True
         seen = occupancy[np.ix_(rows % width, columns % width)]
         bumps = bool((seen & swept[primitive]).any())
         dx, dy = motions.offset[primitive]
