@@ -35,8 +35,8 @@ def compiled(function: Function, **options: Any) -> Function:
             closure=function.__closure__,
         )
         to_compile.__kwdefaults__ = function.__kwdefaults__
-        # Numba uses its code on disk as long as the function's file is the same, even if
-        # a global of another file has changed. So the name of the code has a digest.
+        # Numba uses its code on disk while the function's file is the same, even if a
+        # global of another file has changed. So the name of the code has a digest.
         digest = digest_of(to_compile, options)
         to_compile.__qualname__ = f"{function.__name__}_{digest}"
         # Functions compile sooner without checks of divisors and without entries for C.

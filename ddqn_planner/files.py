@@ -77,7 +77,7 @@ def open_regular(path: Path, limit: float = math.inf) -> BinaryIO:
     kind = kind_of(path)
     if kind:  # to open a device may change it
         raise ValueError(f"{path} is {kind}; give a regular file")
-    # The path may be that of a pipe by now. To open it without O_NONBLOCK would wait for
+    # The path may be a pipe's by now. To open it without O_NONBLOCK would wait for
     # its writer.
     file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
     try:
