@@ -228,7 +228,7 @@ class RobotTrainer:
         starts_per_map = len(self._starts) // maps
         scenario = self._initial.integers(maps, size=robots)
         pose = initial_cells(
-            start_N=self.goal_M[scenario],  # none: p_r is 1
+            start_N=self.goal_M[scenario],  # unused, as p_r is 1
             free_cells=self._starts,
             first_N=scenario * starts_per_map,
             count_N=np.full(robots, starts_per_map),
