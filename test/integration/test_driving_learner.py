@@ -1,5 +1,6 @@
 """When a learner from drives trains the prior; here node and test share a process."""
 
+import time
 from collections.abc import Coroutine, Iterator
 from pathlib import Path
 from typing import Any
@@ -71,3 +72,4 @@ def wait_for_end(coroutine: Coroutine[Any, Any, None]) -> None:
             coroutine.send(None)
         except StopIteration:
             return
+        time.sleep(0.005)  # in which the worker has Python for itself
