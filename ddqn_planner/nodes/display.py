@@ -57,8 +57,7 @@ class Topic(NamedTuple):
     name: str
     message_type: type
     is_for_bodies: bool  # whether it shows the plans of robots with a body
-    make_message: Callable[[Picture], object]
-    make_empty_message: Callable[[Picture], object]
+    make_message: Callable[[Picture, bool], object]  # True: make an empty one
 
 
 class FieldDisplay:
@@ -133,10 +132,7 @@ class FieldDisplay:
             return
         # First, so that a picture that cannot be made is not tried again each time.
         self._published[topic.name] = visible
-        if is_empty:
-            publisher.publish(topic.make_empty_message(picture))
-        else:
-            publisher.publish(topic.make_message(picture))
+        publisher.publish(topic.make_message(picture, is_empty))
 
 
 def value_message(field: QField | None, grid: GridMap, header: Header) -> OccupancyGrid:
@@ -238,27 +234,31 @@ def _point(x: float, y: float) -> Point:
     return point
 
 
-def _value_message(picture: Picture) -> OccupancyGrid:
-    """Make the message of a field, which is computed now."""
+def _value_message(picture: Picture, is_empty: bool) -> OccupancyGrid:
+    """Make the message of the field toward a goal, which is computed now if need be.
+
+    On an empty one, no cell of the map has a value.
+    """
     planner = picture.outcome.planner
     request = picture.outcome.request
     goal = picture.outcome.plan.goal
-    assert planner is not None
-    assert isinstance(request, PlanRequest)
-    assert goal is not None
-    field = planner.q_field(request.grid, goal, request.move_rule)
+    assert request is not None
+    field = None
+    if not is_empty:
+        assert planner is not None
+        assert isinstance(request, PlanRequest)
+        assert goal is not None
+        field = planner.q_field(request.grid, goal, request.move_rule)
     return value_message(field, request.grid, picture.header)
 
 
-def _empty_value_message(picture: Picture) -> OccupancyGrid:
-    """Make the message of a map on which no cell has a value."""
-    request = picture.outcome.request
-    assert request is not None
-    return value_message(None, request.grid, picture.header)
+def _footprint_message(picture: Picture, is_empty: bool) -> MarkerArray:
+    """Make the message of a body's outlines along the path of a plan.
 
-
-def _footprint_message(picture: Picture) -> MarkerArray:
-    """Make the message of a body's outlines along the path of a plan."""
+    An empty one deletes the last outlines.
+    """
+    if is_empty:
+        return MarkerArray(markers=[_marker(picture.header, Marker.DELETE)])
     planner = picture.outcome.planner
     plan = picture.outcome.plan
     assert planner is not None
@@ -268,14 +268,7 @@ def _footprint_message(picture: Picture) -> MarkerArray:
     return footprint_message(outlines, picture.header)
 
 
-def _empty_footprint_message(picture: Picture) -> MarkerArray:
-    """Make a message that deletes the last outlines."""
-    return MarkerArray(markers=[_marker(picture.header, Marker.DELETE)])
-
-
 TOPICS = (
-    Topic("value", OccupancyGrid, False, _value_message, _empty_value_message),
-    Topic(
-        "footprints", MarkerArray, True, _footprint_message, _empty_footprint_message
-    ),
+    Topic("value", OccupancyGrid, False, _value_message),
+    Topic("footprints", MarkerArray, True, _footprint_message),
 )

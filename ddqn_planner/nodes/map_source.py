@@ -5,10 +5,8 @@ import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
-from geometry_msgs.msg import Pose
 from nav_msgs.msg import OccupancyGrid
 from numpy.typing import NDArray
 from rclpy.qos import QoSProfile
@@ -70,17 +68,6 @@ class Received:
     header: Header  # of the map, or of its last update
     time: float  # of the map or its last update, in seconds of the steady clock
     forbidden: Forbidden | None = None  # by the directions
-
-
-class MapPlace(NamedTuple):
-    """Where the cells of a map message lie, and how many they are."""
-
-    frame: str
-    width: int
-    height: int
-    resolution: float
-    origin: Pose
-    number_of_cells: int
 
 
 class MapSource:
@@ -315,7 +302,7 @@ class MapSource:
         If the last map has the same place, only the boxes of cells that differ from
         the last message are read.
         """
-        if last is None or _place(message) != _place(last.message):
+        if last is None or not _have_same_place(message, last.message):
             return grid_from_message(message, self._rules())
         values = occupancy_values(message)
         grid = last.grid
@@ -460,14 +447,15 @@ class MapSource:
         return ""
 
 
-def _place(message: OccupancyGrid) -> MapPlace:
-    """Return where the cells of a map message lie."""
+def _have_same_place(message: OccupancyGrid, other: OccupancyGrid) -> bool:
+    """Return whether the cells of two map messages lie in the same places."""
     info = message.info
-    return MapPlace(
-        message.header.frame_id,
-        info.width,
-        info.height,
-        info.resolution,
-        info.origin,
-        len(message.data),
+    other_info = other.info
+    return (
+        message.header.frame_id == other.header.frame_id
+        and info.width == other_info.width
+        and info.height == other_info.height
+        and info.resolution == other_info.resolution
+        and info.origin == other_info.origin
+        and len(message.data) == len(other.data)
     )

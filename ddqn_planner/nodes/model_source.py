@@ -147,13 +147,14 @@ class ModelSource:
             values["model footprint (m)"] = str(pose_planner.footprint.tolist())
         sizes = [f"{name} {size}" for name, size in metadata.sizes.items()]
         certificate = self.planner.network.certificate(metadata.move_rule)
-        values["model file"] = self.file
-        values["move rule"] = rule or metadata.move_rule.value
-        values["model move rule"] = metadata.move_rule.value
-        values["model sizes"] = ", ".join(sizes)
-        values["model training steps"] = str(metadata.steps)
-        values["model certificate"] = str(certificate or NO_CERTIFICATE)
-        return values
+        return values | {
+            "model file": self.file,
+            "move rule": rule or metadata.move_rule.value,
+            "model move rule": metadata.move_rule.value,
+            "model sizes": ", ".join(sizes),
+            "model training steps": str(metadata.steps),
+            "model certificate": str(certificate or NO_CERTIFICATE),
+        }
 
     def forget(self) -> None:
         """Free the model and its fields, also objects that loading it has frozen."""
