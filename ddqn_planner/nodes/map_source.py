@@ -302,7 +302,7 @@ class MapSource:
         If the last map has the same place, only the boxes of cells that differ from
         the last message are read.
         """
-        if last is None or not _have_same_place(message, last.message):
+        if last is None or _place(message) != _place(last.message):
             return grid_from_message(message, self._rules())
         values = occupancy_values(message)
         grid = last.grid
@@ -447,15 +447,8 @@ class MapSource:
         return ""
 
 
-def _have_same_place(message: OccupancyGrid, other: OccupancyGrid) -> bool:
-    """Return whether the cells of two map messages lie in the same places."""
+def _place(message: OccupancyGrid) -> tuple[object, ...]:
+    """Return where the cells of a map message lie, to compare two messages."""
     info = message.info
-    other_info = other.info
-    return (
-        message.header.frame_id == other.header.frame_id
-        and info.width == other_info.width
-        and info.height == other_info.height
-        and info.resolution == other_info.resolution
-        and info.origin == other_info.origin
-        and len(message.data) == len(other.data)
-    )
+    size = (info.width, info.height, len(message.data))
+    return message.header.frame_id, size, info.resolution, info.origin
