@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from geometry_msgs.msg import (
     Point,
     PoseStamped,
+    PoseWithCovariance,
     PoseWithCovarianceStamped,
     TransformStamped,
     Vector3,
@@ -368,8 +369,9 @@ def listen(
     def on_message(
         message: Odometry | PoseWithCovarianceStamped | PoseStamped,
     ) -> None:
-        # The first two have the pose beside its covariance.
-        pose = getattr(message.pose, "pose", message.pose)
+        pose = message.pose
+        if isinstance(pose, PoseWithCovariance):
+            pose = pose.pose
         with diagnostics.receiving(topic, is_frequent=is_odometry):
             on_pose(PoseStamped(header=message.header, pose=pose))
 
