@@ -28,12 +28,13 @@ POSITIVE = math.ulp(0.0), sys.float_info.max  # the range of finite numbers abov
 
 
 class _ByHash(EnumMeta):
-    """Finds the member of a value.
+    """The class of enums that refuse a value without a hash, such as an array.
 
-    Enum compares values without a hash, as arrays, one by one.
+    Enum itself would compare such a value with the members one by one.
     """
 
     def __call__(cls, value: Any, *args: Any, **options: Any) -> Any:
+        """Return the member of a value."""
         if not isinstance(value, Hashable):
             return cls._missing_(value)  # type: ignore[attr-defined]
         return super().__call__(value, *args, **options)
@@ -85,7 +86,10 @@ def cell_inside(cell: Any, shape: tuple[int, ...], name: str = "the cell") -> Ce
 
 
 def cells_inside(cells: Any, shape: tuple[int, ...]) -> NDArray[np.int64]:
-    """Return cells of a map of shape (H, W): (N, 2) int64."""
+    """Return cells (x, y) of a map of shape (H, W): (N, 2) int64.
+
+    A ValueError names a cell outside.
+    """
     is_array = (
         isinstance(cells, np.ndarray)
         and cells.dtype.kind == "i"
@@ -97,7 +101,7 @@ def cells_inside(cells: Any, shape: tuple[int, ...]) -> NDArray[np.int64]:
 
 
 def listed(values: Any, name: str, remedy: str = "give a list") -> list[Any]:
-    """Return the elements of what has some."""
+    """Return a list of the elements of a list, array or any other iterable."""
     try:
         return list(values)
     except TypeError:
@@ -105,15 +109,16 @@ def listed(values: Any, name: str, remedy: str = "give a list") -> list[Any]:
 
 
 def real(value: Any) -> float:
-    """Return a number of any type as a float.
+    """Return a number of any type as a float; anything else as NaN.
 
-    Anything else becomes NaN, which no range contains.
+    No range contains NaN.
     """
-    is_number = isinstance(value, Real) and not is_flag(value)
+    if not isinstance(value, Real) or is_flag(value):
+        return math.nan
     try:
-        return float(value) if is_number else math.nan
-    except OverflowError:
-        return math.copysign(math.inf, value > 0 or -1)
+        return float(value)
+    except OverflowError:  # an int or a fraction that is too large for a float
+        return math.inf if value > 0 else -math.inf
 
 
 def as_number(
@@ -215,22 +220,25 @@ def _check_range(
     whole: bool,
     remedy: str,
 ) -> None:
-    """Raise a ValueError for numbers out of a range, or for NaN; or for fractions."""
+    """Raise a ValueError for numbers out of a range, for NaN, and for fractions.
+
+    Fractions are allowed unless `whole`. The error names the first wrong number and
+    says what to give: the remedy, or the range.
+    """
     lowest, highest = limits
-    are_whole = not whole or array.dtype.kind != "f" or _all_whole(array)
-    if are_whole and lowest <= array.min() <= array.max() <= highest:
+    has_fractions = False
+    if whole and array.dtype.kind == "f":
+        has_fractions = not (array == np.floor(array)).all()
+    # Without new arrays, as most arrays are right. A comparison with NaN is false.
+    if not has_fractions and lowest <= array.min() <= array.max() <= highest:
         return
-    right = (array >= lowest) & (array <= highest)
+    is_right = (array >= lowest) & (array <= highest)
     if whole:
-        right &= array == np.floor(array)
+        is_right &= array == np.floor(array)
     if not remedy:
         kind = "whole numbers " if whole else ""
         remedy = f"{kind}{lowest:g} to {highest:g}"
-    raise ValueError(f"{name} holds {array[~right].flat[0]}; give {remedy}")
-
-
-def _all_whole(array: NDArray[Any]) -> bool:
-    return bool((array == np.floor(array)).all())
+    raise ValueError(f"{name} holds {array[~is_right].flat[0]}; give {remedy}")
 
 
 def _refuse_flags(name: str, values: ArrayLike) -> None:

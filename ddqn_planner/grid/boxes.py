@@ -21,23 +21,34 @@ ORIGIN = Box(slice(0, 0), slice(0, 0))
 
 
 def boxes_of(is_set: NDArray[np.bool_], max_gap: int = MAX_GAP) -> list[Box]:
-    """Return at most `MAX_BOXES` boxes that hold all set cells, and few other cells."""
+    """Return at most `MAX_BOXES` boxes that hold all set cells, and few other cells.
+
+    Parameters
+    ----------
+    is_set : (H, W) bool
+    max_gap : int
+        Two rows, or columns, with set cells lie in one box if at most so many rows or
+        columns lead from one to the next.
+    """
     boxes = []
     for rows in _runs(np.any(is_set, axis=1), max_gap):
         for columns in _runs(np.any(is_set[rows], axis=0), max_gap):
             boxes.append(Box(rows, columns))
     if len(boxes) > MAX_BOXES:
-        return boxes_of(is_set, max_gap=is_set.size)  # one box
+        return boxes_of(is_set, max_gap=is_set.size)  # all gaps are allowed: one box
     return boxes
 
 
 def _runs(is_set: NDArray[np.bool_], max_gap: int) -> list[slice]:
-    """Return the runs of True, which may contain gaps of some length."""
+    """Return slices of an array (N,) that hold all of its True elements.
+
+    A slice goes on over a gap if the next True element lies at most `max_gap` further.
+    """
     indices = np.flatnonzero(is_set)
     if indices.size == 0:
         return []
-    first_of_next_run = np.flatnonzero(np.diff(indices) > max_gap) + 1
-    runs = np.split(indices, first_of_next_run)
+    last_of_run = np.flatnonzero(np.diff(indices) > max_gap)
+    runs = np.split(indices, last_of_run + 1)
     return [slice(int(run[0]), int(run[-1]) + 1) for run in runs]
 
 
@@ -63,7 +74,10 @@ def cells_in(box: Box) -> int:
 
 
 def wider(box: Box, margin: int, shape: tuple[int, ...]) -> Box:
-    """Return a box with more cells on each side, cut at the border of an array."""
+    """Return a box with `margin` more cells on each side, cut at an array's border.
+
+    `shape` is that of the array, (H, W).
+    """
     height, width = shape
     return Box(
         rows=_wider_slice(box.rows, margin, height),
@@ -75,8 +89,11 @@ def _wider_slice(part: slice, margin: int, size: int) -> slice:
     return slice(max(part.start - margin, 0), min(part.stop + margin, size))
 
 
-def within(box: Box, outer: Box, border: int = 0) -> Box:
-    """Return where a box lies in the array of an outer box, which may have a border."""
+def relative_to(outer: Box, box: Box, border: int = 0) -> Box:
+    """Return where a box lies in an array that holds only the cells of an outer box.
+
+    The array may have a border of so many more cells on each side.
+    """
     first_row = outer.rows.start - border
     first_column = outer.columns.start - border
     return Box(

@@ -17,14 +17,16 @@ from ddqn_planner.grid.boxes import Box, cells_in, hull
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
-SMALL = 2**22  # bytes of an array that is copied as fast, and read faster
-BOX = 2**13  # cells that are copied in the time that a box takes to begin with
-LARGE = 64  # copies share memory if they differ in less than one cell in so many
+SMALL = (
+    2**22
+)  # bytes: so small an array is copied as fast, and a plain copy read faster
+CELLS_PER_BOX = 2**13  # cells that are copied in the time that a box itself takes
+CELLS_PER_CHANGE = 64  # copies share memory if they differ in less than one cell of 64
 MAX_ALIVE = 128  # copies that share memory: each takes one or two open files
 
 
 class _File(list["_Pages"]):
-    """An array in a file in memory, and the mappings of it that are free for use."""
+    """An array in a file in memory; as a list, the mappings of it that nobody uses."""
 
     def __init__(self, array: NDArray[np.generic]) -> None:
         super().__init__()
@@ -36,28 +38,31 @@ class _File(list["_Pages"]):
 
 
 class _Pages(mmap.mmap):
-    """A mapping of a whole file: pages that are written to are copied first."""
+    """A private mapping of a whole file: the first write to a page copies the page."""
 
     file: ReferenceType[_File]
-    written: tuple[Box, ...] = ()  # where they differ from the file
+    changed_boxes: tuple[Box, ...] = ()  # where the array differs from the file
 
 
 class _Source(NamedTuple):
-    """A file that an array differs from in few boxes."""
+    """A file whose array differs in few boxes from an array."""
 
     file: _File
-    written: tuple[Box, ...]
+    changed_boxes: tuple[Box, ...]
 
 
-_alive: WeakSet[_Pages] = WeakSet()
+_pages_alive: WeakSet[_Pages] = WeakSet()
 
 
 def replaced(
     array: NDArray[Scalar], box: Box, values: NDArray[Scalar]
 ) -> NDArray[Scalar]:
-    """Return a copy of an array with other values in a box."""
-    is_large = array.nbytes > SMALL and _effort([box]) * LARGE < array.size
-    if is_large and len(_alive) < MAX_ALIVE:
+    """Return a copy of an array with other values in a box.
+
+    A copy of a large array, with a small box, shares the memory of all other cells.
+    """
+    shares_memory = array.nbytes > SMALL and _is_small_change([box], array)
+    if shares_memory and len(_pages_alive) < MAX_ALIVE:
         with suppress(OSError):  # too many files are open
             return _replaced_in_pages(array, box, values)
     copy: NDArray[Scalar] = array.copy()
@@ -68,37 +73,42 @@ def replaced(
 def _replaced_in_pages(
     array: NDArray[Scalar], box: Box, values: NDArray[Scalar]
 ) -> NDArray[Scalar]:
-    file, written = _source_of(array)
+    """Return a copy as `replaced`, whose cells lie in a mapping of a file."""
+    file, boxes_of_array = _source_of(array)
     try:  # to map and unmap pages takes longer than the copy
         pages = file.pop()
     except IndexError:  # no mapping is free, or another thread has just taken it
         pages = _Pages(file.io.fileno(), array.nbytes, access=mmap.ACCESS_COPY)
-        _alive.add(pages)
+        _pages_alive.add(pages)
     copy: NDArray[Scalar] = np.ndarray(array.shape, array.dtype, pages)
-    for differing_box in (*pages.written, *written):
-        copy[differing_box] = array[differing_box]
+    # The pages may still hold the cells of an array that nobody uses any more.
+    for changed_box in (*pages.changed_boxes, *boxes_of_array):
+        copy[changed_box] = array[changed_box]
     copy[box] = values
     pages.file = ReferenceType(file)
-    pages.written = _with_box(written, box)
+    pages.changed_boxes = _with_box(boxes_of_array, box)
     # Views of the copy keep it, so its pages are used again only after them.
     finalize(copy, file.append, pages).atexit = False
     return copy
 
 
 def _source_of(array: NDArray[Scalar]) -> _Source:
-    """Return the file of an array's pages if they differ in few cells, or a new one."""
+    """Return the file that an array was made of, or a new file with the array.
+
+    It is a new one if the array lies in no file, or differs from it in many cells.
+    """
     # The array may be a view of all cells, as one of another shape.
     owner = array.base if isinstance(array.base, np.ndarray) else array
     pages: object = owner.base if owner.size == array.size else None
-    if isinstance(pages, _Pages) and _effort(pages.written) * LARGE < array.size:
+    if isinstance(pages, _Pages) and _is_small_change(pages.changed_boxes, array):
         file = pages.file()
         if file is not None and file.shape == array.shape:
-            return _Source(file, pages.written)
+            return _Source(file, pages.changed_boxes)
     return _Source(_File(array), ())
 
 
 def _with_box(boxes: tuple[Box, ...], box: Box) -> tuple[Box, ...]:
-    """Return boxes and one more, which may be joined with one of them."""
+    """Return boxes and one more box, joined with one of them if that is no slower."""
     for index, other_box in enumerate(boxes):
         joined = hull([other_box, box])
         if _effort([joined]) <= _effort([other_box, box]):
@@ -106,6 +116,11 @@ def _with_box(boxes: tuple[Box, ...], box: Box) -> tuple[Box, ...]:
     return *boxes, box
 
 
+def _is_small_change(boxes: Sequence[Box], array: NDArray[Scalar]) -> bool:
+    """Return whether a copy of boxes is much faster than one of the whole array."""
+    return _effort(boxes) * CELLS_PER_CHANGE < array.size
+
+
 def _effort(boxes: Sequence[Box]) -> int:
-    """Return the cells that are copied in the time that boxes take."""
-    return sum(BOX + cells_in(box) for box in boxes)
+    """Return the time to copy boxes, as a number of cells that it takes as long."""
+    return sum(CELLS_PER_BOX + cells_in(box) for box in boxes)

@@ -9,7 +9,7 @@ from ddqn_planner.compiled import in_place
 from ddqn_planner.grid.layers import Layers, is_legal
 from ddqn_planner.grid.moves import MOVES
 
-HALF_TURN = 4  # action ^ 4 is the opposite one
+HALF_TURN = 4  # action ^ 4 is the opposite action: it changes the action by 4, modulo 8
 
 
 @in_place
@@ -17,28 +17,29 @@ def flood(
     layers: Layers,
     backward: Any,
     reached: NDArray[np.bool_],
-    waiting: NDArray[np.int64],
+    stack: NDArray[np.int64],
     count: Any,
 ) -> None:  # pragma: no cover
-    """Mark all cells to which paths lead from the waiting cells.
+    """Mark all cells to which paths lead from the first cells.
 
     Parameters
     ----------
     layers : Layers
     backward : bool
-        Whether paths lead to the waiting cells instead.
+        Whether to mark the cells from which paths lead to the first cells instead.
     reached : (H, W) bool
-        True in the waiting cells; the other cells that are reached are marked.
-    waiting : (H * W,) int64
-        A stack of cells, y * W + x, from which no moves have been made yet.
+        True in the first cells only; it becomes True in all cells that are marked.
+    stack : (H * W,) int64
+        The first cells, as numbers y * W + x. Here it holds the cells that are reached,
+        but whose neighbours have not been looked at.
     count : int
-        How many cells are on the stack.
+        The number of first cells.
     """
     height, width = reached.shape
     while count > 0:
         count -= 1
-        y = waiting[count] // width
-        x = waiting[count] % width
+        y = stack[count] // width
+        x = stack[count] % width
         for action in range(8):
             next_x = x + MOVES[action, 0]
             next_y = y + MOVES[action, 1]
@@ -52,5 +53,5 @@ def flood(
                 legal = is_legal(x, y, action, layers)
             if legal:
                 reached[next_y, next_x] = True
-                waiting[count] = next_y * width + next_x
+                stack[count] = next_y * width + next_x
                 count += 1

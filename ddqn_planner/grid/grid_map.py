@@ -7,7 +7,7 @@ import math
 import sys
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -37,7 +37,8 @@ from ddqn_planner.grid.moves import MoveRule
 Float64 = NDArray[np.float64]
 Number = TypeVar("Number", float, Float64)
 
-LAYERS = ("occupancy", "cost", "forbidden", "slowness")  # on which its moves depend
+OPTIONAL_LAYERS = ("cost", "forbidden", "slowness")
+LAYERS = ("occupancy", *OPTIONAL_LAYERS)  # on which a map's moves depend
 PATCHED = {"occupancy", "cost", "obstacles", "unknown"}  # layers that patches change
 RESOLUTIONS = 1e-6, 1e6
 METRES_PER_CELL = "metres per cell, {:g} to {:g}".format(*RESOLUTIONS)
@@ -142,7 +143,7 @@ class GridMap:
             object.__setattr__(self, name, value)  # the dataclass is frozen
 
     def __setstate__(self, state: dict[str, object]) -> None:
-        """Take a pickled or copied state: NumPy forgets that arrays are read-only."""
+        """Set a copy's attributes: NumPy forgets that copied arrays are read-only."""
         self._set(**state)
 
     @classmethod
@@ -188,8 +189,14 @@ class GridMap:
         cost = None
         if arguments.as_flag("use_map_costs", use_map_costs):
             cost = np.maximum(array, UNKNOWN)
-        bits: Any = forbidden  # it is checked there
-        return cls(occupied, resolution, origin, cost, forbidden=bits, unknown=unknown)
+        return cls(
+            occupied,
+            resolution,
+            origin,
+            cost,
+            forbidden=cast("NDArray[np.uint8] | None", forbidden),  # checked there
+            unknown=unknown,
+        )
 
     def with_patch(
         self,
@@ -241,7 +248,10 @@ class GridMap:
         return patched
 
     def _box_of_patch(self, x: int, y: int, shape: tuple[int, ...]) -> Box:
-        """Return the rows and columns of a patch; ValueError outside the map."""
+        """Return the box of a patch of shape (h, w) from cell (x, y) on.
+
+        A ValueError if it does not lie inside the map.
+        """
         x, y = arguments.as_cell((x, y), "the first cell of the patch")
         height, width = shape
         has_columns = 0 <= x <= self.width - width
@@ -257,7 +267,17 @@ class GridMap:
     def _patched_cost(
         self, patch: Occupancy, box: Box, cost: ArrayLike | None
     ) -> NDArray[np.int8] | None:
-        """Return the costs after a patch of some cells, whose costs may be new."""
+        """Return the map's costs after a patch, or None if all cells cost the same.
+
+        Parameters
+        ----------
+        patch : (h, w) bool
+            The new cells: True where occupied.
+        box : Box
+            Where they lie.
+        cost : (h, w) array, optional
+            Their costs; by default the costs that these cells had.
+        """
         if self.cost is None and cost is None:
             return None
         old_cost = self.cost
@@ -270,7 +290,17 @@ class GridMap:
     def _patched_unknown(
         self, patch: Occupancy, box: Box, unknown: ArrayLike | None
     ) -> Occupancy | None:
-        """Return the unknown cells after a patch of some cells."""
+        """Return which cells are unknown after a patch, or None if no cell ever was.
+
+        Parameters
+        ----------
+        patch : (h, w) bool
+            The new cells: True where occupied.
+        box : Box
+            Where they lie.
+        unknown : (h, w) array, optional
+            Which of them are unknown; by default none.
+        """
         new_unknown = np.zeros(patch.shape, dtype=np.bool_)
         if unknown is not None:
             new_unknown = patch & arguments.as_mask("unknown", unknown, patch.shape)
@@ -284,11 +314,12 @@ class GridMap:
     def patches_since(self, older: GridMap) -> list[Box] | None:
         """Return the boxes that `with_patch` replaced since an older map.
 
-        None if this map was not made of the older one, if it has other directions or
-        times, or after more than `MAX_PATCHES`.
+        None if this map was not made of the older one by patches, if it has other
+        directions or times, or after more than `MAX_PATCHES` patches.
         """
-        is_same = self.forbidden is older.forbidden and self.slowness is older.slowness
-        return self._history.patches_since(older._history) if is_same else None
+        if self.forbidden is not older.forbidden or self.slowness is not older.slowness:
+            return None
+        return self._history.patches_since(older._history)
 
     def with_times_of(self, other: GridMap) -> GridMap:
         """Return the same map with the expected and the optimistic times of another."""
@@ -306,7 +337,11 @@ class GridMap:
         )
 
     def with_layers(self, **layers: object) -> GridMap:
-        """Return the map with other layers, which are neither checked nor copied."""
+        """Return the map with other values of some fields or cached properties.
+
+        They are neither checked nor copied. Without new cells (`PATCHED`), the map has
+        the same history, so that `patches_since` still knows it.
+        """
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         if layers.keys().isdisjoint(PATCHED):
             values["_history"] = self._history
@@ -349,13 +384,15 @@ class GridMap:
         return None
 
     def labels(self, move_rule: MoveRule | str) -> NDArray[np.int32]:
-        """Return each free cell's component, from 1 on: (H, W) int32.
+        """Return the number of each free cell's component, from 1 on: (H, W) int32.
 
-        Forbidden moves join cells, too.
+        Occupied cells have 0. Cells belong to one component if moves join them, also
+        forbidden moves.
         """
         from scipy import ndimage
 
-        # If a diagonal move needs both side cells free, two straight moves replace it.
+        # Diagonal neighbours are joined where the rule cuts corners. By the other rule,
+        # a diagonal move needs both side cells free, and two straight moves replace it.
         cuts_corners = MoveRule(move_rule).cuts_corners
         joined = ndimage.generate_binary_structure(2, 2 if cuts_corners else 1)
         labels: NDArray[np.int32] = ndimage.label(~self.occupancy, joined)[0]
@@ -379,9 +416,15 @@ class GridMap:
     def reachable(
         self, cells: ArrayLike, move_rule: MoveRule | str, backward: bool = False
     ) -> NDArray[np.bool_]:
-        """Return which cells paths from some free cells lead to: (H, W) bool.
+        """Return to which cells paths lead from some free cells: (H, W) bool.
 
-        Backward, return from which cells paths lead to them.
+        Parameters
+        ----------
+        cells : (N, 2)
+            The free cells, (x, y).
+        move_rule : MoveRule
+        backward : bool
+            Whether to return from which cells paths lead to the free cells instead.
         """
         path_ends = arguments.cells_inside(cells, self.occupancy.shape)
         is_backward = arguments.as_flag("backward", backward)
@@ -393,10 +436,10 @@ class GridMap:
             )
         reached = np.zeros(self.occupancy.shape, dtype=np.bool_)
         reached[y, x] = True
-        first = np.flatnonzero(reached)
-        waiting = np.empty(reached.size, np.int64)  # each cell waits at most once
-        waiting[: first.size] = first
-        flood(self.layers(move_rule), is_backward, reached, waiting, first.size)
+        first_cells = np.flatnonzero(reached)
+        stack = np.empty(reached.size, np.int64)  # each cell gets onto it at most once
+        stack[: first_cells.size] = first_cells
+        flood(self.layers(move_rule), is_backward, reached, stack, first_cells.size)
         return reached
 
     @cached_property
@@ -408,16 +451,21 @@ class GridMap:
         """Hexadecimal digest of size and cells; equal maps have the same digest."""
         digest = hashlib.sha256(f"{self.height}x{self.width}:".encode())
         digest.update(np.packbits(self.occupancy).tobytes())
-        for name in LAYERS[1:]:
+        for name in OPTIONAL_LAYERS:
             layer = getattr(self, name)
-            if layer is not None:
-                digest.update(b"" if name == "cost" else f"{name}:".encode())
-                digest.update(layer.tobytes())
+            if layer is None:
+                continue
+            if name != "cost":  # the first optional layer came without its name
+                digest.update(f"{name}:".encode())
+            digest.update(layer.tobytes())
         return digest.hexdigest()[:16]
 
     @cached_property
     def _sums(self) -> tuple[int, int, float]:
-        """Sums of layers: they differ in most maps that differ, and compare quickly."""
+        """Sums of occupancy, cost and slowness, which differ in most maps that differ.
+
+        They compare more quickly than the layers.
+        """
         slowness = 0.0 if self.slowness is None else float(self.slowness[::16].sum())
         cost = 0 if self.cost is None else _sum_of_words(self.cost)
         return _sum_of_words(self.occupancy), cost, slowness
@@ -427,6 +475,7 @@ class GridMap:
         check_grid(other, "other")
         boxes = self.patches_since(other)
         if boxes is not None:
+            # The last patch differs most probably: earlier ones may have been undone.
             return not any(self.differs(other, box).any() for box in reversed(boxes))
         if self._sums != other._sums:
             return False
@@ -438,9 +487,12 @@ class GridMap:
         return True
 
     def differs(self, other: GridMap, box: Box) -> NDArray[np.bool_]:
-        """Return which cells of a box differ from a map of the same size and layers."""
+        """Return which cells of a box differ from a map of the same size and layers.
+
+        The result has the shape of the box.
+        """
         differs: NDArray[np.bool_] = self.occupancy[box] != other.occupancy[box]
-        for name in LAYERS[1:]:
+        for name in OPTIONAL_LAYERS:
             layer = getattr(self, name)
             other_layer = getattr(other, name)
             if layer is not other_layer:
@@ -482,7 +534,10 @@ class GridMap:
         return math.floor(column), math.floor(row)
 
     def in_cells(self, points: Float64) -> Float64:
-        """Return points (..., 2) in metres in cells from the corner of cell (0, 0)."""
+        """Convert points (..., 2) from metres in the map frame to cells.
+
+        The results are columns and rows from the corner of cell (0, 0).
+        """
         columns, rows = self._from_metres(points[..., 0], points[..., 1])
         return np.stack([columns, rows], axis=-1)
 
@@ -498,28 +553,40 @@ class GridMap:
         return np.stack([x, y], axis=-1)
 
     def _from_metres(self, x: Number, y: Number) -> tuple[Number, Number]:
-        """Return the column and the row of a point; numbers, or arrays of them."""
+        """Return the column and the row of a point in metres; numbers, or arrays.
+
+        They are not rounded, and count from the corner of cell (0, 0).
+        """
         origin_x, origin_y, yaw = self.origin
         dx = x - origin_x
         dy = y - origin_y
-        along_columns = math.cos(yaw) * dx + math.sin(yaw) * dy
-        along_rows = -math.sin(yaw) * dx + math.cos(yaw) * dy
-        return along_columns / self.resolution, along_rows / self.resolution
+        cos = math.cos(yaw)
+        sin = math.sin(yaw)
+        metres_along_row = cos * dx + sin * dy
+        metres_along_column = -sin * dx + cos * dy
+        column = metres_along_row / self.resolution
+        row = metres_along_column / self.resolution
+        return column, row
 
     def _to_metres(self, column: Number, row: Number) -> tuple[Number, Number]:
-        """Return the point at a column and a row; numbers, or arrays of them."""
+        """Return the point in metres at a column and a row; numbers, or arrays.
+
+        These count from the corner of cell (0, 0).
+        """
         origin_x, origin_y, yaw = self.origin
-        along_columns = column * self.resolution
-        along_rows = row * self.resolution
-        x = origin_x + math.cos(yaw) * along_columns - math.sin(yaw) * along_rows
-        y = origin_y + math.sin(yaw) * along_columns + math.cos(yaw) * along_rows
+        cos = math.cos(yaw)
+        sin = math.sin(yaw)
+        metres_along_row = column * self.resolution
+        metres_along_column = row * self.resolution
+        x = origin_x + cos * metres_along_row - sin * metres_along_column
+        y = origin_y + sin * metres_along_row + cos * metres_along_column
         return x, y
 
 
 class Version(NamedTuple):
     """A map among those that patches made of one map."""
 
-    identity: object  # an object tells maps apart: that of a copied map is another one
+    identity: object  # a new object for each version: maps are compared by it
     box: Box  # where it differs from the version before it
 
 
@@ -530,12 +597,16 @@ class History(NamedTuple):
     versions: tuple[Version, ...]  # the last ones, and at the end the map's own
 
     def with_patch(self, box: Box) -> History:
-        """Return the history of the map with one more patch."""
+        """Return the history of a map that differs from this one in a box."""
         last_versions = self.versions[-MAX_PATCHES:]
-        return History(self.lineage, (*last_versions, Version(object(), box)))
+        new_version = Version(identity=object(), box=box)
+        return History(self.lineage, (*last_versions, new_version))
 
     def patches_since(self, older: History) -> list[Box] | None:
-        """Return the boxes that were replaced since an older map; None for others."""
+        """Return the boxes that were replaced since an older map.
+
+        None if the older map is none of the versions that are remembered.
+        """
         if self.lineage is not older.lineage:
             return None
         identities = [version.identity for version in self.versions]
@@ -557,17 +628,20 @@ class Exploration(NamedTuple):
 def _replaced_if_any(
     layer: Occupancy | None, box: Box, values: Occupancy
 ) -> Occupancy | None:
+    """Return a copy of a layer with other values in a box; None without a layer."""
     return None if layer is None else replaced(layer, box, values)
 
 
 def _sum_of_words(layer: Occupancy | NDArray[np.int8]) -> int:
-    """Return the sum of an array's words of 64 bits, and of the bytes that are left.
+    """Return a number that differs for most arrays that differ.
 
-    It is quicker than the sum of all bytes.
+    It is the sum of the array's words of 64 bits, and of the bytes after the last word,
+    and quicker than the sum of all bytes.
     """
     octets = layer.ravel().view(np.uint8)
-    words = octets[: octets.size // 8 * 8].view(np.uint64)
-    return int(words.sum()) + int(octets[words.nbytes :].sum())
+    size_of_words = octets.size // 8 * 8
+    words = octets[:size_of_words].view(np.uint64)
+    return int(words.sum()) + int(octets[size_of_words:].sum())
 
 
 def check_grid(grid: object, name: str = "grid") -> None:
@@ -579,7 +653,11 @@ def check_grid(grid: object, name: str = "grid") -> None:
 def _check_place(
     origin: tuple[float, float, float], resolution: float, shape: tuple[int, ...]
 ) -> None:
-    """Raise a ValueError where float64 cannot tell the cells of a map apart."""
+    """Raise a ValueError for an origin where float64 cannot tell cells apart.
+
+    `origin` is (x, y, yaw) in metres and radians, `resolution` is in metres per cell,
+    and `shape` is the map's, (H, W).
+    """
     x, y, yaw = origin
     max_distance = MAX_CELLS_AWAY * resolution
     if math.hypot(x, y) + math.hypot(*shape) * resolution > max_distance:
@@ -603,23 +681,23 @@ def _check_occupied(cells: Occupancy, occupancy: Occupancy, problem: str) -> Non
 def _forbidden(
     forbidden: ArrayLike, shape: tuple[int, ...]
 ) -> NDArray[np.uint8] | None:
-    """Return a copy, or None if nothing is forbidden."""
+    """Return a checked copy of one-way zones (H, W); None if nothing is forbidden."""
     bits = arguments.numbers("forbidden", forbidden, shape, between=(0, 255))
     return bits.astype(np.uint8, order="C") if bits.any() else None
 
 
 def _slowness(slowness: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return a copy."""
+    """Return a checked copy of the slowness of cells (H, W)."""
     limits = 1, arguments.MAX_SLOWNESS
     times = arguments.numbers("slowness", slowness, shape, "iuf", limits, whole=False)
     return times.astype(np.float32, order="C")
 
 
 def _costs(cost: ArrayLike, occupancy: Occupancy) -> NDArray[np.int8]:
-    """Return a copy with 0 in occupied cells."""
+    """Return a checked copy of costs (H, W), with 0 in occupied cells."""
     costs = arguments.numbers("cost", cost, occupancy.shape)
     is_whole = costs.dtype.kind != "f"
-    # A product takes a tenth of the time, but other numbers may be infinite.
+    # A product takes a tenth of the time, but fractions may be infinite.
     costs_of_free = costs * ~occupancy if is_whole else np.where(occupancy, 0, costs)
     arguments.numbers("cost", costs_of_free, between=(UNKNOWN, OCCUPIED - 1))
     return costs_of_free.astype(np.int8, order="C", copy=False)

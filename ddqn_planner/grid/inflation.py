@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.grid.arguments import OCCUPIED, UNKNOWN, Occupancy, as_mask, as_number
-from ddqn_planner.grid.boxes import Box, cells_in, hull, wider, within
+from ddqn_planner.grid.boxes import Box, cells_in, hull, relative_to, wider
 from ddqn_planner.grid.grid_map import GridMap, check_grid
 from ddqn_planner.grid.layers import MAX_COST_MULTIPLIER
 
@@ -92,16 +92,24 @@ def inflate(
 def _clearance_costs(
     metres: NDArray[np.float64], clearance_weight: float
 ) -> NDArray[np.int8]:
-    """Return the costs, (H, W), of cells at some distances beyond the body."""
-    fall = 1 + np.maximum(metres, 0.0) / CLEARANCE_SCALE
-    share = clearance_weight / (fall * fall * fall)  # ** 3 takes 20 times as long
+    """Return the costs of cells: (H, W) int8, 0 to 99.
+
+    Parameters
+    ----------
+    metres : (H, W) float64
+        The distance of each cell to the nearest obstacle, minus the robot's radius.
+    clearance_weight : float
+        See `inflate`.
+    """
+    root = 1 + np.maximum(metres, 0.0) / CLEARANCE_SCALE
+    share = clearance_weight / (root * root * root)  # ** 3 takes 20 times as long
     return np.rint((OCCUPIED - 1) * share).astype(np.int8)
 
 
 def with_unknown_free(grid: GridMap) -> GridMap:
     """Return a map as it might be if its unknown cells were free.
 
-    Its costs do not count the clearance anew.
+    The costs of the map stay, and cells that become free have the cost 0.
     """
     if grid.unknown is None:
         return grid
@@ -124,8 +132,8 @@ def with_unknown_free(grid: GridMap) -> GridMap:
 class Body(NamedTuple):
     """A robot's body, as `inflate` takes it."""
 
-    robot_radius: float
-    clearance_weight: float
+    robot_radius: float  # metres
+    clearance_weight: float  # 0 to 1
 
 
 class Inflated(NamedTuple):
@@ -145,14 +153,17 @@ class Inflation:
     def __call__(
         self, grid: GridMap, robot_radius: float, clearance_weight: float
     ) -> GridMap:
-        """Return the map that `inflate` returns."""
+        """Return the map that `inflate` returns, and remember it for the next call."""
         body = Body(robot_radius, clearance_weight)
         inflated = self._from_last(grid, body) or inflate(grid, *body)
         self._last = Inflated(body, grid, inflated)
         return inflated
 
     def _from_last(self, grid: GridMap, body: Body) -> GridMap | None:
-        """Return the inflated map if it is the last one with patches, else None."""
+        """Return the inflated map, made of the last one; None if it must be made anew.
+
+        That is possible if `grid` is the last map with patches, for the same body.
+        """
         last = self._last
         if last is None or body != last.body or not any(body):
             return None
@@ -172,21 +183,22 @@ def _inflated_with_patches(
     boxes : list of Box
         Where the map has changed.
     grid : GridMap
-        The map as it is now.
+        The map as it is now, not inflated.
     inflated : GridMap
         The inflated map before the change.
     body : Body
     """
+    # An obstacle has an effect on cells within `reach` of it.
     reach = _reach_in_cells(body, grid.resolution)
     shape = grid.occupancy.shape
     cells_of_boxes = sum(cells_in(wider(box, 2 * reach, shape)) for box in boxes)
     if boxes and cells_of_boxes > cells_in(wider(hull(boxes), 2 * reach, shape)):
-        boxes = [hull(boxes)]
+        boxes = [hull(boxes)]  # one box is quicker
     for box in boxes:
-        changed = wider(box, reach, shape)  # cells that may be inflated otherwise
-        window = wider(box, 2 * reach, shape)  # with all obstacles that have an effect
+        changed = wider(box, reach, shape)  # the cells that may change
+        window = wider(box, 2 * reach, shape)  # with all obstacles that affect these
         part = _inflated_part(grid, window, body)
-        in_part = within(changed, window)
+        in_part = relative_to(window, changed)
         inflated = inflated.with_patch(
             part.occupancy[in_part],
             x=changed.columns.start,
@@ -199,13 +211,17 @@ def _inflated_with_patches(
 
 
 def _reach_in_cells(body: Body, resolution: float) -> int:
-    """Return the distance from which on an obstacle's cost is rounded to 0."""
-    largest_fall = np.cbrt(2 * (OCCUPIED - 1) * body.clearance_weight)
-    metres = body.robot_radius + max(largest_fall - 1, 0) * CLEARANCE_SCALE
+    """Return a distance in cells beyond which an obstacle adds no cost.
+
+    There the costs of `_clearance_costs`, 99 * weight / root^3, are rounded to 0.
+    """
+    root = np.cbrt(2 * (OCCUPIED - 1) * body.clearance_weight)
+    metres = body.robot_radius + max(root - 1, 0) * CLEARANCE_SCALE
     return int(metres / resolution) + 2
 
 
 def _inflated_part(grid: GridMap, window: Box, body: Body) -> GridMap:
+    """Return the cells of a window as a map of their own, inflated."""
     cost = None if grid.cost is None else grid.cost[window]
     part = GridMap(grid.occupancy[window], grid.resolution, cost=cost)
     return inflate(part, *body)
@@ -218,13 +234,13 @@ def grid_from_costmap(
     allow_unknown: bool = False,
 ) -> GridMap:
     """Make a grid map from a costmap that Nav2 publishes as an ``OccupancyGrid``."""
-    # A robot that starts in an inscribed cell may leave: such cells are occupied, but
-    # no obstacles.
+    # A robot that starts in a cell of value 99 (inscribed) may leave: such cells are
+    # occupied, but no obstacles.
     grid = GridMap.from_occupancy_values(
         values, resolution, origin, INSCRIBED, allow_unknown, use_map_costs=True
     )
     assert grid.cost is not None
     return grid.with_layers(
-        cost=_COSTS.take(grid.cost, mode="wrap"),
+        cost=_COSTS.take(grid.cost, mode="wrap"),  # -1, unknown: the last element
         obstacles=grid.occupancy & (np.asarray(values) != INSCRIBED),
     )

@@ -67,17 +67,26 @@ def legal_moves(
     move_rule: MoveRule | str,
     forbidden: NDArray[np.uint8] | None = None,
 ) -> NDArray[np.bool_]:
-    """Return whether action a may leave cell (x, y), in ``[a, y, x]``: (8, H, W)."""
+    """Return whether action a may leave cell (x, y), in ``[a, y, x]``: (8, H, W).
+
+    Parameters
+    ----------
+    occupancy : (H, W) bool
+    move_rule : MoveRule
+    forbidden : (H, W) uint8, optional
+        The actions that must not leave each cell: bit a for action a.
+    """
     rule = MoveRule(move_rule)
-    free = np.pad(~occupancy, 1)
+    is_free = ~occupancy
+    free = np.pad(is_free, 1)  # no cell outside the map is free
     legal = np.empty((len(MOVES), *occupancy.shape), dtype=np.bool_)
     for action, (dx, dy) in enumerate(MOVES.tolist()):
-        legal[action] = shifted(free, 0, 0) & shifted(free, dx, dy)
+        legal[action] = is_free & shifted(free, dx, dy)
         is_diagonal = dx != 0 and dy != 0
         if is_diagonal and not rule.cuts_corners:
             legal[action] &= shifted(free, dx, 0) & shifted(free, 0, dy)
         if forbidden is not None:
-            legal[action] &= (forbidden >> action & 1) == 0
+            legal[action] &= (forbidden & 2**action) == 0
     return legal
 
 
@@ -108,13 +117,16 @@ def has_costs(layers: Layers) -> Any:
 
 @inlined
 def forbids(x: int, y: int, action: int, layers: Layers) -> Any:
-    """Return whether a cell forbids an action; 8 stands for no action."""
+    """Return whether a cell forbids an action; 8 stands for no action.
+
+    The layer `forbidden` has a bit for each action: the bits of no action are 0.
+    """
     return layers.forbidden.size > 0 and layers.forbidden[y, x] >> action & 1
 
 
 @inlined
 def is_legal(x: int, y: int, action: int, layers: Layers) -> Any:
-    """Return whether a move from a free cell to a free neighbour is legal."""
+    """Return whether a move from a free cell (x, y) to a free neighbour is legal."""
     if forbids(x, y, action, layers):
         return False
     if layers.cuts_corners:
@@ -135,6 +147,7 @@ def multiplier_at(x: int, y: int, one: Any, layers: Layers) -> Any:
     row = np.uint64(y)
     multiplier = one
     if layers.cost.size > 0:
+        # The cost of an unknown cell is -1: the last element.
         multiplier = one * MULTIPLIERS[layers.cost[row, column]]
     if layers.slowness.size > 0:
         multiplier = multiplier * layers.slowness[row, column]
@@ -154,17 +167,20 @@ def cost_of_move(x: int, y: int, action: int, layers: Layers) -> Any:
 
 @inlined
 def actions_of_segment(step_x: int, step_y: int, width: float, height: float) -> Any:
-    """Return the actions between whose directions a segment lies, as bits of a number.
+    """Return the actions between whose directions a segment lies, as a bit set.
+
+    These are the diagonal action and the straight action along the longer side. A
+    segment of equal sides, or along an axis, has one action.
 
     Parameters
     ----------
     step_x, step_y : int
-        The signs of the segment's extents.
+        The signs of the segment's extents: -1, 0 or 1.
     width, height : float
-        Their sizes.
+        The absolute values of the extents.
     """
     diagonal = BIT_OF_STEP[step_y + 1, step_x + 1]
-    straight = BIT_OF_STEP[
-        step_y * (height >= width) + 1, step_x * (width >= height) + 1
-    ]
+    straight_x = step_x * (width >= height)
+    straight_y = step_y * (height >= width)
+    straight = BIT_OF_STEP[straight_y + 1, straight_x + 1]
     return diagonal | straight

@@ -76,11 +76,14 @@ def changed_cells(
 def _cells_where(
     differs_in: Callable[[Box], NDArray[np.bool_]], boxes: list[Box], max_changes: float
 ) -> Cells | None:
-    """Return the cells of boxes that differ; None for more than `max_changes`."""
+    """Return the cells of boxes that differ: (N, 2); None for more than `max_changes`.
+
+    `differs_in` returns for a box which of its cells differ.
+    """
     parts = [np.empty((0, 2), np.int64)]
     changes = 0
     for box in boxes:
-        numbers = np.flatnonzero(differs_in(box))
+        numbers = np.flatnonzero(differs_in(box))  # of cells, row by row in the box
         changes += len(numbers)
         # Tested before the cells are computed: experience changes most of a map.
         if changes > max_changes:

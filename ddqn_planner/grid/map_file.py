@@ -171,9 +171,9 @@ def load_map(
 def read_map_file(path: str | Path, only_below: bool = False) -> MapFile:
     """Read all that a map file holds; see `load_map` for the path and the errors.
 
-    With `only_below` its images must lie in the folder of the YAML file or below it, so
-    that a path from elsewhere, as in a service's request, cannot show any file of this
-    machine.
+    With `only_below` the images must lie in the folder of the YAML file or below it: so
+    a path that others choose, as in a service's request, cannot show any other file of
+    this machine.
     """
     try:
         path = as_path(path)
@@ -199,6 +199,7 @@ def read_map_file(path: str | Path, only_below: bool = False) -> MapFile:
 
 
 def _read_bytes(path: Path, limit: int, error_class: type[MapFileError]) -> bytes:
+    """Return a file's content, at most `limit` bytes; else raise the error class."""
     try:
         return read_file(path, limit)
     except OSError as error:
@@ -210,6 +211,7 @@ def _read_bytes(path: Path, limit: int, error_class: type[MapFileError]) -> byte
 
 
 def _read_moving_ai(path: Path) -> MapFile:
+    """Read a map of the MovingAI benchmark: four lines of header, then the rows."""
     # A row of one cell takes up to three bytes: the cell, \r and \n.
     content = _read_bytes(path, 3 * MAX_CELLS, MapDataError)
     pattern = rb"type octile\s+height (\d{1,8})\s+width (\d{1,8})\s+map[ \t]*\r?\n"
@@ -225,22 +227,24 @@ def _read_moving_ai(path: Path) -> MapFile:
         raise ValueError(
             f"height is {height}, width is {width}; give 1 to {MAX_CELLS} cells"
         )
-    text = content[header.end() :].replace(b"\r\n", b"\n").rstrip(b"\n") + b"\n"
+    body = content[header.end() :].replace(b"\r\n", b"\n")
+    text = body.rstrip(b"\n") + b"\n"  # each row ends with one line break
     rows = text.count(b"\n")
     characters = np.frombuffer(text, dtype=np.uint8)
-    ends_of_rows = characters[width :: width + 1]
     has_size = rows == height and characters.size == height * (width + 1)
+    ends_of_rows = characters[width :: width + 1]
     if not has_size or (ends_of_rows != ord("\n")).any():
         remedy = f"give {height} rows of {width}, as its header says"
         raise MapDataError(
             f"{path}: has {rows} rows, {characters.size - rows} cells; {remedy}"
         )
-    cells = characters.reshape(height, width + 1)[:, :-1]
+    cells = characters.reshape(height, width + 1)[:, :-1]  # without line breaks
     is_free = np.isin(cells, list(b".GS"))
     return MapFile(np.where(is_free, np.int8(0), np.int8(OCCUPIED)), files=(path,))
 
 
 def _read_ros(path: Path, only_below: bool) -> MapFile:
+    """Read a ROS map, whose YAML file names its images; see `read_map_file`."""
     document = read_yaml(_read_bytes(path, MAX_YAML_BYTES, MapMetadataError))
     if not isinstance(document, dict):
         raise ValueError(
@@ -293,7 +297,18 @@ def _read_directions(
 def _image_path(
     path: Path, document: dict[str, Any], key: str, only_below: bool
 ) -> Path:
-    """Return the path of an image that a YAML file names."""
+    """Return the path of an image that a YAML file names.
+
+    Parameters
+    ----------
+    path : Path
+        The YAML file: relative names begin in its folder.
+    document : dict
+        The part of its content with the key.
+    key : str
+    only_below : bool
+        See `read_map_file`.
+    """
     name = _value(document, key)
     if not isinstance(name, str) or not name:
         raise ValueError(f"{key} is {_short(name)}; give the path of an image")
@@ -316,31 +331,42 @@ def _image_path(
 
 
 def _remedy_for_missing_image(path: Path, key: str, name: str) -> str:
+    """Return what to do if there is no image of the name that a YAML file gives."""
     # The name is often the absolute path of the computer on which the map was saved.
     file_name = re.split(r"[/\\]", name)[-1]
-    is_other = file_name not in ("", name)
-    if is_other and os.path.isfile(path.parent / file_name):
+    names_folder = file_name not in ("", name)
+    if names_folder and os.path.isfile(path.parent / file_name):
         remedy = f"write '{key}: {file_name}' there"
         return f"{file_name!r} lies beside the YAML file: {remedy}"
     return f"check {key!r} in the YAML file"
 
 
-def _is_below(file: Path, path: Path) -> bool:
-    # In a linked colcon workspace the YAML file is itself a link: allow the folder of
-    # either.
-    folders = path.parent.resolve(), path.resolve().parent
+def _is_below(file: Path, yaml_file: Path) -> bool:
+    """Return whether a file lies in the folder of a YAML file, or below it."""
+    # In a linked colcon workspace the YAML file is itself a link: the link's folder and
+    # the folder of the linked file are allowed.
+    folders = yaml_file.parent.resolve(), yaml_file.resolve().parent
     return any(file.resolve().is_relative_to(folder) for folder in folders)
 
 
 class Pixels(NamedTuple):
     """The pixels of an image."""
 
-    grey: NDArray[np.uint8]  # (H, W)
-    is_clear: NDArray[np.bool_]  # (H, W): whether they are not opaque
+    grey: NDArray[np.uint8]  # (H, W): 0 is black
+    is_clear: NDArray[np.bool_]  # (H, W): True where not opaque
 
 
 def _read_image(file: Path, formats: tuple[str, ...], layouts: set[str]) -> Pixels:
-    """Read an image of some of Pillow's formats and layouts."""
+    """Read an image; a MapDataError if it is none of these formats and layouts.
+
+    Parameters
+    ----------
+    file : Path
+    formats : tuple of str
+        Pillow's names of file formats.
+    layouts : set of str
+        Pillow's names of pixel layouts, see `LAYOUTS`.
+    """
     from PIL import Image  # 17 ms, and a planner that is sent its maps reads no image
 
     too_large = Image.DecompressionBombWarning, Image.DecompressionBombError
@@ -371,16 +397,17 @@ def _check_layout(image: Any, layouts: set[str]) -> None:
     """Raise a ValueError for an image that is too large, or of another layout."""
     if image.width * image.height > MAX_CELLS:
         raise ValueError(f"{image.width} x {image.height} pixels")
+    # How Pillow will decode the image: the decoder's name, and its arguments, which are
+    # the layout alone or begin with the layout.
     codec, *_, arguments = image.tile[0]
-    layout, *rest = [arguments] if isinstance(arguments, str) else arguments
-    # The last argument of a PPM is its greatest value, unless that is the greatest of
-    # its bytes.
+    layout, *options = [arguments] if isinstance(arguments, str) else arguments
+    # For a PPM the greatest value follows, unless that is the greatest of its bytes.
     greatest = 65535 if image.mode == "I" else 255
-    if codec.startswith("ppm") and rest not in ([], [greatest]):
+    if codec.startswith("ppm") and options not in ([], [greatest]):
         # Versions of map_server disagree on the meaning of other greatest values.
         right = "255, or 65535 for grey"
         raise ValueError(
-            f"its greatest value is {rest[0]}; give {right}, or an 8-bit grey PNG"
+            f"its greatest value is {options[0]}; give {right}, or an 8-bit grey PNG"
         )
     if layout not in layouts or codec == "bmp_rle":
         raise ValueError(
@@ -402,7 +429,11 @@ def _pixels(image: Any) -> Pixels:
 
 
 def _grey(image: Any) -> NDArray[np.integer[Any]]:
-    """Return map_server's grey values: 16-bit Rec. 601 luma, cut to 8 bits."""
+    """Return map_server's grey values, 0 to 255: (H, W).
+
+    map_server computes the luma of Rec. 601 with 16 bits, and cuts it to 8 bits. Values
+    of 16 bits are 257 times those of 8 bits.
+    """
     if image.mode.startswith("I"):
         return np.asarray(image) // 257
     if image.mode in ("1", "L", "LA"):
@@ -412,8 +443,8 @@ def _grey(image: Any) -> NDArray[np.integer[Any]]:
     red = channels[0]
     green = channels[1]
     blue = channels[2]
-    luma = 257 * (299 * red + 587 * green + 114 * blue)
-    rounded_luma = (luma + 500) // 1000  # 16 bits
+    luma_times_1000 = 257 * (299 * red + 587 * green + 114 * blue)
+    rounded_luma = (luma_times_1000 + 500) // 1000  # 16 bits
     grey: NDArray[np.int32] = rounded_luma // 257
     return grey
 
@@ -430,6 +461,7 @@ def _value(document: dict[str, Any], key: str) -> Any:
 
 
 def _choice(document: dict[str, Any], key: str, choices: Sequence[str]) -> str:
+    """Return the value of a key in lower case; a ValueError unless it is a choice."""
     value = _value(document, key)
     if not isinstance(value, str) or value.lower() not in choices:
         raise ValueError(f"{key} is {_short(value)}; give one of {', '.join(choices)}")
@@ -437,7 +469,7 @@ def _choice(document: dict[str, Any], key: str, choices: Sequence[str]) -> str:
 
 
 def _numbers(document: dict[str, Any], key: str) -> Any:
-    """Return a number or a list of numbers, of any length."""
+    """Return the value of a key: a number, or a list of numbers of any length."""
     value = _value(document, key)
     try:
         if isinstance(value, list):
@@ -448,7 +480,17 @@ def _numbers(document: dict[str, Any], key: str) -> Any:
 
 
 def _percent_of_grey(document: dict[str, Any], mode: str) -> NDArray[np.int8]:
-    """Return (256,) int8: the occupancy of each grey value, by map_server's rules."""
+    """Return the occupancy of each grey value by map_server's rules: (256,) int8.
+
+    Parameters
+    ----------
+    document : dict
+        The content of the YAML file, with thresholds.
+    mode : str
+        How map_server derives occupancy: ``raw`` takes the grey values themselves, for
+        0 to 100; ``trinary`` knows 0, 100 and unknown; ``scale`` also has percent
+        between the thresholds.
+    """
     free_thresh = as_number("free_thresh", _numbers(document, "free_thresh"), 0, 1)
     occupied_thresh = as_number(
         "occupied_thresh", _numbers(document, "occupied_thresh"), 0, 1
@@ -470,18 +512,19 @@ def _percent_of_grey(document: dict[str, Any], mode: str) -> NDArray[np.int8]:
     percent = np.full(256, float(UNKNOWN))
     if mode == "scale":
         is_between = (free < darkness) & (darkness < occupied)
-        # map_server subtracts the thresholds in double precision.
-        width = np.float32(occupied_thresh - free_thresh)
-        scaled = (darkness[is_between] - free) / width * np.float32(100)
+        # map_server subtracts the thresholds in double precision, and rounds 0.5 up.
+        range_of_scale = np.float32(occupied_thresh - free_thresh)
+        scaled = (darkness[is_between] - free) / range_of_scale * np.float32(100)
         rounded_down = np.floor(scaled)
-        percent[is_between] = rounded_down + (scaled - rounded_down >= 0.5)
+        is_rounded_up = scaled - rounded_down >= 0.5
+        percent[is_between] = rounded_down + is_rounded_up
     percent[darkness >= occupied] = 100
     percent[darkness <= free] = 0
     return percent.astype(np.int8)
 
 
 def _truth(document: dict[str, Any], key: str) -> bool:
-    """Return the truth value of a key."""
+    """Return the truth value of a key; a ValueError if it is neither true nor false."""
     value = _value(document, key)
     try:
         return as_truth(value)

@@ -56,7 +56,7 @@ class _Loader(yaml.BaseLoader):
         """Accept each character: most that are not printable stand in comments."""
 
     def scan_to_next_token(self) -> None:
-        """Pass white space, with tabs, and comments."""
+        """Move on to the next token, over white space, tabs and comments."""
         while True:
             while self.peek() in " \t\ufeff":
                 if self.peek() == "\t" and not self.flow_level:
@@ -71,7 +71,10 @@ class _Loader(yaml.BaseLoader):
                 self.allow_simple_key = True
 
     def scan_plain_spaces(self, indent: int, start_mark: Any) -> Any:
-        """Return the white space within a plain scalar, with tabs."""
+        """Return the white space at this place in a plain scalar, as a list of texts.
+
+        It may have tabs, unlike in PyYAML, whose method handles line breaks.
+        """
         length = 0
         while self.peek(length) in " \t":
             length += 1
@@ -118,6 +121,7 @@ def read_yaml(content: bytes) -> Any:
 
 
 def _decoded(content: bytes) -> str:
+    """Return the text of a YAML file; see `read_yaml` for bytes that are no UTF-8."""
     encoding = _encoding_of(content)
     errors = "surrogateescape" if encoding.startswith("utf-8") else "replace"
     return content.decode(encoding, errors)
@@ -162,8 +166,10 @@ def as_truth(text: Any) -> bool:
 
 def _fits_into_int(integer: re.Match[str]) -> bool:
     """Return whether C++ can hold a match of `INTEGER` as an int."""
-    is_negative = integer[1] == "-"
-    return _magnitude(integer) < 2**31 + is_negative
+    number = _magnitude(integer)
+    if integer[1] == "-":
+        number = -number
+    return -(2**31) <= number < 2**31
 
 
 def _magnitude(integer: re.Match[str]) -> int:

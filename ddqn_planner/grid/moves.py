@@ -51,9 +51,9 @@ class MoveRule(Choice):
 
 
 def shifted(padded: NDArray[Scalar], dx: int, dy: int) -> NDArray[Scalar]:
-    """Return the value of each cell's neighbour at (dx, dy): (H, W).
+    """Return the value of each cell's neighbour at (dx, dy): a view, (H, W).
 
-    The array has a border of one cell: (H + 2, W + 2).
+    The array `padded` has a border of one cell: (H + 2, W + 2).
     """
     height, width = padded.shape
     return padded[1 + dy : height - 1 + dy, 1 + dx : width - 1 + dx]
@@ -79,18 +79,19 @@ def path_length(cells: Cells) -> float:
 
 
 def positions(parts: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return positions that divide each segment of a path into equal parts.
+    """Return positions that divide each segment of a path into equal parts: (P + 1,).
 
-    The position 2.5 is the middle of the third segment, whose index is 2.
+    A position is the index of a segment plus a share of it: 2.5 is the middle of the
+    third segment. They are the starts of all P parts, and the end of the path.
 
     Parameters
     ----------
     parts : (N,) int64
-        The number of parts of each segment.
+        The number of parts of each of the N segments.
     """
-    segment = np.repeat(np.arange(len(parts)), parts)  # (P,) of each part
-    first_of_segment = np.repeat(np.cumsum(parts) - parts, parts)  # (P,)
-    part_of_segment = np.arange(len(segment)) - first_of_segment
+    segment = np.repeat(np.arange(len(parts)), parts)  # (P,): the segment of each part
+    first_part = np.cumsum(parts) - parts  # (N,): the first part of each segment
+    part_of_segment = np.arange(len(segment)) - first_part[segment]
     starts = segment + part_of_segment / parts[segment]
     return np.append(starts, float(len(parts)))
 
@@ -112,10 +113,12 @@ def cells_along(
     (M,) float64
         Their positions, see `positions`.
     """
-    extents = np.diff(path, axis=0)
-    position = positions(np.abs(extents).max(axis=1))
-    share, segment = np.modf(position)
-    segment = segment.astype(np.int64)
-    extents = np.append(extents, [[0, 0]], axis=0)  # of the last position
-    cells = path[segment] + np.floor(share[:, None] * extents[segment] + 0.5)
+    extents = np.diff(path, axis=0)  # (N - 1, 2)
+    steps = np.abs(extents).max(axis=1)  # that a segment takes from cell to cell
+    position = positions(steps)
+    share, whole = np.modf(position)
+    segment = whole.astype(np.int64)  # the last position is that of cell N - 1
+    extents = np.append(extents, [[0, 0]], axis=0)
+    offset = np.floor(share[:, None] * extents[segment] + 0.5)  # 0.5 is rounded up
+    cells = path[segment] + offset
     return cells.astype(np.int32), position

@@ -34,8 +34,8 @@ def scatter_obstacles(
 ) -> tuple[GridMap, int]:
     """Return the map with 1 to 5 more obstacles, and the number of rejected draws.
 
-    The obstacles lie within `reach` cells of the path, and leave a path from its start
-    to its goal.
+    The obstacles lie within `reach` cells of the path. They are drawn again until they
+    leave a path from its start to its goal.
     """
     check_grid(grid)
     cells = [as_cell(cell) for cell in listed(path, "the path", "give cells (x, y)")]
@@ -60,11 +60,14 @@ def scatter_obstacles(
 
 
 def _free_cells_beside(path: Sequence[Cell], reach: int, grid: GridMap) -> list[Cell]:
-    """Return the free cells within a reach of a path, without its ends, sorted."""
+    """Return the free cells within `reach` cells of a path except its ends, sorted."""
     offsets = range(-reach, reach + 1)
-    cells = {(x + dx, y + dy) for x, y in path for dx in offsets for dy in offsets}
-    cells -= {path[0], path[-1]}
-    return sorted(cell for cell in cells if grid.is_free(cell))
+    near_path: set[Cell] = set()
+    for x, y in path:
+        for dx in offsets:
+            near_path.update((x + dx, y + dy) for dy in offsets)
+    candidates = near_path - {path[0], path[-1]}
+    return sorted(cell for cell in candidates if grid.is_free(cell))
 
 
 def _with_obstacles(
@@ -82,14 +85,16 @@ def _with_obstacles(
 def random_requests(
     occupancy: Occupancy, move_rule: MoveRule, count: int, random: np.random.Generator
 ) -> list[tuple[Cell, Cell]]:
-    """Draw starts and goals.
+    """Draw `count` pairs of a start and a goal, joined by a path.
 
-    Starts are uniform over the cells with a move, goals over the cells that paths from
-    the start lead to, without the start.
+    Starts are uniform over the free cells with a legal move, goals over the cells that
+    paths from the start lead to, without the start.
     """
-    label = GridMap(occupancy).labels(move_rule).ravel()  # (C,), 0 where occupied
-    # The free cells, with those of each component side by side.
-    cells = np.argsort(label, kind="stable")[np.count_nonzero(occupancy) :]
+    label = GridMap(occupancy).labels(move_rule).ravel()  # (C,): 0 where occupied
+    # The numbers y * W + x of the free cells, component by component: the cells of
+    # component k are cells[first_of_component[k]:][:size_of_component[k]].
+    sorted_by_label = np.argsort(label, kind="stable")
+    cells = sorted_by_label[np.count_nonzero(occupancy) :]
     component = label[cells]
     size_of_component = np.bincount(component)
     first_of_component = np.cumsum(size_of_component) - size_of_component
@@ -101,14 +106,16 @@ def random_requests(
     starts = random.choice(candidates, count)  # indices in `cells`
     first = first_of_component[component[starts]]
     size = size_of_component[component[starts]]
-    # The goal is 1 to size - 1 cells further in the component, which is a ring.
-    goals = first + (starts - first + random.integers(1, size)) % size
+    # The goal comes 1 to size - 1 cells after the start; after the last cell of the
+    # component comes its first cell again.
+    places_of_goals = (starts - first + random.integers(1, size)) % size
+    goals = first + places_of_goals  # indices in `cells`
     width = occupancy.shape[1]
     requests = []
     for start, goal in zip(cells[starts].tolist(), cells[goals].tolist(), strict=True):
-        start_cell = (start % width, start // width)
-        goal_cell = (goal % width, goal // width)
-        requests.append((start_cell, goal_cell))
+        start_y, start_x = divmod(start, width)
+        goal_y, goal_x = divmod(goal, width)
+        requests.append(((start_x, start_y), (goal_x, goal_y)))
     return requests
 
 

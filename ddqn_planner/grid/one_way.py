@@ -14,7 +14,9 @@ Indices = NDArray[np.int64]
 
 
 def forbidden_on(grid: GridMap, zones: GridMap) -> NDArray[np.uint8] | None:
-    """Return what the zones of another map of the same frame forbid on a map.
+    """Return which moves the one-way zones of another map forbid on a map.
+
+    Both maps have the same frame.
 
     Parameters
     ----------
@@ -53,22 +55,23 @@ def forbidden_on(grid: GridMap, zones: GridMap) -> NDArray[np.uint8] | None:
     corner_x = (cos * dx + sin * dy) / zones.resolution
     corner_y = (cos * dy - sin * dx) / zones.resolution
     side = grid.resolution / zones.resolution
-    in_columns = _along_axis(zones.forbidden, 1, corner_x, side, grid.width)
-    forbidden = _along_axis(in_columns, 0, corner_y, side, grid.height)
+    # First for the map's columns, still with the rows of the zones.
+    with_columns = _along_axis(zones.forbidden, 1, corner_x, side, grid.width)
+    forbidden = _along_axis(with_columns, 0, corner_y, side, grid.height)
     return forbidden if forbidden.any() else None
 
 
 def _along_axis(
     zones: NDArray[np.uint8], axis: int, corner: float, side: float, count: int
 ) -> NDArray[np.uint8]:
-    """Return the zones with other cells along one axis.
+    """Return the zones with new cells along one axis: (count, W) or (H, count).
 
     Parameters
     ----------
     zones : (H, W) uint8
-        As `GridMap.forbidden`.
+        The moves that each cell forbids, as a bit set; see `GridMap.forbidden`.
     axis : int
-        0 for the rows, 1 for the columns.
+        The axis along which the cells become new: 0 for rows, 1 for columns.
     corner, side : float
         Where the new cells begin, and how long they are, in cells of the zones.
     count : int
@@ -77,6 +80,7 @@ def _along_axis(
     shape = [*zones.shape]
     shape[axis] = count
     forbidden = np.zeros(shape, dtype=np.uint8)
+    # Views whose first axis is the one along which the cells become new.
     forbidden_by_cell = np.moveaxis(forbidden, axis, 0)
     zones_by_cell = np.moveaxis(zones, axis, 0)
     if side < 1 - ON_EDGE:
@@ -89,37 +93,37 @@ def _along_axis(
         len(zones_by_cell), 1 / side, -corner / side, count
     )
     if is_inside.any():
-        cells = index[is_inside]  # in ascending order
-        first_zone = np.flatnonzero(np.diff(cells, prepend=-1))  # in each new cell
+        new_cell_of_zone = index[is_inside]  # in ascending order
+        first_zones = np.flatnonzero(np.diff(new_cell_of_zone, prepend=-1))
         zones_inside = zones_by_cell[is_inside]
-        joined = np.bitwise_or.reduceat(zones_inside, first_zone, axis=0)
-        forbidden_by_cell[cells[first_zone]] = joined
+        joined = np.bitwise_or.reduceat(zones_inside, first_zones, axis=0)
+        forbidden_by_cell[new_cell_of_zone[first_zones]] = joined
     return forbidden
 
 
 def _cells_of_centres(
     centres: int, side: float, corner: float, count: int
 ) -> tuple[Indices, NDArray[np.bool_]]:
-    """Return the cells in which the centres of other cells lie.
+    """Return in which of some cells of length 1 the centres of N other cells lie.
 
     Parameters
     ----------
     centres : int
-        The number N of the other cells.
+        The number N of the other cells, which lie in a row.
     side, corner : float
-        How long they are, and where they begin.
+        The length of each of these other cells, and where the first one begins.
     count : int
-        The number of cells.
+        The number of cells of length 1, which lie from 0 to `count`.
 
     Returns
     -------
     (N,) int64
-        The cell of each centre, 0 for those outside.
+        The cell of each centre; 0 for a centre outside.
     (N,) bool
-        Whether it is one of the cells 0 to `count` - 1.
+        Whether each centre lies in one of the cells.
     """
     # A corner may be too far away for a number of cells.
     with np.errstate(all="ignore"):
-        place = corner + (np.arange(centres) + 0.5) * side + ON_EDGE
-    is_inside = (place >= 0) & (place < count)
-    return np.where(is_inside, place, 0).astype(np.int64), is_inside
+        position = corner + (np.arange(centres) + 0.5) * side + ON_EDGE
+    is_inside = (position >= 0) & (position < count)
+    return np.where(is_inside, position, 0).astype(np.int64), is_inside

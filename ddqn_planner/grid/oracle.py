@@ -29,6 +29,7 @@ def shortest_path(
     goal = cell_inside(goal, grid.occupancy.shape, "the goal")
     next_cell = _shortest_paths(grid, goal, move_rule).next_cell
     cells = [start]
+    # Cells have numbers y * W + x.
     number = next_cell[start[1] * grid.width + start[0]]
     while number >= 0:
         y, x = divmod(int(number), grid.width)
@@ -47,12 +48,17 @@ class ShortestPaths(NamedTuple):
 def _shortest_paths(
     grid: GridMap, goal: Cell, move_rule: MoveRule | str
 ) -> ShortestPaths:
+    """Return the cheapest paths to a goal, found by scipy's Dijkstra.
+
+    The graph is a sparse matrix of move costs: rows are the cells where moves begin,
+    columns the cells where they end.
+    """
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import dijkstra
 
     x, y = cell_inside(goal, grid.occupancy.shape, "the goal")
     # Shapes: A = 8 actions, C = cells. scipy wants the columns of each row sorted: to
-    # sort the 8 actions is quicker than to sort all edges.
+    # sort the 8 actions by the numbers of their ends is quicker than to sort all edges.
     step_A = (MOVES[:, 1] * grid.width + MOVES[:, 0]).astype(np.int32)
     order_A = np.argsort(step_A)
     legal_CA = grid.legal_moves(move_rule)[order_A].reshape(len(MOVES), -1).T
@@ -67,8 +73,10 @@ def _shortest_paths(
     edges = cost_CA[legal_CA], target_CA[legal_CA], row_starts
     graph = csr_array(edges, shape=(cells, cells))
 
+    # scipy's paths lead from the goal, so all moves are reversed. Without forbidden
+    # moves, the reverse of each move is legal and costs the same.
     if grid.forbidden is not None:
-        graph = graph.T  # paths lead to the goal, and scipy's lead from it
+        graph = graph.T
     distance, next_cell = dijkstra(
         graph, indices=y * grid.width + x, return_predecessors=True
     )

@@ -18,20 +18,21 @@ class Rotation(NamedTuple):
     @property
     def norm(self) -> float:
         """Its length, which is 1 for a rotation; NaN if one of the numbers is."""
-        # Of NaN and infinity hypot makes infinity.
+        # The hypot of NaN and infinity is infinity.
         return math.nan if any(map(math.isnan, self)) else math.hypot(*self)
 
     @property
     def is_rounded(self) -> bool:
-        """Whether it is a rotation but for the rounding of its numbers."""
+        """Whether it is a rotation except for the rounding of its numbers."""
         return LEAST_NORM <= self.norm <= GREATEST_NORM
 
     @property
     def yaw(self) -> float:
         """The heading of the turned x axis in the plane, radians, for any norm > 0."""
-        ahead = self.w**2 + self.x**2 - self.y**2 - self.z**2
-        aside = 2 * (self.x * self.y + self.w * self.z)
-        return math.atan2(aside, ahead)
+        # The coordinates of the turned x axis, times the squared norm.
+        x_of_axis = self.w**2 + self.x**2 - self.y**2 - self.z**2
+        y_of_axis = 2 * (self.x * self.y + self.w * self.z)
+        return math.atan2(y_of_axis, x_of_axis)
 
     @property
     def tilt(self) -> float:

@@ -19,7 +19,7 @@ from ddqn_planner.grid import (
     MoveRule,
     legal_moves,
 )
-from ddqn_planner.grid.boxes import ORIGIN, Box, wider, within
+from ddqn_planner.grid.boxes import ORIGIN, Box, relative_to, wider
 from ddqn_planner.grid.copies import replaced
 from ddqn_planner.grid.grid_map import LAYERS
 
@@ -127,8 +127,8 @@ class MoveCosts(NamedTuple):
             if layer is not None:
                 layers[name] = layer[region].copy()  # in C order, as numba expects
         part = self.on_map(grid.with_layers(**layers), reads_all=True)
-        cells_of_part = within(cells, region, 1)
-        cells_of_map = within(cells, ORIGIN, 1)
+        cells_of_part = relative_to(region, cells, border=1)
+        cells_of_map = relative_to(ORIGIN, cells, border=1)
 
         def with_part(
             array: NDArray[Number], array_of_part: NDArray[Number]

@@ -436,8 +436,8 @@ def test_unknown_inscribed_lethal_cells_are_closed(
 def shared(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let small arrays share their memory, too."""
     monkeypatch.setattr(copies, "SMALL", 0)
-    monkeypatch.setattr(copies, "LARGE", 1)
-    monkeypatch.setattr(copies, "BOX", 1)
+    monkeypatch.setattr(copies, "CELLS_PER_CHANGE", 1)
+    monkeypatch.setattr(copies, "CELLS_PER_BOX", 1)
 
 
 BOXES = st.tuples(

@@ -223,8 +223,8 @@ def any_share(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fields, "REPAIRED", fields.REPAIRED)  # tests change it
     for name, value in {
         "SMALL": 0,
-        "BOX": 1,
-        "LARGE": 1,
+        "CELLS_PER_BOX": 1,
+        "CELLS_PER_CHANGE": 1,
     }.items():  # copies share memory
         monkeypatch.setattr(copies, name, value)
     monkeypatch.setattr(grid_map, "MAX_PATCHES", 3)
