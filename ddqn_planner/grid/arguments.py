@@ -118,7 +118,7 @@ def real(value: Any) -> float:
     try:
         return float(value)
     except OverflowError:  # an int or a fraction that is too large for a float
-        return math.inf if value > 0 else -math.inf
+        return -math.inf if value < 0 else math.inf
 
 
 def as_number(
