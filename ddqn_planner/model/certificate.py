@@ -119,7 +119,8 @@ def certify(
     occupied so, under a rule. It is proved if it is right for all costs of the free
     cells, and for all unknown cells among them.
     """
-    # Here P = the 512 patches of each rule; then only the patterns with a free centre.
+    # Shapes: P = the 512 patches of each rule, then only those with a free centre, A =
+    # 8 actions, I = inputs, 9 = the cells of a patch.
     every_P9 = every_patch()
     features = [network.features(every_P9, rule) for rule in move_rules]
     legal_PA = np.concatenate([legal_in_patches(every_P9, rule) for rule in move_rules])
@@ -171,6 +172,7 @@ def _count_wrong(
     """Return how many open decisions are wrong for the costs of the least margin.
 
     The network itself is asked, with one example of costs for each open decision.
+    Shapes: P patterns, A = 8 actions, I inputs, B open decisions.
 
     Parameters
     ----------
@@ -206,6 +208,9 @@ def logit_margins(
     network: PatchNetwork, feature_PI: Float32, legal_PA: NDArray[np.bool_]
 ) -> Margins:
     """Bound how far each logit is on its right side of 0.
+
+    Shapes: P patterns, A = 8 actions, F filters, I inputs, C = 18 of these for costs
+    and unknown cells.
 
     Parameters
     ----------
@@ -256,6 +261,9 @@ def _lines_of_layers(
     The inputs of a ReLU are bounded by the least and greatest sums for all costs and
     unknown cells. With one slope for both lines around a ReLU, one product gives the
     bounds of the hidden layer (Fast-Lin, Weng et al. 2018).
+
+    Shapes: P patterns, F filters, I inputs, C = 18 of these for costs and unknown
+    cells. `feature_PI` has the inputs of each pattern; those for costs are 0.
     """
     # Copies, as products with transposed arrays are slow.
     weight_IF = tensors["convolution.weight"].T.copy()
@@ -282,7 +290,7 @@ class _Lines:
     """
 
     def __init__(self, least_PF: Float64, greatest_PF: Float64) -> None:
-        """Take the least and the greatest input of each ReLU."""
+        """Take the least and the greatest input of each ReLU, for P patterns."""
         greatest_output_PF = np.maximum(greatest_PF, 0)
         below_0_PF = np.minimum(least_PF, 0)
         # The upper line leads from (least, 0) to (greatest, greatest) if these lie on
@@ -322,7 +330,8 @@ def _multiplier_error(
 ) -> float:
     """Bound the relative error of legal moves' cost multipliers, for all costs.
 
-    The network computes a multiplier as 1 + max(0, sum of weighted inputs).
+    The network computes a multiplier as 1 + max(0, sum of weighted inputs). Shapes: P
+    patterns, A = 8 actions, I inputs, 2 = the cells before and after a move.
 
     Parameters
     ----------
@@ -423,7 +432,7 @@ def _terms_of_values(cost_weight: float, unknown_weight: float) -> Float64:
 def _rounding_error(
     network: PatchNetwork, greatest_of_input: Sequence[tuple[str, Float32]]
 ) -> Float32:
-    """Bound the rounding errors of the last of some layers in float32: (U,).
+    """Bound the rounding errors of the U outputs of the last of some layers: (U,).
 
     Parameters
     ----------

@@ -78,7 +78,7 @@ class MoveCosts(NamedTuple):
 
     @classmethod
     def of_table(cls, table_PA: Array) -> MoveCosts:
-        """Return the costs of a table (P, 8), for no map yet.
+        """Return the costs of a table of P patches and 8 actions, for no map yet.
 
         The table gets one more row, for a patch that no move leaves.
         """
@@ -231,7 +231,8 @@ class MoveCosts(NamedTuple):
         """Return the costs, infinite for the actions that cells forbid.
 
         The table gets a copy of all its rows for each set of forbidden actions that
-        occurs on the map. A cell's patch number then leads to the copy of its set.
+        occurs on the map. A cell's patch number, a row of the table, then leads to the
+        copy for its set. Shapes: C cells, S sets, P rows of the table, A = 8 actions.
 
         Parameters
         ----------

@@ -96,7 +96,7 @@ class QNetwork:
         raise NotImplementedError
 
     def _layer(self, name: str, input_BI: Array) -> Array:
-        """Return the output of a fully connected layer: (B, O)."""
+        """Return the O outputs of a fully connected layer for B inputs: (B, O)."""
         with np.errstate(
             over="ignore", invalid="ignore"
         ):  # a broken model may overflow
@@ -173,6 +173,9 @@ def _outputs_by_robot_cell(
 
     The layer is linear, so its output is that for the observation without a robot, plus
     the changes in the few windows of the convolution that contain the robot.
+
+    Shapes: C = cells, and at the end one that stands for all outside the map, L =
+    windows of 9 cells, F = filters, U = outputs of the layer.
 
     Parameters
     ----------
@@ -263,7 +266,7 @@ class PropagationQNetwork(QNetwork):
 
     @classmethod
     def features(cls, patch_B9: NDArray[np.int8], move_rule: MoveRule) -> Array:
-        """Return the inputs of the network for patches, see `patches`: (B, I).
+        """Return the I inputs of the network for B patches, see `patches`: (B, I).
 
         Without costs I = 9: whether each cell is occupied. With costs I = 28: then each
         cell's cost, 0 to 0.99, whether it is unknown, and whether corners are cut.
@@ -280,7 +283,10 @@ class PropagationQNetwork(QNetwork):
         return feature_BI
 
     def success(self, feature_BI: Array) -> Array:
-        """Return the probability p(s, a) that a move succeeds, 0..1: (B, 8)."""
+        """Return the probability p(s, a) that each move succeeds, 0..1: (B, 8).
+
+        `feature_BI` has the inputs for B patches; see `features`.
+        """
         hidden_BF = np.maximum(self._layer("convolution", feature_BI), 0)
         hidden_BF = np.maximum(self._layer("hidden", hidden_BF), 0)
         # The sigmoid function, without overflow.
@@ -288,7 +294,7 @@ class PropagationQNetwork(QNetwork):
         return p_BA
 
     def tries(self, feature_BI: Array) -> Array:
-        """Return how many tries a move takes, 1/p: (B, 8).
+        """Return how many tries each move takes in B patches, 1/p: (B, 8).
 
         It is 1 for a p of `CERTAIN` or more, and infinite if p is at most 1/2, or NaN:
         then the move counts as impossible.
@@ -300,7 +306,7 @@ class PropagationQNetwork(QNetwork):
         return tries_BA
 
     def multiplier(self, feature_BI: Array) -> Array:
-        """Return the cost multiplier of each move, 1 or more: (B, 8)."""
+        """Return the cost multiplier of each move in B patches, 1 or more: (B, 8)."""
         if not self.uses_costs:
             return np.ones((len(feature_BI), len(MOVES)), dtype=np.float32)
         multiplier_BA: Array = 1 + np.maximum(self._layer("prices", feature_BI), 0)
@@ -354,6 +360,9 @@ class PropagationQNetwork(QNetwork):
     ) -> MoveCosts | None:
         """Return costs as sums over a move's two cells, or None if they are none.
 
+        Shapes: 9 = the cells of a patch, A = 8 actions, L = the codes of a cell's cost
+        (0 unknown, 1 to 100 for costs 0 to 99, 101 occupied).
+
         Parameters
         ----------
         move_rule : MoveRule
@@ -389,8 +398,9 @@ class PropagationQNetwork(QNetwork):
     def _price_terms(self, move_rule: MoveRule) -> Array:
         """Return what a cell of the patch adds to a cost multiplier: (9, 8, L).
 
-        The indices are the cell, the action and the code of the cell's cost. The layer
-        is linear, so a multiplier is 1 plus the sum of these terms over the cells.
+        The indices are the cell, the action and the code of the cell's cost: 0 unknown,
+        1 to 100 for costs 0 to 99, 101 occupied. The layer is linear, so a multiplier
+        is 1 plus the sum of these terms over the cells.
         """
         weight_AI = self.tensors["prices.weight"]
         cells_weight_AI = weight_AI[:, :27]  # without the weight of the move rule
@@ -426,8 +436,9 @@ class PropagationQNetwork(QNetwork):
     def _costs_of(
         self, patch_P9: NDArray[np.int8], move_rule: MoveRule, has_times: bool
     ) -> Array:
-        """Return each move's cost, infinite if it is not possible: (P, 8).
+        """Return each move's cost in P patches, infinite if not possible: (P, 8).
 
+        The patches are evaluated in batches of B; I = inputs, A = 8 actions.
         For a map with times the cost is the length times the tries, without the
         multiplier, which follows from the times.
         """

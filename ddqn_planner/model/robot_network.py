@@ -51,9 +51,10 @@ class RobotNetwork(QNetwork):
 
     @classmethod
     def untrained(cls, footprint: Float64, motions: Motions) -> RobotNetwork:
-        """Return the network of a robot, without a training.
+        """Return the network of a robot, without a training: all weights are 0.
 
         Raises a ValueError if the footprint or the motions are those of no robot.
+        Shapes: U units, S x S cells, P primitives, N poses of all primitives.
         """
         swept_USS = swept_cells(footprint, units_of(motions).motions)
         units, side, _ = swept_USS.shape
@@ -111,7 +112,11 @@ class RobotNetwork(QNetwork):
         return False
 
     def of_primitives(self, array_USS: NDArray[Any]) -> NDArray[Any]:
-        """Return the arrays of primitives, turned from those of units: (P, S, S)."""
+        """Return an array (S, S) of cells for each primitive: (P, S, S).
+
+        It is the array of the primitive's unit, (U, S, S), turned by the quarter turns
+        by which the primitive differs from its unit.
+        """
         turned = [np.rot90(array_USS, -turns, axes=(1, 2)) for turns in range(4)]
         turned_4USS = np.stack(turned)
         return turned_4USS[self.turns, self.unit]
@@ -138,8 +143,8 @@ class RobotNetwork(QNetwork):
 class _Primitives(NamedTuple):
     """The columns of the tensor `primitive`: (P,) each."""
 
-    start: NDArray[Any]  # the heading before
-    end: NDArray[Any]  # and after
+    start: NDArray[Any]  # the first heading
+    end: NDArray[Any]  # the last heading
     dx: NDArray[Any]  # cells from begin to end
     dy: NDArray[Any]
     cost: NDArray[Any]
@@ -150,7 +155,10 @@ COLUMNS: Final = _Primitives._fields
 
 
 def _motions_of(tensors: Mapping[str, NDArray[Any]]) -> Motions:
-    """Return the motions that tensors hold; a ValueError if they are none."""
+    """Return the motions in a network's tensors; a ValueError if they are damaged.
+
+    All columns of the tensor `primitive` except the cost should be whole numbers.
+    """
     column = _Primitives(*tensors["primitive"].T)  # float64
     start = column.start.astype(np.int64)
     end = column.end.astype(np.int64)
@@ -197,7 +205,19 @@ def _check_ends(
     heading_P: NDArray[np.int64],
     angles: Float64,
 ) -> None:
-    """Raise a ValueError unless poses lie in the middle of cells, with headings."""
+    """Raise a ValueError unless poses lie in the centres of cells, with headings.
+
+    Parameters
+    ----------
+    pose_P3 : (P, 3)
+        The first, or the last, pose of each primitive: cells, cells, radians.
+    cell_P2 : (P, 2)
+        The cell where it should lie.
+    heading_P : (P,)
+        The heading that it should have. All headings should occur.
+    angles : (16,)
+        The yaw of each heading, radians.
+    """
     cells_off = np.abs(pose_P3[:, :2] - cell_P2).max()
     radians_off = np.abs(turn_between(pose_P3[:, 2], angles[heading_P])).max()
     has_all_headings = len(np.unique(heading_P)) == HEADINGS

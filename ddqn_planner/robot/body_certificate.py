@@ -54,6 +54,9 @@ def certify_body(
 ) -> BodyCertificate:
     """Prove which cells forbid each primitive, for all patterns of occupied cells.
 
+    Shapes: U = units of the network, which P primitives share, S x S cells with the
+    robot in the middle.
+
     Parameters
     ----------
     weight_USS : (U, S, S) float32
