@@ -20,9 +20,9 @@ from ddqn_planner.planning.queues import (
     buckets_are_past,
     has_full_bucket,
     make_buckets,
+    pop_from_bucket,
     push_to_bucket,
     states_in_buckets,
-    take_from_bucket,
 )
 from ddqn_planner.planning.wavefront import (
     DONE,
@@ -36,11 +36,11 @@ from ddqn_planner.planning.wavefront import (
     spread,
 )
 
-MARKED: Final = 4  # a mark of open cells while they are counted
+COUNTED: Final = 4  # a mark of open cells while they are counted, beside OPEN
 
-# The distance of the goal: not 0, which means that a cell was not reached, and as good
-# as 0 in every sum. Distances begin with 0, as pages of memory that no request needs
-# are then never touched.
+# Distances are 0 where a cell was not reached: pages of memory that no request needs
+# are then never touched. So the distance of the goal is the least number above 0, which
+# is as good as 0 in every sum.
 AT_GOAL: Final = 5e-324
 CAPACITY = 4.0  # cells of a bucket, at first, per cell of a square map's side
 BUCKETS: Final = 2  # per unit of cost; with more, fewer needless cells are visited
@@ -48,28 +48,32 @@ SAME: Final = 1 + 1e-12  # paths cost the same up to this factor: sums are round
 # Cells that cost as much as the start, up to this factor, are closed too: so a rollout
 # does not depend on the requests before.
 TIES: Final = 1 + 1e-6
+NO_ACTION: Final = -1
+TOO_MANY: Final = -1  # what `_lose_unsupported` returns where a limit is exceeded
 
 MOVE_X, MOVE_Y = MOVES.T.copy()
 
-# The lowest bit of a byte that is set.
+# (256,): the number of the lowest bit of a byte that is set.
 LOWEST_BIT = np.array(
     [0] + [(bits & -bits).bit_length() - 1 for bits in range(1, 256)], np.uint64
 )
 # Unsigned, as numba then looks for no index that counts from the end.
-ONE, ACTIONS, TERMS_OF_ACTION, TERMS_AFTER = np.array(
-    [1, 8, COST_CODES, 8 * COST_CODES], np.uint64
-)
+ONE, ACTIONS = np.array([1, 8], np.uint64)
+# Where terms of a move are, see `MoveCosts.terms`: those of an action from this many
+# times the action on, and those of the cell that the move leads to from this on.
+TERMS_OF_ACTION, TERMS_OF_END = np.array([COST_CODES, 8 * COST_CODES], np.uint64)
 
 
 class Known(NamedTuple):
     """What is known of a field; cells are numbers of a padded map, see `MoveCosts`."""
 
-    # (C,): the least costs of paths to the goal. As float32 they would lose the order
-    # of neighbours above some 10^6.
+    # (C,): the least cost found of a path from each cell to a goal: 0 where no path was
+    # found, AT_GOAL at a goal. As float32 they would lose the order of neighbours above
+    # some 10^6.
     distance: NDArray[np.float64]
     mark: NDArray[np.uint8]  # (C,): UNREACHED, OPEN or CLOSED
-    opened: NDArray[np.int32]  # all cells that are open, and some others
-    # Whether closed cells have the least distances: those of a repair may be too great.
+    opened: NDArray[np.int32]  # (K,): all cells that are open, and some others
+    # Whether closed cells have the least distances: after a repair, some are too great.
     closed_is_final: bool = True
 
 
@@ -97,7 +101,7 @@ def step_costs(costs: MoveCosts) -> StepCosts:
 
 
 class LowerBound(NamedTuple):
-    """What a path from a cell to a start costs at least: its moves if none is longer."""
+    """What a path between a cell and a start costs at least, if no cell is occupied."""
 
     start_x: int
     start_y: int
@@ -114,20 +118,32 @@ class CellSpace(NamedTuple):
 
 
 @inlined
+def after_move(cell: int, action: int, costs: Any) -> Any:
+    """Return the number of the cell to which an action leads from a cell."""
+    # Unsigned, as numba then looks for no index that counts from the end.
+    return np.uint64(cell + MOVE_Y[action] * costs.width + MOVE_X[action])
+
+
+@inlined
 def cost_of(cell: int, action: int, costs: Any) -> Any:
-    """Return the cost of a move, infinite if it is not possible. See `MoveCosts`."""
+    """Return the cost of a move from a cell, infinite if it is not possible.
+
+    How it is made of the table, the terms and the multipliers, `MoveCosts` says.
+    """
     begin = np.uint64(cell)
-    end = np.uint64(cell + MOVE_Y[action] * costs.width + MOVE_X[action])
-    cost = costs.table[
-        ACTIONS * np.uint64(costs.patch_number[begin]) + np.uint64(action)
-    ]
+    end = after_move(cell, action, costs)
+    action_number = np.uint64(action)
+    patch = np.uint64(costs.patch_number[begin])
+    cost = costs.table[ACTIONS * patch + action_number]
     if costs.multiplier.size > 0:
-        # One of them as float64, so that the sum is no float32.
-        return cost * (np.float64(costs.multiplier[begin]) + costs.multiplier[end]) / 2
+        # As float64, so that the sum is no float32.
+        multiplier_of_begin = np.float64(costs.multiplier[begin])
+        return cost * (multiplier_of_begin + costs.multiplier[end]) / 2
     if costs.terms.size > 0:
-        first = np.uint64(action) * TERMS_OF_ACTION
+        first = action_number * TERMS_OF_ACTION
         term_of_begin = costs.terms[first + costs.cost_code[begin]]
-        cost *= term_of_begin + costs.terms[first + TERMS_AFTER + costs.cost_code[end]]
+        term_of_end = costs.terms[first + TERMS_OF_END + costs.cost_code[end]]
+        cost *= term_of_begin + term_of_end
     return np.float64(cost)
 
 
@@ -135,10 +151,10 @@ def cost_of(cell: int, action: int, costs: Any) -> Any:
 
 
 @inlined
-def remaining_cost(x: int, y: int, bound: Any) -> Any:
-    """Return what moves over x columns and y rows cost at least."""
-    columns = abs(x)
-    rows = abs(y)
+def remaining_cost(dx: int, dy: int, bound: Any) -> Any:
+    """Return what a path over dx columns and dy rows, of any sign, costs at least."""
+    columns = abs(dx)
+    rows = abs(dy)
     diagonals = columns if columns < rows else rows
     straight_moves = columns + rows - 2 * diagonals
     return bound.straight * straight_moves + bound.diagonal * diagonals
@@ -148,62 +164,62 @@ def remaining_cost(x: int, y: int, bound: Any) -> Any:
 def _expand_cell(
     cell_number: int, distance: Any, mark: Any, queue: Any, space: Any
 ) -> None:
-    """Open each cell from which a move to a closed one is cheaper than it is."""
+    """Lower the distance of each neighbour that is nearer to a goal by way of a cell.
+
+    Such a neighbour is marked as open and queued. The cell was just closed; `distance`
+    and `mark` (C,) are those of `Known`.
+    """
     costs = space.costs
     bound = space.bound
     cell = np.uint64(cell_number)
     cost_from_cell = distance[cell]
-    # First a set of the actions that may make a cell cheaper, by a cost without the
-    # multipliers, which is no greater than the exact one. Illegal moves take no branch,
-    # which the processor would often predict wrong.
+    # First a set of actions, bit a for action a: those whose move from a neighbour to
+    # the cell may lower the neighbour's distance. It is judged by the cost without the
+    # multipliers, which is no greater than the exact one. Impossible moves, of infinite
+    # cost, take no branch, which the processor would often predict wrong.
     cheaper_by = np.uint64(0)
-    term_after = TERMS_AFTER + np.uint64(
-        costs.cost_code[cell] if costs.terms.size > 0 else 0
-    )
+    term_of_cell = TERMS_OF_END
+    if costs.terms.size > 0:
+        term_of_cell += np.uint64(costs.cost_code[cell])
     for number in range(8):
         action = np.uint64(number)
-        previous = cell - space.offset[action]
-        step = costs.table[ACTIONS * np.uint64(costs.patch_number[previous]) + action]
+        neighbour = cell - space.offset[action]
+        patch = np.uint64(costs.patch_number[neighbour])
+        step = costs.table[ACTIONS * patch + action]
         if costs.terms.size > 0:
             first = TERMS_OF_ACTION * action
-            term = costs.terms[first + costs.cost_code[previous]]
-            step *= term + costs.terms[first + term_after]
-        cost_before = distance[previous] if distance[previous] > 0 else np.inf
+            term_of_neighbour = costs.terms[first + costs.cost_code[neighbour]]
+            step *= term_of_neighbour + costs.terms[first + term_of_cell]
+        cost_before = _cost_before(distance, neighbour)
         cheaper_by |= np.uint64(cost_from_cell + step < cost_before) << action
-    # Divisions of 32 bits take half as long as those of 64.
-    x = np.int64(np.uint32(cell) % np.uint32(costs.width)) - bound.start_x
-    y = np.int64(np.uint32(cell) // np.uint32(costs.width)) - bound.start_y
+    # Columns and rows from the start. Divisions of 32 bits take half as long as those
+    # of 64.
+    dx = np.int64(np.uint32(cell) % np.uint32(costs.width)) - bound.start_x
+    dy = np.int64(np.uint32(cell) // np.uint32(costs.width)) - bound.start_y
     while cheaper_by:
         action = LOWEST_BIT[cheaper_by]
-        cheaper_by &= cheaper_by - ONE
-        previous = cell - space.offset[action]
-        cost_before = distance[previous] if distance[previous] > 0 else np.inf
-        cost = cost_from_cell + cost_of(np.int64(previous), np.int64(action), costs)
-        if cost < cost_before:
-            remaining = remaining_cost(x - MOVE_X[action], y - MOVE_Y[action], bound)
-            distance[previous] = cost
-            mark[previous] = OPEN
-            push_to_bucket(cost + remaining, previous, queue)
+        cheaper_by &= cheaper_by - ONE  # without the lowest bit
+        neighbour = cell - space.offset[action]
+        cost = cost_from_cell + cost_of(np.int64(neighbour), np.int64(action), costs)
+        if cost < _cost_before(distance, neighbour):
+            distance[neighbour] = cost
+            mark[neighbour] = OPEN
+            remaining = remaining_cost(dx - MOVE_X[action], dy - MOVE_Y[action], bound)
+            push_to_bucket(cost + remaining, neighbour, queue)
 
 
 @inlined
-def _is_full(queue: Any, space: Any) -> bool:
-    """Return whether a queue may have no room for the predecessors of a cell."""
-    return has_full_bucket(queue)
-
-
-@inlined
-def _is_past(queue: Any, cost: Any, target: Any) -> bool:
-    """Return whether no cell that waits costs as little as the start."""
-    return buckets_are_past(cost * target.share, queue)
+def _cost_before(distance: Any, cell: Any) -> float:
+    """Return the cost that was found from a cell to a goal, infinite if none was."""
+    return distance[cell] if distance[cell] > 0 else np.inf
 
 
 spread_over_cells = specialised(
     spread,
     advance=advance_buckets,
-    take=take_from_bucket,
-    is_past=_is_past,
-    is_full=_is_full,
+    pop=pop_from_bucket,
+    is_past=buckets_are_past,
+    is_full=has_full_bucket,
     expand=_expand_cell,
 )
 
@@ -211,15 +227,17 @@ spread_over_cells = specialised(
 def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known, bool]:
     """Close cells until a start's distance is known, or more than `limit` were closed.
 
-    Return what is known then, and whether that is enough for the start. No path reaches
-    cell 0, of the border: with it as the start, all of the map is visited.
+    The start is the number of a cell. No path reaches cell 0, of the border: with it as
+    the start, all of the map is visited. Return what is known then, and whether that is
+    enough for the start. The arrays of `known` change in place.
     """
     # In the order of A*, so that few cells are visited (resumable reverse A*, Silver
     # 2005); all of the map without lower bounds (Dijkstra), and then with one bucket
     # per unit, as no move costs less than 1.
     space = _space_toward(start, costs)
     per_unit = BUCKETS if start else 1
-    # No key is greater than that of the front bucket by more than a step and its bound.
+    # A queued key is greater than that of the front bucket by one move and its bound at
+    # most. So many buckets the ring needs, rounded up to a power of 2.
     highest_step = (costs.highest + space.bound.diagonal) * per_unit
     buckets = 1 << int(highest_step + 2).bit_length()
     capacity = 9 + int(CAPACITY * math.sqrt(known.distance.size))
@@ -239,7 +257,7 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
         )
         opened = states_in_buckets(queue)
         visits_left -= progress.visits
-        if progress.reason == NOT_CLOSABLE:
+        if progress.reason == NOT_CLOSABLE:  # twice as many more rows are read
             opened = np.append(opened, np.int32(progress.state))
             rows_read = end_row - first_row
             first_row -= rows_read
@@ -247,7 +265,7 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
             closable = _read_rows(costs, first_row, end_row)
         elif progress.reason in (DONE, OUT_OF_VISITS):
             break
-        else:
+        else:  # a bucket was full
             capacity *= 4
     is_known = progress.reason == DONE or not opened.size
     grown = Known(known.distance, known.mark, opened, known.closed_is_final)
@@ -255,7 +273,7 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
 
 
 def _space_toward(start: int, costs: MoveCosts) -> CellSpace:
-    """Return the space with lower bounds toward a start; with bounds of 0 for cell 0."""
+    """Return the space with lower bounds of the cost to a start; all 0 for cell 0."""
     rounded_down = costs.least_multiplier * (1 - 1e-7) if start else 0.0
     bound = LowerBound(
         start_x=start % costs.width,
@@ -275,7 +293,10 @@ def _queue_of(
     capacity: int,
     per_unit: int,
 ) -> Buckets:
-    """Return a queue of those candidates that are open."""
+    """Return a queue of those candidates (K,) that are open, each once.
+
+    It has a ring of so many buckets, of that capacity, `per_unit` for a unit of cost.
+    """
     opened = np.empty(candidates.size, np.int32)
     number = np.empty(candidates.size, np.int64)
     count = _number_buckets(
@@ -308,15 +329,30 @@ def _number_buckets(
     width: int,
     per_unit: int,
 ) -> int:
-    """Write each open candidate once, and the number of its bucket; return how many."""
+    """Write each open candidate once, and the number of its bucket; return how many.
+
+    Parameters
+    ----------
+    distance, mark : (C,)
+        As in `Known`.
+    candidates : (K,)
+        Cells; some of them may be there twice.
+    opened, bucket_number : (K,)
+        What is written.
+    bound : LowerBound
+    width : int
+        Columns of the padded map.
+    per_unit : int
+        Buckets per unit of cost.
+    """
     count = 0
     for index in range(candidates.size):
         cell = np.int64(candidates[index])
         if mark[cell] == OPEN:
-            mark[cell] = MARKED
-            x = cell % width - bound.start_x
-            y = cell // width - bound.start_y
-            key = distance[cell] + remaining_cost(x, y, bound)
+            mark[cell] = COUNTED  # so that it is not written again
+            dx = cell % width - bound.start_x
+            dy = cell // width - bound.start_y
+            key = distance[cell] + remaining_cost(dx, dy, bound)
             bucket_number[count] = np.int64(key * per_unit)
             opened[count] = cell
             count += 1
@@ -328,12 +364,16 @@ def _number_buckets(
 def _rows_around(
     opened: NDArray[np.int32], start: int, costs: MoveCosts
 ) -> tuple[int, int]:
-    """Return the first row of the map to read before a field grows, and their end."""
-    height = costs.patch_number.size // costs.width - 2
+    """Return the first row of the map to read before a field grows, and the rows' end.
+
+    Without a start, or if no rows need be read, these are all rows of the map. Else
+    they reach from the open cells (K,) to the start, and `MARGIN` rows beyond.
+    """
+    height = costs.patch_number.size // costs.width - 2  # without the border
     if not start or costs.rows_read is None or not opened.size:
         return 0, height
     cells = start, int(opened.min()), int(opened.max())
-    rows = [cell // costs.width - 1 for cell in cells]
+    rows = [cell // costs.width - 1 for cell in cells]  # the border's row is -1
     return min(rows) - MARGIN, max(rows) + 1 + MARGIN
 
 
@@ -351,15 +391,16 @@ def _read_rows(costs: MoveCosts, first_row: int, end_row: int) -> Closable | Non
 def cheapest_move(
     distance: Any, cell: int, cost_enough: float, costs: Any
 ) -> tuple[float, int]:
-    """Return the least cost of a path from a cell, and its action, or -1 without one.
+    """Return the least cost of a path from a cell to a goal, and its first action.
 
-    The first action whose path costs at most `cost_enough` will do.
+    Without a path, they are infinity and `NO_ACTION`. The first action whose path costs
+    at most `cost_enough` is taken without a look at the others.
     """
     cheapest = np.inf
-    cheapest_action = -1
+    cheapest_action = NO_ACTION
     for action in range(8):
-        end = np.uint64(cell + MOVE_Y[action] * costs.width + MOVE_X[action])
-        # Without a path it is 0, or less while a repair takes cells back.
+        end = after_move(cell, action, costs)
+        # It is 0 without a path, and less where a repair takes it back.
         if distance[end] <= 0:
             continue
         cost = distance[end] + cost_of(cell, action, costs)
@@ -374,12 +415,25 @@ def cheapest_move(
 def take_back(
     known: Known, costs: MoveCosts, changed: NDArray[np.int32], limit: int
 ) -> Known | None:
-    """Take back what changed moves no longer support, at most `limit` cells.
+    """Take back distances that no longer hold, and open the cells from which to grow.
 
-    None, and nothing is changed, if more cells would lose their distance. `changed` has
-    all cells whose own moves changed (Ramalingam and Reps 1996; LPA*, Koenig and
-    Likhachev 2002, is the same for one start).
+    Parameters
+    ----------
+    known : Known
+        Of a map before some changes; its arrays change in place.
+    costs : MoveCosts
+        Of the map after the changes.
+    changed : (N,)
+        All cells whose own moves have changed.
+    limit : int
+        How many cells may lose their distance.
+
+    Returns
+    -------
+    Known or None
+        None, and nothing is changed, if more cells would lose their distance.
     """
+    # Ramalingam and Reps 1996; LPA* (Koenig and Likhachev 2002) is it for one start.
     costs_of_steps = step_costs(costs)
     lost = np.empty(limit, np.int32)
     # A cell that loses its distance makes at most its 8 neighbours wait.
@@ -389,7 +443,7 @@ def take_back(
     lost_count = _lose_unsupported(
         distance, waiting, changed.size, lost, costs_of_steps
     )
-    if lost_count < 0:
+    if lost_count == TOO_MANY:
         return None
     to_reopen = np.concatenate([lost[:lost_count], changed])
     opened = np.empty(to_reopen.size, np.int32)
@@ -404,20 +458,36 @@ def take_back(
 
 @in_place
 def _lose_unsupported(
-    distance: Any, waiting: Any, end: int, lost: Any, costs: Any
+    distance: Any, waiting: Any, waiting_end: int, lost: Any, costs: Any
 ) -> int:
     """Make the distance of each cell negative that no neighbour supports any more.
 
-    `waiting` begins with `end` cells to judge. Return how many cells were lost; -1, and
-    no distance is changed, if `lost` has no room for all.
+    A neighbour supports the distance of a cell if a path by way of the neighbour costs
+    no more.
+
+    Parameters
+    ----------
+    distance : (C,)
+        As in `Known`; changes in place.
+    waiting : (W,)
+        The cells to judge, `waiting_end` of them at first; others are appended.
+    lost : (limit,)
+        Where the cells are written whose distance became negative.
+    costs : StepCosts
+
+    Returns
+    -------
+    int
+        How many cells were lost; `TOO_MANY`, and no distance is changed, if they would
+        be more than `lost` has room for.
     """
     first = 0
     count = 0
-    while first < end:
+    while first < waiting_end:
         cell = np.int64(waiting[first])
         first += 1
         cost_before = distance[cell]
-        if cost_before <= AT_GOAL:  # a goal, or it has no distance
+        if cost_before <= AT_GOAL:  # a goal, or a cell without a distance
             continue
         cheapest, _ = cheapest_move(distance, cell, cost_before, costs)
         if cheapest <= cost_before:
@@ -425,24 +495,28 @@ def _lose_unsupported(
         if count == lost.size:
             for number in range(count):
                 distance[lost[number]] = -distance[lost[number]]
-            return -1
-        # Below 0 it supports no other cell.
+            return TOO_MANY
+        # With a negative distance the cell supports no neighbour.
         distance[cell] = -cost_before
         lost[count] = cell
         count += 1
-        # The cells that it may have supported are judged again.
+        # The neighbours that the cell may have supported are judged again.
         for action in range(8):
-            previous = cell - MOVE_Y[action] * costs.width - MOVE_X[action]
-            cost = cost_of(previous, action, costs)
-            if distance[np.uint64(previous)] >= cost_before + cost:
-                waiting[end] = previous
-                end += 1
+            neighbour = cell - MOVE_Y[action] * costs.width - MOVE_X[action]
+            cost = cost_of(neighbour, action, costs)
+            if distance[np.uint64(neighbour)] >= cost_before + cost:
+                waiting[waiting_end] = neighbour
+                waiting_end += 1
     return count
 
 
 @in_place
 def _reopen(distance: Any, mark: Any, cells: Any, opened: Any, costs: Any) -> int:
-    """Open each cell that a neighbour makes cheaper than it is; return how many."""
+    """Open each of some cells (N,) whose neighbours lead to a goal at a lower cost.
+
+    A cell of which a repair took back the distance, which is then negative, has no cost
+    at first. The cells that are open then are written to `opened`; return how many.
+    """
     count = 0
     for number in range(cells.size):
         cell = np.int64(cells[number])
@@ -467,12 +541,24 @@ def _reopen(distance: Any, mark: Any, cells: Any, opened: Any, costs: Any) -> in
 def roll_out(
     distance: Any, start: int, path: Any, toward_x: int, toward_y: int, costs: Any
 ) -> int:
-    """Write the (x, y) of a closed cell and of greedy moves to the goal; return how many.
+    """Write the cells of greedy moves from a start to a goal; return how many.
 
     Of moves that are as good as each other, it takes those that end nearest to the
     straight line from the start to (`toward_x`, `toward_y`).
+
+    Parameters
+    ----------
+    distance : (C,)
+        As in `Known`.
+    start : int
+        The number of a closed cell.
+    path : (N, 2)
+        Where the x and y of the cells are written, the start's first.
+    toward_x, toward_y : int
+    costs : StepCosts
     """
     cell = start
+    # The padded map has a border of one cell.
     start_x = cell % costs.width - 1
     start_y = cell // costs.width - 1
     line_x = toward_x - start_x
@@ -486,14 +572,14 @@ def roll_out(
         count += 1
         greatest_cost = distance[cell] * SAME
         best_deviation = np.inf
-        best_action = -1
+        best_action = NO_ACTION
         for action in range(8):
-            end = np.uint64(cell + MOVE_Y[action] * costs.width + MOVE_X[action])
+            end = after_move(cell, action, costs)
             if not 0 < distance[end] < greatest_cost:
                 continue
             from_start_x = x + MOVE_X[action] - start_x
             from_start_y = y + MOVE_Y[action] - start_y
-            # The distance from the line, times the line's length.
+            # How far the end lies from the line, times the line's length.
             deviation = abs(from_start_x * line_y - from_start_y * line_x)
             if deviation >= best_deviation:
                 continue
@@ -502,7 +588,7 @@ def roll_out(
                 best_action = action
                 if deviation == 0:
                     break
-        if best_action < 0:  # at the goal
+        if best_action == NO_ACTION:  # at a goal
             break
         x += MOVE_X[best_action]
         y += MOVE_Y[best_action]
@@ -512,7 +598,7 @@ def roll_out(
 
 @in_place
 def write_value(distance: Any, value: Any, _: Any) -> None:
-    """Write minus the distance of each reached cell but the goals: (C,) float32."""
+    """Write the value (C,) of each reached cell but the goals: minus its distance."""
     for cell in range(distance.size):
         if distance[cell] > AT_GOAL:
             value[cell] = -distance[cell]
@@ -520,7 +606,11 @@ def write_value(distance: Any, value: Any, _: Any) -> None:
 
 @in_place
 def write_policy(distance: Any, policy: Any, costs: Any) -> None:
-    """Write the greedy action of each cell of a whole field that has one: (C,) int8."""
+    """Write the greedy action of each cell that has one to a policy (C,).
+
+    The field has grown over the whole map.
+    """
+    # The first and the last row are the border.
     for cell in range(costs.width + 1, distance.size - costs.width - 1):
         greatest_cost = distance[cell] * SAME
         cost, action = cheapest_move(distance, cell, greatest_cost, costs)
@@ -530,9 +620,9 @@ def write_policy(distance: Any, policy: Any, costs: Any) -> None:
 
 @in_place
 def write_q(distance: Any, q: Any, costs: Any) -> None:
-    """Write minus the cost of the best path through each action: (8, C) float32."""
+    """Write Q (8, C): minus the cost of the best path that begins with each action."""
     for action in range(8):
         for cell in range(costs.width + 1, distance.size - costs.width - 1):
-            end = cell + MOVE_Y[action] * costs.width + MOVE_X[action]
+            end = after_move(cell, action, costs)
             if distance[end] > 0:
                 q[action, cell] = -(distance[end] + cost_of(cell, action, costs))

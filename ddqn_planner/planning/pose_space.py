@@ -19,6 +19,7 @@ from ddqn_planner.planning.pose_world import (
 from ddqn_planner.planning.queues import (
     Heap,
     advance_heap,
+    heap_is_past,
     pop_from_heap,
     push_to_heap,
 )
@@ -176,12 +177,6 @@ def _expand_pose(number: int, distance: Any, mark: Any, heap: Any, search: Any) 
 
 
 @inlined
-def _is_past(heap: Any, cost: Any, target: Any) -> Any:
-    """Return whether the cost is enough, or a share of it is the least key."""
-    return max(target.cost_enough, heap.keys[0] / target.share) >= cost
-
-
-@inlined
 def _is_full(heap: Any, search: Any) -> Any:
     """Return whether a heap may have no room for the predecessors of a state."""
     room = heap.keys.size - search.world.body.start.size
@@ -191,8 +186,8 @@ def _is_full(heap: Any, search: Any) -> Any:
 spread_over_poses = specialised(
     spread,
     advance=advance_heap,
-    take=pop_from_heap,
-    is_past=_is_past,
+    pop=pop_from_heap,
+    is_past=heap_is_past,
     is_full=_is_full,
     expand=_expand_pose,
 )

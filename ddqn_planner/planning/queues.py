@@ -7,17 +7,20 @@ from numpy.typing import NDArray
 
 from ddqn_planner.compiled import inlined
 
-# What a queue finds: no state, a state of the same key as the one before, or one of a
-# greater key. In a ring of buckets, all states of a bucket count as of the same key.
+# What is next in a queue: no state, a state of the same key as the state before it, or
+# a state of a greater key. In a ring of buckets, all states of a bucket count as of the
+# same key.
 NONE_WAITS, SAME_KEY, NEXT_KEY = 0, 1, 2
 CHILD_BITS: Final = 2
 CHILDREN: Final = 1 << CHILD_BITS  # of each entry of a heap
+NEIGHBOURS: Final = 8  # of a cell: a bucket needs room for so many more states
 
-# The numbers of a ring of buckets that change; buckets are not wrapped.
-FRONT: Final = 0  # the bucket that is emptied now
-READ: Final = 1  # entries of that bucket that were taken
-LAST: Final = 2  # no bucket behind this one holds a state
-TAKEN: Final = 3  # entries of `opened` that were taken
+# Places in `Buckets.cursor`. Buckets are numbered from key 0 on; where bucket n is in
+# the ring is n modulo the size of the ring.
+FRONT: Final = 0  # the number of the bucket that is emptied now
+READ: Final = 1  # how many entries of the front bucket were popped
+LAST: Final = 2  # the number of the last bucket that holds a state
+TAKEN: Final = 3  # how many entries of `opened` were popped
 IS_FULL: Final = 4  # 1 if a bucket may have no room for 8 more states
 
 
@@ -27,11 +30,12 @@ class Buckets(NamedTuple):
     A state whose key is less than those of the front bucket goes to that bucket.
     """
 
-    opened: NDArray[np.int32]  # (K,): the states that were open before, sorted
-    opened_bucket: NDArray[np.int64]  # (K,): the bucket of each
-    bucket: NDArray[np.int32]  # (B, capacity); B is a power of 2
+    # (K,): states that were open before the ring was made, sorted by their buckets.
+    opened: NDArray[np.int32]
+    opened_bucket: NDArray[np.int64]  # (K,): the number of the bucket of each of them
+    bucket: NDArray[np.int32]  # (B, capacity): states; B is a power of 2
     used: NDArray[np.int64]  # (B,): how many entries of each bucket hold a state
-    cursor: NDArray[np.int64]  # (5,): the numbers that change, by the names above
+    cursor: NDArray[np.int64]  # (5,): the numbers that change, at FRONT to IS_FULL
     per_unit: int  # buckets per unit of a key
 
 
@@ -42,20 +46,22 @@ def make_buckets(
     capacity: int,
     per_unit: int,
 ) -> Buckets:
-    """Return a ring of some buckets with room for `capacity` states each, all empty.
+    """Return a ring of `buckets` empty buckets with room for `capacity` states each.
 
-    The open states are sorted by their buckets.
+    The states `opened` (K,), sorted by the numbers of their buckets (K,), wait beside
+    the ring. There are `per_unit` buckets per unit of a key.
     """
     cursor = np.zeros(5, np.int64)
     if opened_bucket.size:
-        cursor[FRONT] = opened_bucket[0] - 1  # a bucket without states
+        # The bucket before is empty: so the first state is one of a next key.
+        cursor[FRONT] = opened_bucket[0] - 1
     bucket = np.empty((buckets, capacity), np.int32)
     used = np.zeros(buckets, np.int64)
     return Buckets(opened, opened_bucket, bucket, used, cursor, per_unit)
 
 
 def states_in_buckets(queue: Buckets) -> NDArray[np.int32]:
-    """Return the states that wait, and some that were taken from the front bucket."""
+    """Return the states in a queue, and some that were popped from its front bucket."""
     waiting = [
         queue.bucket[number, : queue.used[number]] for number in queue.used.nonzero()[0]
     ]
@@ -63,82 +69,95 @@ def states_in_buckets(queue: Buckets) -> NDArray[np.int32]:
 
 
 @inlined
+def _place_in_ring(number: Any, queue: Any) -> Any:
+    """Return where the bucket of a number is in the ring."""
+    # The size of the ring is a power of 2, so that this takes no division. Unsigned, as
+    # numba then looks for no index that counts from the end.
+    return np.uint64(number & (queue.bucket.shape[0] - 1))
+
+
+@inlined
 def push_to_bucket(key: Any, state: Any, queue: Any) -> None:
-    """Add a state."""
+    """Add a state to a ring of buckets."""
     number = max(np.int64(key * queue.per_unit), queue.cursor[FRONT])
-    # The size of the ring is a power of 2, so that wrapping takes no division. Unsigned,
-    # as numba then looks for no index that counts from the end.
-    wrapped = np.uint64(number & (queue.bucket.shape[0] - 1))
-    used = queue.used[wrapped]
-    queue.bucket[wrapped, np.uint64(used)] = state
-    queue.used[wrapped] = used + 1
+    place = _place_in_ring(number, queue)
+    used = queue.used[place]
+    queue.bucket[place, np.uint64(used)] = state
+    queue.used[place] = used + 1
     if number > queue.cursor[LAST]:
         queue.cursor[LAST] = number
-    if used + 1 > queue.bucket.shape[1] - 8:
+    if used + 1 > queue.bucket.shape[1] - NEIGHBOURS:
         queue.cursor[IS_FULL] = 1
 
 
 @inlined
 def advance_buckets(queue: Any) -> int:
-    """Move the front to the next bucket that holds a state, if the front bucket is empty.
+    """Make the next bucket that holds a state the front bucket, if the front is empty.
 
-    Return NONE_WAITS, SAME_KEY if the front bucket held one, or NEXT_KEY.
+    Return SAME_KEY if the front bucket still holds a state, NEXT_KEY if another bucket
+    became the front, NONE_WAITS if no bucket holds a state.
     """
     step = SAME_KEY
     while True:
         front = queue.cursor[FRONT]
-        wrapped = np.uint64(front & (queue.bucket.shape[0] - 1))
-        if queue.cursor[READ] < queue.used[wrapped]:
+        place = _place_in_ring(front, queue)
+        if queue.cursor[READ] < queue.used[place]:
             return step
-        taken = queue.cursor[TAKEN]
-        if taken < queue.opened.size and queue.opened_bucket[taken] <= front:
+        # Of the states beside the ring, the first that was not popped.
+        next_opened = queue.cursor[TAKEN]
+        has_opened = next_opened < queue.opened.size
+        if has_opened and queue.opened_bucket[next_opened] <= front:
             return step
         step = NEXT_KEY
-        queue.used[wrapped] = 0
+        queue.used[place] = 0
         queue.cursor[READ] = 0
         if front < queue.cursor[LAST]:
             queue.cursor[FRONT] = front + 1
-        elif taken < queue.opened.size:
-            queue.cursor[FRONT] = queue.opened_bucket[taken]
+        elif has_opened:
+            queue.cursor[FRONT] = queue.opened_bucket[next_opened]
         else:
             return NONE_WAITS
 
 
 @inlined
-def take_from_bucket(queue: Any) -> Any:
-    """Take a state of the front bucket away and return it; there is one."""
-    wrapped = np.uint64(queue.cursor[FRONT] & (queue.bucket.shape[0] - 1))
+def pop_from_bucket(queue: Any) -> Any:
+    """Remove a state from the front bucket, which holds one, and return it."""
+    place = _place_in_ring(queue.cursor[FRONT], queue)
     read = queue.cursor[READ]
-    if read < queue.used[wrapped]:
+    if read < queue.used[place]:
         queue.cursor[READ] = read + 1
-        return np.int64(queue.bucket[wrapped, np.uint64(read)])
+        return np.int64(queue.bucket[place, np.uint64(read)])
+    # It is one of the states beside the ring.
     taken = queue.cursor[TAKEN]
     queue.cursor[TAKEN] = taken + 1
     return np.int64(queue.opened[taken])
 
 
 @inlined
-def buckets_are_past(cost: Any, queue: Any) -> bool:
-    """Return whether all keys are greater than a cost."""
+def buckets_are_past(queue: Any, cost: Any) -> bool:
+    """Return whether all keys in the buckets are greater than a cost."""
     return bool(cost * queue.per_unit < queue.cursor[FRONT])
 
 
 @inlined
-def has_full_bucket(queue: Any) -> bool:
-    """Return whether there may be no room for the predecessors of a cell."""
+def has_full_bucket(queue: Any, _: Any) -> bool:
+    """Return whether a bucket may have no room for the predecessors of a cell."""
     return bool(queue.cursor[IS_FULL])
 
 
 class Heap(NamedTuple):
-    """States by their keys, which may fall: a heap of which each entry has 4 children."""
+    """States by their keys: a heap of which each entry has 4 children.
 
-    keys: NDArray[np.float32]
-    states: NDArray[np.int64]
-    size: NDArray[np.int64]  # (1,): how many entries are used
+    The children of entry n are 4 n + 1 to 4 n + 4, and none has a smaller key than n.
+    """
+
+    keys: NDArray[np.float32]  # (room,)
+    states: NDArray[np.int64]  # (room,)
+    size: NDArray[np.int64]  # (1,): how many entries hold a state
 
 
 def make_heap(entries: int) -> Heap:
-    """Return an empty heap with room for some entries."""
+    """Return an empty heap with room for so many entries."""
     return Heap(
         np.empty(entries, np.float32),
         np.empty(entries, np.int64),
@@ -148,8 +167,9 @@ def make_heap(entries: int) -> Heap:
 
 @inlined
 def push_to_heap(key: Any, state: Any, heap: Any) -> None:
-    """Add a state; keys are rounded to float32."""
+    """Add a state to a heap; its key is rounded to float32."""
     rounded = np.float32(key)
+    # The state rises from the end of the heap past all parents of greater keys.
     place = heap.size[0]
     heap.size[0] = place + 1
     while place > 0:
@@ -165,17 +185,23 @@ def push_to_heap(key: Any, state: Any, heap: Any) -> None:
 
 @inlined
 def advance_heap(heap: Any) -> int:
-    """Return NEXT_KEY if a state waits, or else NONE_WAITS."""
+    """Return NEXT_KEY if a heap holds a state, else NONE_WAITS."""
     return NEXT_KEY if heap.size[0] > 0 else NONE_WAITS
 
 
 @inlined
+def heap_is_past(heap: Any, cost: Any) -> bool:
+    """Return whether no key in a heap is less than a cost."""
+    return bool(heap.keys[0] >= cost)
+
+
+@inlined
 def pop_from_heap(heap: Any) -> Any:
-    """Take the state of the least key away and return it; there is one."""
+    """Remove the state of the least key from a heap that is not empty; return it."""
     size = heap.size[0] - 1
     heap.size[0] = size
     first_state = heap.states[0]
-    # The last entry moves to the first place, and from there down past smaller ones.
+    # The last entry moves to the first place, and from there down past smaller keys.
     key = heap.keys[size]
     state = heap.states[size]
     place = 0

@@ -1,4 +1,4 @@
-"""How least costs spread from goals over states: one algorithm for cells and for poses."""
+"""How least costs spread from goals over states: one algorithm, for cells and poses."""
 
 from typing import Any, Final, NamedTuple
 
@@ -19,16 +19,19 @@ NOT_CLOSABLE: Final = 3  # the next state lies where the map was not read
 
 
 class Target(NamedTuple):
-    """The state whose cost is asked for, and when it is known well enough."""
+    """The state whose cost is asked for, and when a wavefront toward it may stop."""
 
     state: int
-    share: float  # of its cost: known if no state in the queue has a smaller key
-    cost_enough: float  # or if it is no greater than this, whatever the queue holds
-    most_visits: int
+    # The cost of the state is known well enough once all states in the queue have a
+    # greater key than this share of it (1 for exact costs),
+    share: float
+    # or once it is no greater than this.
+    cost_enough: float
+    most_visits: int  # how many states may be closed
 
 
 class Closable(NamedTuple):
-    """The numbers of the states that may be closed."""
+    """The states from `first` on, and before `end`, are those that may be closed."""
 
     first: int
     end: int
@@ -37,9 +40,11 @@ class Closable(NamedTuple):
 class Progress(NamedTuple):
     """What became of a wavefront."""
 
-    visits: int  # states that it closed
+    visits: int  # how many states it closed
     reason: int  # why it stopped: DONE, OUT_OF_VISITS, QUEUE_FULL or NOT_CLOSABLE
-    state: int  # that is not closable, and was taken from the queue; or NO_STATE
+    # After NOT_CLOSABLE the state that may not be closed, which is no longer in the
+    # queue; else NO_STATE.
+    state: int
 
 
 # What differs between cells and poses, the queue and the space, is handed in when a
@@ -47,17 +52,20 @@ class Progress(NamedTuple):
 
 
 def advance(queue: Any) -> int:
-    """Find the next state: return NONE_WAITS, SAME_KEY or NEXT_KEY."""
+    """Move a queue on to its next state, which stays in the queue.
+
+    Return NONE_WAITS, SAME_KEY or NEXT_KEY (see `queues`).
+    """
     raise NotImplementedError
 
 
-def take(queue: Any) -> int:
-    """Take the state that `advance` found away and return it."""
+def pop(queue: Any) -> int:
+    """Remove the state to which `advance` moved a queue, and return it."""
     raise NotImplementedError
 
 
-def is_past(queue: Any, cost: Any, target: Target) -> bool:
-    """Return whether a cost of the target is known well enough by the keys that wait."""
+def is_past(queue: Any, cost: Any) -> bool:
+    """Return whether all keys in a queue are too great to make a cost smaller."""
     raise NotImplementedError
 
 
@@ -67,7 +75,10 @@ def is_full(queue: Any, space: Any) -> bool:
 
 
 def expand(state: int, distance: Any, mark: Any, queue: Any, space: Any) -> None:
-    """Open each state from which a step to a closed one is cheaper than it is."""
+    """Lower the cost of each state that reaches a goal more cheaply by way of `state`.
+
+    `state` was just closed. Each state whose cost falls is marked as open and queued.
+    """
     raise NotImplementedError
 
 
@@ -76,35 +87,42 @@ def spread(
 ) -> Progress:
     """Close states in the order of a queue, until the cost of a target is known.
 
+    It grows from the goals, so the cost of a state is that of a path to a goal.
+
     Parameters
     ----------
-    distance, mark : (S,)
-        The cost of each state, and whether it was reached: they change in place.
+    distance : (S,) float
+        The least cost found for each of S states; changes in place. It has no meaning
+        for states that are UNREACHED.
+    mark : (S,) uint8
+        UNREACHED, OPEN, WAITING or CLOSED for each state; changes in place.
     queue : Buckets or Heap
-        The open states.
+        The open states. A state may be in it more than once.
     target : Target
     closable : Closable, optional
-        None for all states: then numba compiles no test of it.
-    space : CellSpace or PoseSpace
-        What `expand` needs.
+        None if all states may be closed: then numba compiles no test of it.
+    space : CellSpace or Search
+        The map, as `expand` needs it.
     """
     visits = 0
     while True:
         step = advance(queue)
         if step == NONE_WAITS:
             break
-        # Not between states of the same key: where one of them is closed, all are, so
-        # that a rollout finds the paths that are as good as each other.
+        # It stops only between two keys: of the states of one key, all are closed or
+        # none. So a rollout may choose among all paths of the same cost.
         if step == NEXT_KEY:
-            is_reached = mark[target.state] != UNREACHED
-            if is_reached and is_past(queue, distance[target.state], target):
-                break
+            if mark[target.state] != UNREACHED:
+                cost = distance[target.state]
+                if cost <= target.cost_enough or is_past(queue, cost * target.share):
+                    break
             if visits >= target.most_visits:
                 return Progress(visits, OUT_OF_VISITS, NO_STATE)
         if is_full(queue, space):
             return Progress(visits, QUEUE_FULL, NO_STATE)
-        state = take(queue)
-        if mark[state] != OPEN:  # it was queued twice
+        state = pop(queue)
+        # It was queued more than once and is closed by now, or a repair took it back.
+        if mark[state] != OPEN:
             continue
         if closable is not None and not closable.first <= state < closable.end:
             return Progress(visits, NOT_CLOSABLE, state)
