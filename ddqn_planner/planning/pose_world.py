@@ -1,5 +1,6 @@
 """A body on a map for kernels: where it has room, what its primitives cost."""
 
+import math
 from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -15,7 +16,7 @@ from ddqn_planner.grid.moves import ACTION_OF_STEP, NO_ACTION
 from ddqn_planner.robot.motions import HEADINGS, Motions, dense_poses
 
 SHIFT: Final = 2  # so many bits tell where in its tile a cell lies, along a side
-TILE: Final = 1 << SHIFT  # cells of a side
+TILE: Final = 1 << SHIFT  # cells along a side of a tile
 # Occupied cells around the map, so that a body sweeps none beyond the bits.
 BORDER: Final = 128
 State: TypeAlias = tuple[int, int, int]  # x, y, heading
@@ -25,42 +26,52 @@ WORD: Final = np.uint64(64)  # cells of a word of bits
 LAST_BIT: Final = np.uint64(63)
 ONE: Final = np.uint64(1)
 FULL: Final = np.uint64(2**64 - 1)  # a word of occupied cells
-# What is known of a tile, besides 0 for nothing: see `World.tile`.
-IS_FAR: Final = 1
-IS_NEAR: Final = 2
+
+# What is known of a tile in `World.tile` and `World.room`: at first nothing.
+UNSEEN: Final = 0
+IS_FAR, IS_NEAR = 1, 2
+PASSABLE, IMPASSABLE = 1, 2
 
 
 class Body(NamedTuple):
-    """P primitives as kernels use them, and the rows of P + 34 masks."""
+    """P primitives as kernels use them, and the rows of M masks.
 
-    # A mask for each primitive says what it sweeps. 16 more say for each heading where
-    # the body stands. Then come the cores, of each heading and of all: what each
-    # primitive that starts with it sweeps around any cell that its origin passes. The
-    # last one is all within reach of a tile, around its middle.
+    A mask is a set of cells around the cell in which a primitive begins. Mask p has the
+    cells that the body sweeps on primitive p; the numbers of the other masks follow.
+    """
 
-    # (17,): into[h] to into[h + 1] are the places in `ending` of those that end in h.
-    into: NDArray[np.int64]
-    ending: NDArray[np.int64]  # (P,): the primitives, by the heading in which they end
-    out: NDArray[np.int64]  # (17,): likewise, by the heading in which they start
-    start: NDArray[np.int64]  # (P,)
-    end: NDArray[np.int64]  # (P,)
-    offset: NDArray[np.int64]  # (P, 2)
-    cost: NDArray[np.float32]  # (P,)
-    # (R, 2): y and x of the first of 64 cells in a row of a mask, or fewer.
-    row: NDArray[np.int64]
-    bits: NDArray[np.uint64]  # (R,): which of them are in the mask
-    first: NDArray[np.int64]  # (P + 35,): where the rows of each mask begin
-    passed: NDArray[np.int64]  # (C, 3): x, y, and how the origin leaves the cell
-    share: NDArray[np.float32]  # (C,): which part of the cost counts in this cell
-    first_passed: NDArray[np.int64]  # (P + 1,)
+    # The primitives that end in heading h are by_end[first_ending[h]] and on, to before
+    # first_ending[h + 1]; those that start in h are first_starting[h] and on.
+    first_ending: NDArray[np.int64]  # (17,)
+    by_end: NDArray[np.int64]  # (P,): primitives, by the heading in which they end
+    first_starting: NDArray[np.int64]  # (17,)
+    start: NDArray[np.int64]  # (P,): the heading in which each primitive starts
+    end: NDArray[np.int64]  # (P,): the heading in which it ends
+    offset: NDArray[np.int64]  # (P, 2): x and y from its first to its last cell
+    cost: NDArray[np.float32]  # (P,): its least cost, in cells
+    # (R, 2): y and x of the first of 64 cells, or fewer, in a row of a mask.
+    row_begin: NDArray[np.int64]
+    row_bits: NDArray[np.uint64]  # (R,): which of these cells are in the mask
+    first_row: NDArray[np.int64]  # (M + 1,): where the rows of each mask begin
+    standing_mask: int  # where the body stands in heading 0; those of the others follow
+    # What all primitives that start in heading 0 sweep around each cell that the origin
+    # passes; those of the others follow. Where it is occupied, none of them leads by.
+    core_mask: int
+    common_core_mask: int  # likewise, of the primitives of all headings
+    reach_mask: int  # all cells that the body reaches from a tile, around its middle
+    # (C, 3): x and y of the cells that the origin passes on a primitive, from its first
+    # cell, and the action by which the origin leaves the cell.
+    passed_cells: NDArray[np.int64]
+    passed_shares: NDArray[np.float32]  # (C,): the part of the path in each cell
+    first_passed: NDArray[np.int64]  # (P + 1,): where the cells of each primitive begin
     # (N, 4): all poses but the first of each primitive, and their shares of its cost.
     pose: NDArray[np.float64]
-    first_pose: NDArray[np.int64]  # (P + 1,)
-    angle: NDArray[np.float64]  # (16,)
+    first_pose: NDArray[np.int64]  # (P + 1,): where the poses of each primitive begin
+    angle: NDArray[np.float64]  # (16,): the yaw of each heading, radians
     # (P, 2): the least and the greatest x and y of the cells that the origin passes,
     # from its first cell.
-    lowest: NDArray[np.int64]
-    highest: NDArray[np.int64]
+    lowest_passed: NDArray[np.int64]
+    highest_passed: NDArray[np.int64]
     # Cells that a primitive, or its origin, gets to any side of its begin or end, at
     # most.
     reach: int
@@ -71,22 +82,23 @@ class World(NamedTuple):
 
     body: Body
     # (rows, words): a bit for each occupied cell, with the border.
-    bits: NDArray[np.uint64]
-    # By tile: whether the body can reach an occupied cell from it, once known.
+    occupied_bits: NDArray[np.uint64]
+    # (tile rows, tile columns): IS_NEAR if the body can reach an occupied cell from the
+    # tile, IS_FAR if not, UNSEEN until a kernel looks.
     tile: NDArray[np.uint8]
-    # By tile: whether the body may pass one of its cells, likewise.
+    # Likewise: PASSABLE if the origin may pass a cell of the tile, else IMPASSABLE.
     room: NDArray[np.uint8]
     height: int
     width: int
     layers: Layers
 
 
-class Passed(NamedTuple):
+class PassedCells(NamedTuple):
     """The C cells that the origin passes on a primitive."""
 
     cells: NDArray[np.int64]  # (C, 2): x and y from the first pose's cell
-    actions: NDArray[np.int64]  # (C,): by which the origin leaves each
-    shares: NDArray[np.float64]  # (C,): of the path's length
+    actions: NDArray[np.int64]  # (C,): by which the origin leaves each cell
+    shares: NDArray[np.float64]  # (C,): the part of the path's length in each cell
 
 
 class Rows(NamedTuple):
@@ -100,21 +112,26 @@ class Rows(NamedTuple):
 class Masks(NamedTuple):
     """Cells around a body, S x S with the body's cell in the middle."""
 
-    standing: NDArray[np.bool_]  # (16, S, S): where it stands, by heading
-    core: NDArray[np.bool_]  # (16, S, S): see `Body`
+    standing: NDArray[np.bool_]  # (16, S, S): where the body stands, by heading
+    core: NDArray[np.bool_]  # (16, S, S): see `Body.core_mask`
     swept: NDArray[np.bool_]  # (S, S): by any primitive around any cell that it passes
 
 
 def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
-    """Return what kernels need of primitives and the cells (P, S, S) they sweep."""
-    passed = [_passed(poses) for poses in motions.poses]
+    """Return primitives as kernels need them.
+
+    `swept` (P, S, S) are the cells that the body sweeps on each primitive, around the
+    cell in which the primitive begins.
+    """
+    passed = [_passed_cells(poses) for poses in motions.poses]
     masks = _masks_of(motions, swept, passed)
     lowest = np.array([cells.min(axis=0) for cells, _, _ in passed])
     highest = np.array([cells.max(axis=0) for cells, _, _ in passed])
-    # The origin may lie outside of the body.
     farthest_swept = np.abs(np.argwhere(masks.swept) - swept.shape[1] // 2).max()
+    # An origin outside of the body may reach farther than what the body sweeps.
     reach = int(max(farthest_swept, (highest - lowest).max()))
     side = 2 * reach + TILE + 1
+    # The rows of all masks, in the order of the masks' numbers.
     rows = [
         rows_of(swept),
         rows_of(masks.standing),
@@ -123,6 +140,7 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
         rows_of(np.ones((1, side, side), dtype=np.bool_)),
     ]
     row_counts = np.concatenate([part.counts for part in rows])
+    primitives = len(motions.start)
     passed_rows = [np.column_stack([cells, actions]) for cells, actions, _ in passed]
     shares = np.concatenate([shares for _, _, shares in passed])
     pose_rows = [
@@ -130,34 +148,41 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
         for poses in motions.poses
     ]
     headings = np.arange(HEADINGS + 1)
-    ending = np.argsort(motions.end, kind="stable")
+    by_end = np.argsort(motions.end, kind="stable")
     return Body(
-        into=np.searchsorted(motions.end[ending], headings),
-        ending=ending,
-        out=np.searchsorted(motions.start, headings),
+        first_ending=np.searchsorted(motions.end[by_end], headings),
+        by_end=by_end,
+        first_starting=np.searchsorted(motions.start, headings),
         start=motions.start,
         end=motions.end,
         offset=motions.offset,
         cost=motions.cost,
-        row=np.concatenate([part.begins for part in rows]),
-        bits=np.concatenate([part.bits for part in rows]),
-        first=np.cumsum([0, *row_counts]),
-        passed=np.concatenate(passed_rows),
-        share=shares.astype(np.float32),
+        row_begin=np.concatenate([part.begins for part in rows]),
+        row_bits=np.concatenate([part.bits for part in rows]),
+        first_row=np.cumsum([0, *row_counts]),
+        standing_mask=primitives,
+        core_mask=primitives + HEADINGS,
+        common_core_mask=primitives + 2 * HEADINGS,
+        reach_mask=primitives + 2 * HEADINGS + 1,
+        passed_cells=np.concatenate(passed_rows),
+        passed_shares=shares.astype(np.float32),
         first_passed=np.cumsum([0, *map(len, passed_rows)]),
         pose=np.concatenate(pose_rows),
         first_pose=np.cumsum([0, *map(len, pose_rows)]),
         angle=motions.angles,
-        lowest=lowest,
-        highest=highest,
+        lowest_passed=lowest,
+        highest_passed=highest,
         reach=reach,
     )
 
 
 def _masks_of(
-    motions: Motions, swept: NDArray[np.bool_], passed: list[Passed]
+    motions: Motions, swept: NDArray[np.bool_], passed: list[PassedCells]
 ) -> Masks:
-    """Return what the cells (P, S, S) that primitives sweep have in common."""
+    """Return what the primitives of each heading sweep in common.
+
+    `swept` (P, S, S) are the cells that the body sweeps on each primitive.
+    """
     shape = swept.shape[1:]
     standing = np.ones((HEADINGS, *shape), dtype=np.bool_)
     core = np.ones((HEADINGS, *shape), dtype=np.bool_)
@@ -165,7 +190,8 @@ def _masks_of(
     for primitive, mask in enumerate(swept):
         start = motions.start[primitive]
         end = motions.end[primitive]
-        # (C, S, S): what it sweeps around each cell that its origin passes.
+        # (C, S, S): what the primitive sweeps, with each of the C cells that the origin
+        # passes moved to the middle.
         swept_around = np.array(
             [
                 np.roll(mask, (-y, -x), axis=(0, 1))
@@ -181,54 +207,62 @@ def _masks_of(
 
 
 def rows_of(masks: NDArray[np.bool_]) -> Rows:
-    """Return the rows of 64 cells of masks (M, S, S) in which a cell is set."""
-    reach = masks.shape[-1] // 2
+    """Return the rows of 64 cells of masks (M, S, S) in which a cell is set.
+
+    Columns S to the next multiple of 64 are not set.
+    """
+    middle = masks.shape[-1] // 2
     missing_columns = -masks.shape[-1] % 64
     whole_words = np.pad(masks, ((0, 0), (0, 0), (0, missing_columns)))
+    # (M, S, words): bit b of word w is the cell in column 64 w + b.
     words = np.packbits(whole_words, axis=-1, bitorder="little").view("<u8")
-    mask, y, word = np.nonzero(words)
-    begins = np.column_stack([y, 64 * word]) - reach
+    mask, y, word = np.nonzero(words)  # (R,) each
+    begins = np.column_stack([y, 64 * word]) - middle
     counts = np.bincount(mask, minlength=len(masks))
     return Rows(begins, words[mask, y, word], counts)
 
 
-def _passed(poses: NDArray[np.float64]) -> Passed:
-    """Return the cells that the origin passes along the poses (N, 3) of a primitive."""
+def _passed_cells(poses: NDArray[np.float64]) -> PassedCells:
+    """Return the cells that the origin passes along the poses (N, 3) of a primitive.
+
+    The poses are x and y in cells, from the centre of the first cell, and yaw.
+    """
     points = dense_poses(poses, FINE, 0.0)[:, :2]  # (K, 2)
-    middles = (points[1:] + points[:-1]) / 2  # (K - 1, 2): of the steps between them
+    middles = (points[1:] + points[:-1]) / 2  # (K - 1, 2): of the steps between points
     steps = np.diff(points, axis=0)
     lengths = np.hypot(steps[:, 0], steps[:, 1])  # (K - 1,)
-    if not lengths.any():  # a turn on the spot
+    if not lengths.any():  # a turn on the spot: one step that stays in its cell
         middles = points[:1]
         lengths = np.ones(1)
-    cell_of_step = np.floor(middles + 0.5).astype(np.int64)
-    has_left_cell = (cell_of_step[1:] != cell_of_step[:-1]).any(axis=1)
-    begins = np.flatnonzero(np.append(True, has_left_cell))
+    cell_of_step = np.floor(middles + 0.5).astype(np.int64)  # (K - 1, 2)
+    is_in_new_cell = (cell_of_step[1:] != cell_of_step[:-1]).any(axis=1)
+    begins = np.flatnonzero(np.append(True, is_in_new_cell))  # (C,): steps
     cells = cell_of_step[begins]  # (C, 2)
-    shares = np.add.reduceat(lengths, begins) / lengths.sum()
-    dx, dy = np.diff(cells, axis=0).T
+    shares = np.add.reduceat(lengths, begins) / lengths.sum()  # (C,)
+    dx, dy = np.diff(cells, axis=0).T  # (C - 1,) each
     actions = np.append(ACTION_OF_STEP[dy + 1, dx + 1], NO_ACTION)
-    return Passed(cells, actions, shares)
+    return PassedCells(cells, actions, shares)
 
 
 def occupied_for_body(grid: GridMap) -> NDArray[np.bool_]:
-    """Return the cells (H, W) that no body may touch.
+    """Return the cells (H, W) that no body may touch: the obstacles.
 
-    What is only too near for a disc's body is free.
+    Cells that are occupied only because a disc's body would touch an obstacle are free.
     """
     return grid.occupancy if grid.obstacles is None else grid.obstacles
 
 
 def body_costs(grid: GridMap) -> NDArray[np.int8] | None:
-    """Return what cells cost, (H, W), if they do.
+    """Return the costs of cells (H, W) for a body, or None for a map without costs.
 
-    It is the most where only a disc's body is too near.
+    A cell that is occupied only because a disc's body would touch an obstacle costs the
+    most.
     """
     if grid.cost is None or grid.obstacles is None:
         return grid.cost
-    # The cost of an occupied cell is 0.
+    # The cost of an occupied cell is 0 in `grid.cost`.
     costs: NDArray[np.int8] = grid.cost + np.int8(OCCUPIED) * grid.occupancy
-    # As all layers: for others numba compiles the kernels again.
+    # Like all layers, it is read-only: else numba would compile the kernels again.
     costs.flags.writeable = False
     return costs
 
@@ -239,9 +273,10 @@ def world_of(
     older: World | None = None,
     cells: NDArray[np.int64] | None = None,
 ) -> World:
-    """Return a map for kernels.
+    """Return a body on a map, as kernels use it.
 
-    It is made from scratch, or from an older one that differs in cells (N, 2).
+    With the `cells` (N, 2) in which an `older` world of the same body differs from the
+    map, what kernels have found out there is kept, except near these cells.
     """
     if older is None or cells is None:
         return _new_world(grid, body)
@@ -249,58 +284,76 @@ def world_of(
         return older
     first_column, first_row = cells.min(axis=0).tolist()
     last_column, last_row = cells.max(axis=0).tolist()
-    bits = older.bits.copy()
-    _write_rows(bits, grid, first_row, last_row + 1)
-    # The body may reach the cells from these tiles: they are unknown again.
-    tiles = (
-        slice(max(first_row - BORDER, 0) // TILE, (last_row + 1 + BORDER) // TILE + 1),
-        slice(
-            max(first_column - BORDER, 0) // TILE,
-            (last_column + 1 + BORDER) // TILE + 1,
-        ),
-    )
+    occupied_bits = older.occupied_bits.copy()
+    _write_rows(occupied_bits, grid, first_row, last_row + 1)
+    # The tiles from which a body may reach the cells are unseen again.
+    near_rows = _tiles_near(first_row, last_row)
+    near_columns = _tiles_near(first_column, last_column)
     tile = older.tile.copy()
-    tile[tiles] = 0
+    tile[near_rows, near_columns] = UNSEEN
     room = older.room.copy()
-    room[tiles] = 0
-    return World(body, bits, tile, room, grid.height, grid.width, _layers_of(grid))
+    room[near_rows, near_columns] = UNSEEN
+    return older._replace(
+        occupied_bits=occupied_bits,
+        tile=tile,
+        room=room,
+        layers=_layers_for_body(grid),
+    )
+
+
+def _tiles_near(first: int, last: int) -> slice:
+    """Return the rows of tiles within `BORDER` of some rows of cells, or columns."""
+    return slice(max(first - BORDER, 0) // TILE, (last + 1 + BORDER) // TILE + 1)
 
 
 def _new_world(grid: GridMap, body: Body) -> World:
-    words = (grid.width + 2 * BORDER + 63) // 64 + 1
-    bits = np.full((grid.height + 2 * BORDER, words), FULL)
-    _write_rows(bits, grid, 0, grid.height)
-    tiles = (-(-grid.height // TILE), -(-grid.width // TILE))  # rounded up
-    tile = np.zeros(tiles, dtype=np.uint8)
-    room = np.zeros(tiles, dtype=np.uint8)
-    return World(body, bits, tile, room, grid.height, grid.width, _layers_of(grid))
+    """Return a body on a map, of which no tile was seen."""
+    # One word more than a row fills: kernels read a word and the word after it.
+    words = math.ceil((grid.width + 2 * BORDER) / 64) + 1
+    occupied_bits = np.full((grid.height + 2 * BORDER, words), FULL)
+    _write_rows(occupied_bits, grid, 0, grid.height)
+    tiles = math.ceil(grid.height / TILE), math.ceil(grid.width / TILE)
+    return World(
+        body,
+        occupied_bits,
+        tile=np.full(tiles, UNSEEN, np.uint8),
+        room=np.full(tiles, UNSEEN, np.uint8),
+        height=grid.height,
+        width=grid.width,
+        layers=_layers_for_body(grid),
+    )
 
 
-def _write_rows(bits: NDArray[np.uint64], grid: GridMap, begin: int, end: int) -> None:
-    """Write the occupied cells of some rows of a map to `World.bits`."""
-    # All that is not the map counts as occupied.
-    cells = np.ones((end - begin, 64 * bits.shape[1]), dtype=np.bool_)
-    cells[:, BORDER : BORDER + grid.width] = occupied_for_body(grid)[begin:end]
-    words = np.packbits(cells, axis=1, bitorder="little").view("<u8")
-    bits[BORDER + begin : BORDER + end] = words
+def _write_rows(
+    occupied_bits: NDArray[np.uint64], grid: GridMap, begin: int, end: int
+) -> None:
+    """Write rows `begin` to before `end` of a map to `World.occupied_bits`."""
+    columns = 64 * occupied_bits.shape[1]
+    # The border on both sides of the map counts as occupied.
+    is_occupied = np.ones((end - begin, columns), dtype=np.bool_)
+    is_occupied[:, BORDER : BORDER + grid.width] = occupied_for_body(grid)[begin:end]
+    # (end - begin, words): bit b of word w is the cell in column 64 w + b.
+    words = np.packbits(is_occupied, axis=1, bitorder="little").view("<u8")
+    occupied_bits[BORDER + begin : BORDER + end] = words
 
 
-def _layers_of(grid: GridMap) -> Layers:
-    """Return the layers of a map for a body."""
+def _layers_for_body(grid: GridMap) -> Layers:
+    """Return the layers of a map on which the costs of primitives depend."""
     layers = grid.layers(MoveRule.ROBOT_SAFE)
     costs = body_costs(grid)
     return layers if costs is None else layers._replace(cost=costs)
 
 
 def differences(old: GridMap, new: GridMap) -> NDArray[np.int64] | None:
-    """Return the cells (N, 2) in which maps differ for a body.
+    """Return the cells (N, 2) in which two maps differ for a body.
 
-    It is None where `changed_cells` returns None.
+    It is None where the maps are better not compared, see `changed_cells`.
     """
     old_occupied = occupied_for_body(old)
     new_occupied = occupied_for_body(new)
 
     def differs(box: Box) -> NDArray[np.bool_]:
+        """Return which cells of a box differ."""
         is_free = ~new_occupied[box]
         has_other_layers = new.differs(old, box) & is_free
         differs: NDArray[np.bool_] = old_occupied[box] != new_occupied[box]
@@ -311,18 +364,19 @@ def differences(old: GridMap, new: GridMap) -> NDArray[np.int64] | None:
 
 @inlined
 def touches(x: int, y: int, mask: int, world: Any) -> bool:
-    """Return whether an occupied cell lies in a mask around a cell."""
+    """Return whether an occupied cell lies in a mask around cell (x, y)."""
     body = world.body
-    for number in range(body.first[mask], body.first[mask + 1]):
-        # The 64 cells of the row lie in two words of the map's row.
-        row = y + body.row[number, 0] + BORDER
-        column = np.uint64(x + body.row[number, 1] + BORDER)
+    for number in range(body.first_row[mask], body.first_row[mask + 1]):
+        # The 64 cells of the mask's row are bits of two words of the map's row.
+        row = y + body.row_begin[number, 0] + BORDER
+        column = np.uint64(x + body.row_begin[number, 1] + BORDER)
         word = column // WORD
         bit = column & LAST_BIT
-        occupied = world.bits[row, word] >> bit
-        # Two shifts, as one by 64 has no meaning.
-        occupied |= (world.bits[row, word + ONE] << ONE) << (LAST_BIT - bit)
-        if occupied & body.bits[number]:
+        occupied = world.occupied_bits[row, word] >> bit
+        # And the lowest bits of the next word, in two shifts: one by 64, which bit 0
+        # would need, has no meaning.
+        occupied |= (world.occupied_bits[row, word + ONE] << ONE) << (LAST_BIT - bit)
+        if occupied & body.row_bits[number]:
             return True
     return False
 
@@ -335,14 +389,16 @@ def is_inside(x: int, y: int, world: Any) -> bool:
 
 @inlined
 def is_far(x: int, y: int, world: Any) -> bool:
-    """Return whether no occupied cell is within reach of a tile; looks at most once."""
+    """Return whether the body reaches no occupied cell from any cell of a tile.
+
+    The tile is that of cell (x, y). What was found is kept in `world.tile`.
+    """
     row = y >> SHIFT
     column = x >> SHIFT
-    if world.tile[row, column] == 0:
-        middle_x = (x & -TILE) + TILE // 2
-        middle_y = (y & -TILE) + TILE // 2
-        reach_mask = world.body.first.size - 2  # the last one
-        if touches(middle_x, middle_y, reach_mask, world):
+    if world.tile[row, column] == UNSEEN:
+        middle_x = (column << SHIFT) + TILE // 2
+        middle_y = (row << SHIFT) + TILE // 2
+        if touches(middle_x, middle_y, world.body.reach_mask, world):
             world.tile[row, column] = IS_NEAR
         else:
             world.tile[row, column] = IS_FAR
@@ -350,63 +406,68 @@ def is_far(x: int, y: int, world: Any) -> bool:
 
 
 @inlined
-def cost_of(x: int, y: int, number: int, world: Any) -> Any:
-    """Return the cost of a primitive that the body has room for.
+def cost_of_primitive(x: int, y: int, primitive: int, world: Any) -> Any:
+    """Return the cost of a primitive from cell (x, y) on, for which the body has room.
 
     It is infinite if the map forbids a move of the origin.
     """
     body = world.body
     layers = world.layers
     if not has_costs(layers) and layers.forbidden.size == 0:
-        return body.cost[number]
-    total = np.float32(0)
-    for place in range(body.first_passed[number], body.first_passed[number + 1]):
-        cell_x = x + body.passed[place, 0]
-        cell_y = y + body.passed[place, 1]
-        if forbids(cell_x, cell_y, body.passed[place, 2], layers):
+        return body.cost[primitive]
+    mean_multiplier = np.float32(0)  # along the path of the origin
+    for place in range(body.first_passed[primitive], body.first_passed[primitive + 1]):
+        cell_x = x + body.passed_cells[place, 0]
+        cell_y = y + body.passed_cells[place, 1]
+        if forbids(cell_x, cell_y, body.passed_cells[place, 2], layers):
             return np.float32(np.inf)
         multiplier = multiplier_at(cell_x, cell_y, np.float32(1), layers)
-        total += body.share[place] * multiplier
-    # Rounded, the shares may be less than 1 together; but lower bounds rely on the cost
-    # of the primitive as the least.
-    return body.cost[number] * max(total, np.float32(1))
+        mean_multiplier += body.passed_shares[place] * multiplier
+    # Shares are rounded, so the mean may be less than 1; but lower bounds rely on the
+    # cost of the primitive as the least.
+    return body.cost[primitive] * max(mean_multiplier, np.float32(1))
 
 
 @inlined
-def leaves_map(x: int, y: int, mask: int, world: Any) -> bool:
-    """Return whether the origin leaves the map on a primitive.
+def leaves_map(x: int, y: int, primitive: int, world: Any) -> bool:
+    """Return whether the origin leaves the map on a primitive from cell (x, y) on.
 
-    Only an origin outside of the body can, where the body has room.
+    Where the body has room, only an origin outside of the body can leave the map.
     """
-    lowest = world.body.lowest
-    highest = world.body.highest
-    if mask >= lowest.shape[0]:  # of no primitive
-        return False
-    if not is_inside(x + lowest[mask, 0], y + lowest[mask, 1], world):
+    lowest = world.body.lowest_passed
+    highest = world.body.highest_passed
+    if not is_inside(x + lowest[primitive, 0], y + lowest[primitive, 1], world):
         return True
-    return not is_inside(x + highest[mask, 0], y + highest[mask, 1], world)
+    return not is_inside(x + highest[primitive, 0], y + highest[primitive, 1], world)
 
 
 @inlined
-def is_possible(x: int, y: int, mask: int, world: Any) -> bool:
-    """Return whether the body can take a primitive from a cell.
+def has_room(x: int, y: int, mask: int, world: Any) -> bool:
+    """Return whether no occupied cell lies in a mask around cell (x, y).
 
-    Or whether it has room for another mask.
+    The masks of primitives have the primitives' numbers: of these, the origin must not
+    leave the map either.
     """
     if is_far(x, y, world):
         return True
-    return not (touches(x, y, mask, world) or leaves_map(x, y, mask, world))
+    if touches(x, y, mask, world):
+        return False
+    is_primitive = mask < world.body.standing_mask  # the masks of primitives come first
+    return not (is_primitive and leaves_map(x, y, mask, world))
 
 
 @in_place
 def standing(states: NDArray[np.int64], world: World) -> int:
-    """Move states (N, 3) at which the body has room to the front; return how many."""
+    """Move the states at which the body has room to the front; return how many.
+
+    `states` (N, 3) are x, y and heading. Their order does not change.
+    """
     count = 0
     for place in range(len(states)):
         x = states[place, 0]
         y = states[place, 1]
         heading = states[place, 2]
-        if is_possible(x, y, world.body.start.size + heading, world):
+        if has_room(x, y, world.body.standing_mask + heading, world):
             states[count, 0] = x
             states[count, 1] = y
             states[count, 2] = heading

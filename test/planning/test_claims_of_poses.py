@@ -19,7 +19,7 @@ from ddqn_planner.planning.plan import PlanStatus, PosePlan
 from ddqn_planner.planning.planner import last_step
 from ddqn_planner.planning.pose_field import PoseField
 from ddqn_planner.planning.pose_planner import Pose, PosePlanner, PoseRequest
-from ddqn_planner.planning.pose_space import way_left
+from ddqn_planner.planning.pose_space import remaining_cost
 from ddqn_planner.planning.pose_world import State, world_of
 
 CELL = 0.1  # metres
@@ -226,7 +226,7 @@ def lower_bounds(
     field._aim = field._aim._replace(x=x, y=y)
     field._look_at_map(shift)
     cells = np.ndindex(grid.occupancy.shape)
-    bounds = [way_left(column, row, field._aim) for row, column in cells]
+    bounds = [remaining_cost(column, row, field._aim) for row, column in cells]
     return np.array(bounds).reshape(grid.occupancy.shape)
 
 

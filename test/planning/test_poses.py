@@ -23,11 +23,11 @@ from ddqn_planner.planning.path_finder import last_step
 from ddqn_planner.planning.plan import PlanStatus, PosePlan
 from ddqn_planner.planning.pose_paths import cost_of_poses
 from ddqn_planner.planning.pose_planner import Pose, PosePlanner, PoseRequest
-from ddqn_planner.planning.pose_space import way_left
+from ddqn_planner.planning.pose_space import remaining_cost
 from ddqn_planner.planning.pose_world import (
     State,
     body_of,
-    is_possible,
+    has_room,
     rows_of,
     world_of,
 )
@@ -188,9 +188,11 @@ def test_a_core_is_what_all_motions_sweep_around_each_cell_of_the_origin(
     motion: str,
 ) -> None:
     body, cells = planner(motion).body, []
-    for begin, end in pairwise(body.first.tolist()):
+    for begin, end in pairwise(body.first_row.tolist()):
         rows = zip(
-            body.row[begin:end].tolist(), body.bits[begin:end].tolist(), strict=True
+            body.row_begin[begin:end].tolist(),
+            body.row_bits[begin:end].tolist(),
+            strict=True,
         )
         cells.append(
             {(x + i, y) for (y, x), bits in rows for i in range(64) if bits >> i & 1}
@@ -198,8 +200,10 @@ def test_a_core_is_what_all_motions_sweep_around_each_cell_of_the_origin(
     for heading in range(16):
         swept_around = [
             {(x - over, y - up) for x, y in cells[primitive]}
-            for primitive in range(body.out[heading], body.out[heading + 1])
-            for over, up, *_ in body.passed[
+            for primitive in range(
+                body.first_starting[heading], body.first_starting[heading + 1]
+            )
+            for over, up, *_ in body.passed_cells[
                 slice(*body.first_passed[primitive : primitive + 2])
             ]
         ]
@@ -235,7 +239,7 @@ def test_what_the_map_tells_is_left_at_least(motion: str, seed: int) -> None:
     for shift in (2, 1):  # tiles of 4 cells, and of 2
         field._look_at_map(shift)
         for row, column, _ in np.argwhere(np.isfinite(best)):
-            left = way_left(column, row, field._aim)
+            left = remaining_cost(column, row, field._aim)
             assert left <= best[row, column].min() + 1e-3
 
 
@@ -446,7 +450,7 @@ def test_a_primitive_on_which_the_origin_leaves_the_map_is_impossible(
     motions = replace(motions, poses=poses)
     grid = GridMap(np.zeros((15, 20)), CELL)
     world = world_of(grid, body_of(motions, swept_cells(footprint, motions)))
-    assert is_possible(4, row, ahead, world) == is_free
+    assert has_room(4, row, ahead, world) == is_free
 
 
 def test_a_plan_begins_and_ends_as_asked_and_the_rest_of_it_is_known() -> None:
