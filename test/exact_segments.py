@@ -56,14 +56,8 @@ def exact_cost(first: Cell, last: Cell, grid: GridMap, rule: MoveRule) -> float:
     return float(length * float(mean))
 
 
-def is_legal(
-    first: Cell,
-    last: Cell,
-    grid: GridMap,
-    rule: MoveRule,
-    begin: Fraction = Fraction(0),
-) -> bool:
-    """Say whether a segment is legal from a share of it on, by all cells that it touches there."""
+def is_legal(first: Cell, last: Cell, grid: GridMap, rule: MoveRule) -> bool:
+    """Say whether a segment is legal, by all cells that it touches."""
     if not (grid.contains(first) and grid.contains(last)):
         return False
     step = [last[0] - first[0], last[1] - first[1]]
@@ -74,20 +68,17 @@ def is_legal(
         if grid.forbidden is None
         else grid.forbidden
     )
-    passed, until = [*shares(first, last).items()], Fraction(0)
-    for number, ((x, y), share) in enumerate(passed):
-        until += share
-        if until <= begin:
-            continue
+    passed = list(shares(first, last))
+    for number, (x, y) in enumerate(passed):
         touched = {(x, y)}
         if (x, y) != last:
-            u, v = passed[number + 1][0]
+            u, v = passed[number + 1]
             touched |= set() if rule.cuts_corners else {(x, v), (u, y)}
             if any(forbidden[y, x] >> action & 1 for action in actions):
                 return False
         if not all(map(grid.is_free, touched)):
             return False
-    if begin == 0 and step in MOVES.tolist():
+    if step in MOVES.tolist():
         index = MOVES.tolist().index(step), first[1], first[0]
         assert grid.legal_moves(rule)[index]
     return True

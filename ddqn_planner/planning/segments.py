@@ -34,18 +34,19 @@ SAME_COST: Final = 1 + 1e-9
 # passed over: with corners at the very last cells that are seen, a path is longer.
 FIRST_STEP: Final = 3
 NO_ACTION: Final = -1
+LEGAL: Final = True  # segments must be legal, see `segment_cost`
 
 
 def simplify(
     cells: Cells, grid: GridMap, move_rule: MoveRule | str
 ) -> tuple[Cell, ...]:
-    """Return a path of few legal segments beside a path, with the same ends.
+    """Return a path of few legal segments that costs no more than a path of cells.
 
-    A segment is legal if all cells that it passes through are free; under
-    `MoveRule.ROBOT_SAFE` also the cells that it touches at a corner. None of the cells
-    except the last may forbid one of the two actions between whose directions the
-    segment lies. A segment never costs more than the moves that it replaces, so the
-    path keeps away from cells of high cost.
+    Both paths have the same ends. A segment is legal if all cells that it passes
+    through are free; under `MoveRule.ROBOT_SAFE` also the cells that it touches at a
+    corner. None of the cells except the last may forbid one of the two actions between
+    whose directions the segment lies. A segment never costs more than the moves that it
+    replaces, so the path keeps away from cells of high cost.
 
     Parameters
     ----------
@@ -66,18 +67,23 @@ def simplify(
 
 
 def straightened(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> Path:
-    """Do the work of `simplify` for a path of one cell or more."""
+    """Return a path of few legal segments, as `simplify` does: (K, 2).
+
+    The path (N, 2) has one cell or more.
+    """
     layers = grid.layers(move_rule)
     cells = np.array(path, np.int64)
-    spent = np.empty(0)  # without costs, nothing between two cells is below a segment
+    # Without costs no path between two cells is cheaper than a segment.
+    cost_to_cell = np.empty(0)
     if grid.has_costs:
-        spent = np.cumsum(_segment_costs(cells, layers, legal_from=np.ones(len(cells))))
-    from_start = _pulled(cells, spent, layers, is_backward=False)
+        costs = _segment_costs(cells, layers, must_be_legal=False)
+        cost_to_cell = np.cumsum(costs)
+    from_start = _pulled(cells, cost_to_cell, layers, is_backward=False)
     if not from_start.has_moved_corners or len(cells) > LONG:
         return from_start.cells
     # From the end, obstacles come in another order: the path may pass them on the
     # better side.
-    from_end = _pulled(cells, spent, layers, is_backward=True)
+    from_end = _pulled(cells, cost_to_cell, layers, is_backward=True)
     is_better = from_end.cost * SAME_COST < from_start.cost
     return from_end.cells if is_better else from_start.cells
 
@@ -88,20 +94,14 @@ def cost_along(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> float:
     Each cell counts by the share of the segment that lies in it.
     """
     layers = grid.layers(move_rule)
-    costs = _segment_costs(path, layers, legal_from=np.ones(len(path)))
-    return float(costs.sum())
+    return float(_segment_costs(path, layers, must_be_legal=False).sum())
 
 
 def legal_segments(
-    path: Cells, grid: GridMap, move_rule: MoveRule | str, begin: float = 0.0
+    path: Cells, grid: GridMap, move_rule: MoveRule | str
 ) -> NDArray[np.bool_]:
-    """Return which segments of a path are legal, see `simplify`: (N - 1,) bool.
-
-    Of the first segment, only the part from the share `begin` of it on counts.
-    """
-    legal_from = np.zeros(len(path))
-    legal_from[1:2] = begin
-    costs = _segment_costs(path, grid.layers(move_rule), legal_from)
+    """Return which segments of a path (N, 2) are legal, see `simplify`: (N - 1,)."""
+    costs = _segment_costs(path, grid.layers(move_rule), must_be_legal=True)
     return costs[1:] < np.inf
 
 
@@ -114,48 +114,46 @@ class _Pulled(NamedTuple):
 
 
 def _pulled(
-    path: CellArray, spent: Float64, layers: Layers, is_backward: bool
+    path: CellArray, cost_to_cell: Float64, layers: Layers, is_backward: bool
 ) -> _Pulled:
-    """Return a path of straight segments in place of a path of cells, pulled taut.
-
-    It is pulled from the start or, backward, from the end; what it keeps is in the order
-    of the path in both cases.
+    """Return a path of few straight segments in place of a path of cells.
 
     Parameters
     ----------
     path : (N, 2)
-    spent : (N,)
+    cost_to_cell : (N,)
         What the path costs from its start to each cell; empty on a map without costs.
+    layers : Layers
+    is_backward : bool
+        Whether string pulling begins at the end of the path. The result leads from the
+        start to the end in both cases.
     """
-    cells = path.copy()
-    costs = np.zeros(len(path))  # of the segment that ends in each cell
+    cells = path.copy()  # the first `count` of them are kept
+    costs = np.zeros(len(path))  # (N,): of the segment that ends in each cell
     if is_backward:
         cells = path[::-1].copy()
-        # Differences of this are the costs between two cells, as those of `spent` are.
-        spent = -spent[::-1]
-    count = _pull(cells, costs, spent, is_backward, layers)
+        # Only differences count. Negative costs in reverse order rise along the path,
+        # by the same differences.
+        cost_to_cell = -cost_to_cell[::-1]
+    count = _keep_corners(cells, costs, cost_to_cell, is_backward, layers)
     if is_backward:
         cells[:count] = cells[:count][::-1]
+        # A segment ends now where it began: its cost stands at the other end.
         costs[1:count] = costs[1:count][::-1]
     count, has_moved_corners = _move_corners(cells, costs, count, layers)
     cost = float(costs[:count].sum())
     return _Pulled(cells[:count].astype(np.int32), cost, has_moved_corners)
 
 
-def _segment_costs(path: Cells, layers: Layers, legal_from: Float64) -> Float64:
-    """Return 0 and the cost of each segment, see `segment_cost`: (N,).
+def _segment_costs(path: Cells, layers: Layers, must_be_legal: bool) -> Float64:
+    """Return the cost of the segment that ends in each cell of a path (N, 2): (N,).
 
-    Parameters
-    ----------
-    path : (N, 2)
-    layers : Layers
-    legal_from : (N,)
-        From which share on the segment that ends in each cell must be legal.
+    It is 0 for the first cell; see `segment_cost` for segments that are not legal.
     """
     # With 64 bits, all that is computed from a cell has one type: numba compiles once.
     cells = np.array(path, np.int64)
     costs = np.zeros(len(cells))
-    _write_costs(cells, legal_from, costs, layers)
+    _write_costs(cells, must_be_legal, costs, layers)
     return costs
 
 
@@ -164,7 +162,7 @@ def _segment_costs(path: Cells, layers: Layers, legal_from: Float64) -> Float64:
 
 @inlined
 def _length(width: int, height: int) -> float:
-    """Return the length of a segment over some columns and rows: its least cost."""
+    """Return the length of a segment over so many columns and rows: its least cost."""
     return math.sqrt(width * width + height * height)
 
 
@@ -183,11 +181,11 @@ def _is_free(x: int, y: int, layers: Layers) -> bool:
 
 @inlined
 def segment_cost(
-    x: int, y: int, last_x: int, last_y: int, legal_from: float, layers: Layers
+    x: int, y: int, last_x: int, last_y: int, must_be_legal: bool, layers: Layers
 ) -> float:
-    """Return the cost of a segment; infinity if it is not legal.
+    """Return the cost of the segment from cell (x, y) to cell (last_x, last_y).
 
-    Before the share `legal_from` of it, occupied cells do not count.
+    If it must be legal, but is not, the cost is infinite.
     """
     dx = last_x - x
     dy = last_y - y
@@ -196,29 +194,27 @@ def segment_cost(
     length = _length(abs(dx), abs(dy))
     actions = actions_of_segment(step_x, step_y, abs(dx), abs(dy))
     # Positions on the segment count from 0 at its first point to `end` at its last
-    # point, in units in which all crossings of edges of cells are whole numbers.
+    # point, in units in which all crossings of edges of cells are whole numbers: a
+    # column is 2 rows long, and a row 2 columns. Each end lies in the middle of a cell.
     columns = max(abs(dx), 1)
     rows = max(abs(dy), 1)
     end = 2 * columns * rows
-    next_column = rows if dx != 0 else end + 1  # where the segment enters the column
+    # Where the segment enters the next column and the next row: never without a step.
+    next_column = rows if dx != 0 else end + 1
     next_row = columns if dy != 0 else end + 1
-    position = 0
-    first_legal = legal_from * end
+    position = 0  # where the segment enters cell (x, y)
     weighted_length = 0.0  # each cell's part of the segment times the cell's multiplier
     costs_differ = has_costs(layers)
     while position < end:
         cell_end = min(next_column, next_row, end)  # where the segment leaves the cell
-        column = np.uint64(x)  # unsigned: no index counts from the end
-        row = np.uint64(y)
-        is_blocked = layers.occupancy[row, column]
-        if layers.forbidden.size > 0 and cell_end < end:
-            is_blocked |= (layers.forbidden[row, column] & actions) != 0
-        is_at_corner = next_column == next_row and cell_end < end
-        if is_at_corner and not layers.cuts_corners:
-            is_blocked |= layers.occupancy[row, np.uint64(x + step_x)]
-            is_blocked |= layers.occupancy[np.uint64(y + step_y), column]
-        if is_blocked and cell_end > first_legal:
-            return np.inf
+        if must_be_legal:
+            if layers.occupancy[np.uint64(y), np.uint64(x)]:
+                return np.inf
+            is_at_corner = next_column == next_row
+            if cell_end < end and _may_not_leave(
+                x, y, step_x, step_y, actions, is_at_corner, layers
+            ):
+                return np.inf
         if costs_differ:
             multiplier = multiplier_at(x, y, np.float64(1), layers)
             weighted_length += (cell_end - position) * multiplier
@@ -234,11 +230,40 @@ def segment_cost(
     return length
 
 
+@inlined
+def _may_not_leave(
+    x: int,
+    y: int,
+    step_x: int,
+    step_y: int,
+    actions: int,
+    is_at_corner: bool,
+    layers: Layers,
+) -> bool:
+    """Return whether a segment may not go on from cell (x, y).
+
+    That is so if the cell forbids one of the segment's actions, which are bits; or if
+    the segment leaves the cell at a corner, and one of the two cells that it touches
+    there, in the directions of its steps, is occupied.
+    """
+    column = np.uint64(x)  # unsigned: so no index counts from the end
+    row = np.uint64(y)
+    if layers.forbidden.size > 0 and layers.forbidden[row, column] & actions:
+        return True
+    if layers.cuts_corners or not is_at_corner:
+        return False
+    is_beside_occupied = layers.occupancy[row, np.uint64(x + step_x)]
+    return is_beside_occupied or layers.occupancy[np.uint64(y + step_y), column]
+
+
 @in_place
 def _write_costs(
-    path: CellArray, legal_from: Float64, costs: Float64, layers: Layers
+    path: CellArray, must_be_legal: bool, costs: Float64, layers: Layers
 ) -> None:
-    """Write the cost of the segment to each cell; infinity outside the map."""
+    """Write the cost of the segment that ends in each cell of a path (N, 2) to `costs`.
+
+    It is infinite if an end of the segment lies outside the map.
+    """
     for index in range(1, path.shape[0]):
         x = path[index - 1, 0]
         y = path[index - 1, 1]
@@ -246,7 +271,7 @@ def _write_costs(
         last_y = path[index, 1]
         costs[index] = np.inf
         if _is_inside(x, y, layers) and _is_inside(last_x, last_y, layers):
-            costs[index] = segment_cost(x, y, last_x, last_y, legal_from[index], layers)
+            costs[index] = segment_cost(x, y, last_x, last_y, must_be_legal, layers)
 
 
 @inlined
@@ -285,7 +310,10 @@ def _is_right_angle(
 
 @inlined
 def _end_of_equal_moves(path: CellArray, first: int) -> int:
-    """Return the last cell to which equal moves lead: they are one segment."""
+    """Return the last row of a path to which equal moves lead from a row.
+
+    Equal moves, one after another, are one straight segment.
+    """
     last = path.shape[0] - 1
     dx = path[first + 1, 0] - path[first, 0]
     dy = path[first + 1, 1] - path[first, 1]
@@ -303,34 +331,56 @@ def _end_of_equal_moves(path: CellArray, first: int) -> int:
 def _cost_between(
     path: CellArray, first: int, last: int, is_backward: bool, layers: Layers
 ) -> float:
-    """Return the cost of the segment between two cells, in the path's direction."""
+    """Return the cost of the segment between two cells, in the direction of driving.
+
+    `first` and `last` are rows of the path (N, 2). A backward path leads from the goal
+    to the start.
+    """
     begin = last if is_backward else first
     end = first if is_backward else last
     return segment_cost(
-        path[begin, 0], path[begin, 1], path[end, 0], path[end, 1], 0.0, layers
+        path[begin, 0], path[begin, 1], path[end, 0], path[end, 1], LEGAL, layers
     )
 
 
 @in_place
-def _pull(
+def _keep_corners(
     path: CellArray,
     costs: Float64,
-    spent: Float64,
+    cost_to_cell: Float64,
     is_backward: bool,
     layers: Layers,
 ) -> int:
-    """Keep cells far along a path that are seen from the one before; return how many.
+    """Leave out all cells of a path that straight segments can replace.
 
-    The cells are moved to the front of `path`, and the costs of the segments that end
-    in them to the front of `costs`. A backward path leads from the goal to the start.
+    From each cell that is kept, the next one is the farthest cell found to which a
+    segment is legal and costs no more than the moves.
+
+    Parameters
+    ----------
+    path : (N, 2)
+        The cells that are kept are moved to its front.
+    costs : (N,)
+        The costs of the segments that end in these cells are written to its front.
+    cost_to_cell : (N,)
+        What the path costs from its first cell to each cell, plus any constant; empty
+        on a map without costs.
+    is_backward : bool
+        Whether the path leads from the goal to the start.
+    layers : Layers
+
+    Returns
+    -------
+    int
+        How many cells are kept.
     """
     last = path.shape[0] - 1
-    first = 0
-    number = 0
+    first = 0  # the row of the last cell that was kept
+    number = 0  # the row to which it was moved
     while first < last:
         end = _end_of_equal_moves(path, first)
-        if spent.size > 0:
-            cost = spent[end] - spent[first]
+        if cost_to_cell.size > 0:
+            cost = cost_to_cell[end] - cost_to_cell[first]
         else:
             width = abs(path[first + 1, 0] - path[first, 0])
             height = abs(path[first + 1, 1] - path[first, 1])
@@ -348,8 +398,8 @@ def _pull(
                 path, first, candidate, is_backward, layers
             )
             is_straight = cost_to_candidate < np.inf
-            if spent.size > 0:
-                cost_of_moves = spent[candidate] - spent[first]
+            if cost_to_cell.size > 0:
+                cost_of_moves = cost_to_cell[candidate] - cost_to_cell[first]
                 is_straight = cost_to_candidate <= SAME_COST * cost_of_moves
             if is_straight:
                 end = candidate
@@ -371,7 +421,20 @@ def _move_corners(
 ) -> tuple[int, bool]:
     """Move or leave out corners of a path while that makes it cheaper.
 
-    Returns the number of cells that remain, and whether any corner moved.
+    Parameters
+    ----------
+    path : (N, 2)
+        Its first `count` cells are the path; they change in place.
+    costs : (N,)
+        The cost of the segment that ends in each cell; changes in place.
+    count : int
+    layers : Layers
+
+    Returns
+    -------
+    count : int
+        How many cells remain.
+    has_moved_corners : bool
     """
     has_moved_corners = False
     corner = 1
@@ -380,15 +443,13 @@ def _move_corners(
         was_moved_by = moved_by
         first_action = 0
         end_action = 8
-        if was_moved_by != NO_ACTION:  # that action alone is tried again
+        if was_moved_by != NO_ACTION:  # no action except this one is tried again
             first_action = was_moved_by
             end_action = was_moved_by + 1
-        else:
-            is_settled = _is_right_angle(path, corner - 1, corner, corner + 1, layers)
-            if not is_settled:
-                is_settled = _move_to_next(path, costs, corner, layers)
-            if is_settled:
-                end_action = 0
+        elif _is_right_angle(path, corner - 1, corner, corner + 1, layers):
+            end_action = 0  # no action is tried
+        elif _move_to_next(path, costs, corner, layers):
+            end_action = 0
         moved_by = _move(path, costs, corner, first_action, end_action, layers)
         is_at_next = (
             path[corner, 0] == path[corner + 1, 0]
@@ -396,11 +457,11 @@ def _move_corners(
         )
         if is_at_next:
             count -= 1
-            _leave_out(path, costs, corner, count)
+            _leave_out(path, costs, corner + 1, count)
             moved_by = NO_ACTION
         has_moved_corners |= is_at_next or moved_by != NO_ACTION
         if is_at_next or (was_moved_by != NO_ACTION and moved_by == NO_ACTION):
-            corner = max(corner - 1, 1)  # what follows the corner before has changed
+            corner = max(corner - 1, 1)  # the corner before has a new neighbour
         elif moved_by == NO_ACTION:
             corner += 1
     return count, has_moved_corners
@@ -408,21 +469,30 @@ def _move_corners(
 
 @inlined
 def _move_to_next(path: CellArray, costs: Float64, corner: int, layers: Layers) -> bool:
-    """Move a corner onto the next one if that costs no more; return if it moved.
+    """Move a corner onto the next one if the path then costs no more.
 
-    Both corners are then the same point, and the segment between them costs nothing.
+    Return whether it moved. The caller then leaves out one of the two equal corners:
+    the segment between them costs nothing.
+
+    Parameters
+    ----------
+    path : (N, 2)
+        Changes in place, in row `corner`.
+    costs : (N,)
+        The cost of the segment that ends in each cell; changes in place.
     """
+    # Rounded sums of the same cost are not greater.
     highest_cost = (costs[corner] + costs[corner + 1]) * SAME_COST
     x = path[corner - 1, 0]
     y = path[corner - 1, 1]
     next_x = path[corner + 1, 0]
     next_y = path[corner + 1, 1]
+    # A segment costs its length at least, which is quicker to compute.
     if _length(abs(next_x - x), abs(next_y - y)) >= highest_cost:
         return False
-    if not _is_free(next_x, next_y, layers):
+    if not _is_free(next_x, next_y, layers):  # paths may end in occupied cells
         return False
-    legal_from = 0.0  # the segment has to be legal from its first point on
-    cost = segment_cost(x, y, next_x, next_y, legal_from, layers)
+    cost = segment_cost(x, y, next_x, next_y, LEGAL, layers)
     if cost >= highest_cost:
         return False
     path[corner, 0] = next_x
@@ -441,10 +511,22 @@ def _move(
     end_action: int,
     layers: Layers,
 ) -> int:
-    """Move a corner by the action of a range after which the path costs the least.
+    """Move a corner by the action after which the path costs the least.
 
-    An action moves it by a cell, or by two past an obstacle of one cell. Returns the
-    action; `NO_ACTION` if none makes the path cheaper.
+    An action moves it by a cell, or by two past an obstacle of one cell. The actions
+    from `first_action` on, and before `end_action`, are tried.
+
+    Parameters
+    ----------
+    path : (N, 2)
+        Changes in place, in row `corner`.
+    costs : (N,)
+        The cost of the segment that ends in each cell; changes in place.
+
+    Returns
+    -------
+    int
+        The action; `NO_ACTION`, and nothing is changed, if none makes the path cheaper.
     """
     x = path[corner - 1, 0]
     y = path[corner - 1, 1]
@@ -452,6 +534,7 @@ def _move(
     corner_y = path[corner, 1]
     next_x = path[corner + 1, 0]
     next_y = path[corner + 1, 1]
+    # Of the two segments at the corner. A rounded sum of the same cost is not less.
     lowest_cost = (costs[corner] + costs[corner + 1]) / SAME_COST
     best_action = NO_ACTION
     for action in range(first_action, end_action):
@@ -460,17 +543,18 @@ def _move(
         if not _is_free(new_x, new_y, layers):
             new_x += MOVES[action, 0]
             new_y += MOVES[action, 1]
-        # Lengths are quicker than costs, and never greater.
+        # Both segments are first judged by their lengths, which are quicker to compute
+        # and never greater than their costs.
         first_cost = _length(abs(new_x - x), abs(new_y - y))
         second_cost = _length(abs(next_x - new_x), abs(next_y - new_y))
         if first_cost + second_cost >= lowest_cost:
             continue
         if not _is_free(new_x, new_y, layers):
             continue
-        second_cost = segment_cost(new_x, new_y, next_x, next_y, 0.0, layers)
+        second_cost = segment_cost(new_x, new_y, next_x, next_y, LEGAL, layers)
         if first_cost + second_cost >= lowest_cost:
             continue
-        first_cost = segment_cost(x, y, new_x, new_y, 0.0, layers)
+        first_cost = segment_cost(x, y, new_x, new_y, LEGAL, layers)
         if first_cost + second_cost >= lowest_cost:
             continue
         lowest_cost = first_cost + second_cost
@@ -483,9 +567,9 @@ def _move(
 
 
 @inlined
-def _leave_out(path: CellArray, costs: Float64, corner: int, count: int) -> None:
-    """Leave out the cell after a corner, of which `count` others remain in the path."""
-    for index in range(corner + 1, count):
+def _leave_out(path: CellArray, costs: Float64, row: int, count: int) -> None:
+    """Leave out a row of a path (N, 2), of which `count` other rows remain."""
+    for index in range(row, count):
         path[index, 0] = path[index + 1, 0]
         path[index, 1] = path[index + 1, 1]
         costs[index] = costs[index + 1]

@@ -247,21 +247,18 @@ def test_a_search_follows_the_values_even_on_a_detour() -> None:
 
 
 @settings(max_examples=300)
-@given(GRIDS, RULES, st.sampled_from([0.0, 0.0, 0.25, 0.625]), st.data())
+@given(GRIDS, RULES, st.data())
 def test_segments_are_as_their_cells_are(
-    place: Place, rule: MoveRule, begin: float, data: Data
+    place: Place, rule: MoveRule, data: Data
 ) -> None:
     grid, _ = place
     path = data.draw(st.lists(cells_of(grid), min_size=1, max_size=4))
     steps = st.tuples(st.sampled_from(MOVES.tolist()), st.integers(1, 4))
     for (dx, dy), by in data.draw(st.lists(steps, max_size=4)):  # perhaps off the map
         path.append((path[-1][0] + by * dx, path[-1][1] + by * dy))
-    segments, begins = [*pairwise(path)], [Fraction(begin)] + [Fraction(0)] * len(path)
-    expected = [
-        is_legal(*each, grid, rule, at)
-        for each, at in zip(segments, begins, strict=False)
-    ]
-    assert legal_segments(path, grid, rule, begin).tolist() == expected
+    segments = [*pairwise(path)]
+    expected = [is_legal(*segment, grid, rule) for segment in segments]
+    assert legal_segments(path, grid, rule).tolist() == expected
     if all(map(grid.contains, path)):
         exact = sum(exact_cost(*segment, grid, rule) for segment in segments)
         assert cost_along(path, grid, rule) == pytest.approx(exact)
