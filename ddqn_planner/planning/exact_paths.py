@@ -18,8 +18,8 @@ CellXY: TypeAlias = NDArray[np.int32]  # (2,)
 Point: TypeAlias = tuple[float, float]
 
 # Cells: points so near to each other are one point, and a line so near to a cell
-# touches it. It is more than the rounding between metres and cells, also on maps far
-# from their frame's origin.
+# touches the cell. It is more than the rounding between metres and cells, also on maps
+# far from the origin of their frame.
 MARGIN: Final = 1e-6
 
 
@@ -72,14 +72,27 @@ def exact_path(
 
 
 def dense(points: Float64, spacing: float) -> tuple[Float64, NDArray[np.int64]]:
-    """Return points on a path, at most a spacing apart: (M, 2), and their pieces.
+    """Return points on a path of straight pieces, at most a spacing apart.
 
-    All points of the path are among them. The pieces are the numbers of the straight
-    pieces of the path that begin at or before each point except the last: (M - 1,).
+    Parameters
+    ----------
+    points : (N, 2)
+        Where the path turns.
+    spacing : float
+        In the unit of the points.
+
+    Returns
+    -------
+    dense_points : (M, 2)
+        The points of the path, and points between them.
+    pieces : (M - 1,)
+        For each dense point except the last, the number of the straight piece that it
+        begins or lies on.
     """
-    lengths = np.hypot(*np.diff(points, axis=0).T)
+    lengths = np.hypot(*np.diff(points, axis=0).T)  # (N - 1,)
+    # Into how many equal parts each piece is divided.
     parts = np.ceil(lengths / spacing * (1 - MARGIN)).astype(np.int64)
-    position = positions(parts)
+    position = positions(parts)  # (M,): in pieces from the start of the path
     number = np.arange(len(points))
     dense_points = np.column_stack(
         [np.interp(position, number, axis) for axis in points.T]
@@ -88,11 +101,11 @@ def dense(points: Float64, spacing: float) -> tuple[Float64, NDArray[np.int64]]:
 
 
 def _point_in(grid: GridMap, cell: CellXY, point: Point) -> Float64:
-    """Return a point (2,) if it lies in a cell, else the cell's centre."""
+    """Return a point if it lies in a cell, else the cell's centre: (2,), in metres."""
     x, y = cell.tolist()
-    return np.array(
-        point if grid.world_to_cell(*point) == (x, y) else grid.centres(cell)
-    )
+    if grid.world_to_cell(*point) == (x, y):
+        return np.array(point)
+    return grid.centres(cell)
 
 
 def _in_cells(points: Float64, grid: GridMap) -> Float64:
@@ -101,9 +114,10 @@ def _in_cells(points: Float64, grid: GridMap) -> Float64:
 
 
 def _corners_between(path: Path, grid: GridMap, begin: Float64, end: Float64) -> Path:
-    """Return the cells of a leg at whose centres the path turns between two points.
+    """Return the cells of a leg (N, 2) through whose centres a path leads.
 
-    The points lie in the first and in the last cell of the leg.
+    The points `begin` and `end`, in cells, lie in the first and in the last cell of the
+    leg. Between the centres of its cells, the leg is known to be clear.
     """
     if len(path) == 1:
         return path[:0]
@@ -123,13 +137,15 @@ def _corners_between(path: Path, grid: GridMap, begin: Float64, end: Float64) ->
 
 
 def _is_near(point: Float64, cell: CellXY) -> bool:
+    """Return whether a point is the centre of a cell."""
     return bool(np.abs(point - cell).max() < MARGIN)
 
 
 def _is_clear(begin: Float64 | CellXY, end: Float64 | CellXY, grid: GridMap) -> bool:
     """Return whether a straight piece touches only free cells, and leaves them legally.
 
-    The cells of its ends need not be free: a robot may leave an obstacle.
+    The piece leads from `begin` to `end`, in cells. The cells in which these two lie
+    need not be free: a robot may leave an obstacle.
     """
     layers = grid.layers(MoveRule.ROBOT_SAFE)
     x, y = begin.tolist()
@@ -139,19 +155,19 @@ def _is_clear(begin: Float64 | CellXY, end: Float64 | CellXY, grid: GridMap) -> 
 
 @inlined
 def _cell_at(position: float) -> int:
-    """Return the column or row in which a position lies."""
+    """Return the column of x, or the row of y: cell 0 reaches from -0.5 to 0.5."""
     return math.floor(position + 0.5)
 
 
 @inlined
 def _first_touched(lowest: float) -> int:
-    """Return the first column or row that is touched from a position on."""
+    """Return the first column or row touched from the lowest position of a line on."""
     return math.floor(lowest + 0.5 - MARGIN)
 
 
 @inlined
 def _last_touched(highest: float) -> int:
-    """Return the last column or row that is touched up to a position."""
+    """Return the last column or row that a line touches up to its highest position."""
     return math.floor(highest + 0.5 + MARGIN)
 
 
@@ -159,7 +175,10 @@ def _last_touched(highest: float) -> int:
 def _touches_none(
     x: float, y: float, last_x: float, last_y: float, layers: Layers
 ) -> bool:
-    """Return whether no cell is in the way of a piece, see `_is_clear`."""
+    """Return whether no cell is in the way of a straight piece, see `_is_clear`.
+
+    The piece leads from (x, y) to (last_x, last_y), in cells.
+    """
     dx = last_x - x
     dy = last_y - y
     step_x = (dx > MARGIN) - (dx < -MARGIN)
@@ -169,12 +188,14 @@ def _touches_none(
     right = max(x, last_x)
     slope = dy / dx if step_x != 0 else 0.0
     for column in range(_first_touched(left), _last_touched(right) + 1):
-        # The part of the piece within this column, from one edge to the other.
+        # The y of the piece where it enters and where it leaves this column.
         begin_y = y
         end_y = last_y
         if step_x != 0:
-            begin_y = y + (max(column - 0.5 - MARGIN, left) - x) * slope
-            end_y = y + (min(column + 0.5 + MARGIN, right) - x) * slope
+            left_in_column = max(column - 0.5 - MARGIN, left)
+            right_in_column = min(column + 0.5 + MARGIN, right)
+            begin_y = y + (left_in_column - x) * slope
+            end_y = y + (right_in_column - x) * slope
         low = min(begin_y, end_y)
         high = max(begin_y, end_y)
         for row in range(_first_touched(low), _last_touched(high) + 1):
@@ -189,7 +210,12 @@ def _touches_none(
 def _is_in_the_way(
     column: int, row: int, is_first: bool, is_last: bool, actions: int, layers: Layers
 ) -> bool:
-    """Return whether a cell that a piece touches is occupied or forbids actions."""
+    """Return whether a cell that a straight piece touches stops the piece.
+
+    An occupied cell does, except the first and the last one. So does a cell that
+    forbids one of the actions, bits of a number, except the last one, which the piece
+    does not leave. Outside the map nothing does.
+    """
     height, width = layers.occupancy.shape
     is_inside = 0 <= column < width and 0 <= row < height
     if not is_inside or is_last:
@@ -200,6 +226,6 @@ def _is_in_the_way(
 
 
 def _length(points: Float64, grid: GridMap) -> float:
-    """Return the length of a path of points in cells, see `path_length`."""
+    """Return the length in cells of a path of points (N, 2) in metres."""
     steps = np.diff(_in_cells(points, grid), axis=0)
     return float(np.hypot(*steps.T).sum())

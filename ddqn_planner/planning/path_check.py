@@ -13,8 +13,8 @@ from ddqn_planner.planning.pose_paths import BodyPoints, Float64, in_cells, touc
 from ddqn_planner.planning.pose_world import occupied_for_body
 
 LETHAL: Final = 254  # Nav2's cost of an obstacle
-INSCRIBED: Final = 253  # and of a free cell so near to one that a disc touches it
-COST_STEP: Final = 2.5  # of Nav2's costs in one of a `GridMap`, as NavFn counts them
+INSCRIBED: Final = 253  # Nav2's cost of a free cell where a disc touches an obstacle
+COST_STEP: Final = 2.5  # Nav2's cost per cost of a `GridMap`, as NavFn counts them
 
 
 def invalid_poses(
@@ -64,31 +64,36 @@ def invalid_poses(
         invalid = [
             number
             for number in range(first, end)
-            if touches(path[number : number + 1], points, bits)
+            if touches(path[number : number + 1], points, bits)  # a path of one pose
         ]
         return np.array(invalid, np.int64)
-    # float64: the poses may lie far away.
-    cells = np.floor(grid.in_cells(poses[first:end, :2]))
+    # As float64, since poses may lie too far away for whole numbers.
+    cells = np.floor(grid.in_cells(poses[first:end, :2]))  # (M, 2)
     is_invalid = _is_closed(cells, closed)
     cell = None if robot is None else grid.world_to_cell(*robot)
     if cell is not None and grid.contains(cell) and not grid.is_free(cell):
-        before_free = int(is_invalid.argmin())  # 0 if it leads nowhere
+        # The poses before the first free one are the way out of the robot's cell. No
+        # pose is, if none is free.
+        way_out = int(is_invalid.argmin())
         obstacles = obstacles_in_the_way(grid, cell, clearing_radius)
-        is_invalid[:before_free] = _is_closed(cells[:before_free], obstacles)
+        is_invalid[:way_out] = _is_closed(cells[:way_out], obstacles)
     return first + np.flatnonzero(is_invalid)
 
 
 def _part_to_check(poses: Float64, robot: Any, distance: float) -> tuple[int, int]:
-    """Return the first pose to check, and the one after the last."""
+    """Return the numbers of the first pose to check and of the pose after the last.
+
+    See `invalid_poses` for the parameters.
+    """
     x, y, _ = poses.T
     first = 0
     if robot is not None:
         distance_to_robot = np.hypot(x - robot[0], y - robot[1])  # (N,)
         first = int(distance_to_robot.argmin())
-    if not distance > 0:
+    if not distance > 0:  # also where it is no number
         return first, len(poses)
     steps = np.hypot(np.diff(x[first:]), np.diff(y[first:]))
-    distance_from_first = np.cumsum(steps)  # of each pose after it
+    distance_from_first = np.cumsum(steps)  # of each pose after the first
     poses_ahead = int(np.count_nonzero(distance_from_first <= distance))
     return first, first + 1 + poses_ahead
 
@@ -96,22 +101,23 @@ def _part_to_check(poses: Float64, robot: Any, distance: float) -> tuple[int, in
 def _closed_cells(
     grid: GridMap, has_body: bool, unknown: Occupancy | None, max_cost: int
 ) -> Occupancy:
-    """Return the cells that are not free, (H, W) bool."""
+    """Return the cells that are not free, (H, W): see `invalid_poses`."""
     closed = occupied_for_body(grid) if has_body else grid.occupancy
     if unknown is not None:
         closed = closed | unknown
     if max_cost < LETHAL:
-        cost = (
-            np.zeros(closed.shape)
-            if grid.cost is None
-            else COST_STEP * np.maximum(grid.cost, 0)
-        )
+        cost = np.zeros(closed.shape)  # as Nav2 counts it
+        if grid.cost is not None:
+            cost = COST_STEP * np.maximum(grid.cost, 0)
         closed = closed | (np.where(grid.occupancy, INSCRIBED, cost) >= max_cost)
     return closed
 
 
 def _is_closed(cells: Float64, closed: Occupancy) -> NDArray[np.bool_]:
-    """Return which cells (N, 2) are closed, or lie outside the map."""
+    """Return which cells (N, 2) are closed or lie outside the map: (N,).
+
+    `closed` (H, W) says which cells of the map are closed.
+    """
     height, width = closed.shape
     is_closed: NDArray[np.bool_]
     is_closed = np.any((cells < 0) | (cells >= (width, height)), axis=1)

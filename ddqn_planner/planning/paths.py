@@ -2,7 +2,7 @@
 
 import heapq
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +21,19 @@ from ddqn_planner.planning.segments import (
     straightened,
 )
 
-# Cells along an axis that a robot may be beside its path, and still come back to it.
+# Cells along an axis that a robot may be away from its path, and still come back to it.
 REACH = 5
-# Of ways out of one length, the one that ends nearer to the goal: so little its
-# distance counts.
+# What a cell of distance from the goal costs at the end of a way out of the start: so
+# little that of several shortest ways out the one counts that ends nearest to the goal.
 NEARER_TO_GOAL = 1e-9
 NO_CELL = -1  # the number of a cell that does not exist
+
+
+class WayOut(NamedTuple):
+    """How a path leaves the start, and where it can end."""
+
+    cells: tuple[Cell, ...]  # from the start to a free cell; the start alone if free
+    ends: Goals  # a path leads to each of them from the last of these cells
 
 
 # Best-first search
@@ -39,10 +46,22 @@ def search(
     move_rule: MoveRule,
     value: NDArray[np.float32] | None = None,
 ) -> tuple[Cell, ...]:
-    """Return a legal path to a cell, or to the nearest of a mask; empty without one."""
-    # A* (Hart, Nilsson and Raphael 1968) with -V as its heuristic: a good field leads
-    # straight to the end, and with any, each cell is visited at most once. Without
-    # values it is Dijkstra.
+    """Return the cells of a legal path from a start to an end; empty without a path.
+
+    It is A* (Hart, Nilsson and Raphael 1968) with minus the values as its heuristic.
+    Each cell is visited at most once, whatever the values are.
+
+    Parameters
+    ----------
+    start : (x, y)
+    end : (x, y) or (H, W) bool
+        The cell where the path ends, or all cells where it may end.
+    grid : GridMap
+    move_rule : MoveRule
+    value : (H, W), optional
+        Minus the expected cost from each cell to an end. Without values it is
+        Dijkstra's algorithm, which finds a cheapest path to the nearest end.
+    """
     shape = grid.occupancy.shape
     if isinstance(end, np.ndarray):
         is_end = end
@@ -68,15 +87,17 @@ def search(
 def _search(
     start: Cell, is_end: Any, value: Any, layers: Layers
 ) -> tuple[NDArray[np.int8], int]:
-    """Return the action by which each cell was entered, (H, W) int8, and an end.
+    """Do the search of `search`.
 
-    The end is the number y * W + x of its cell, or NO_CELL if no path leads to one.
+    Return the action by which each cell was entered, (H, W), and the end that was
+    reached: the number y * W + x of its cell, or NO_CELL if no path leads to an end.
     """
     height, width = is_end.shape
     entered_by = np.full(is_end.shape, -1, dtype=np.int8)
     visited = np.zeros(is_end.shape, dtype=np.bool_)
-    # Of each move: its order, the cost of the path with it, the number of the cell to
-    # which it leads, the action.
+    # A heap of moves. For each: its order (the cost of the path with the move plus the
+    # expected rest), the cost of the path, the number of the cell to which the move
+    # leads, and the action.
     start_x, start_y = start
     queue = [(0.0, 0.0, start_y * width + start_x, -1)]
     while len(queue) > 0:
@@ -110,52 +131,50 @@ def _search(
 # The way out, and the goals that are left
 
 
-def way_and_ends(
-    request: PlanRequest, goals: Goals
-) -> tuple[tuple[Cell, ...], Goals] | PlanStatus:
-    """Return the way to the first free cell and where a path can end.
+def way_and_ends(request: PlanRequest, goals: Goals) -> WayOut | PlanStatus:
+    """Return how a path leaves the start and where it can end.
 
-    Or the status that says why there is no path.
+    It can end in each of the `goals`, the free ones of the request, to which a path
+    leads; or else, with a tolerance, in the free cell nearest to the goal to which one
+    leads. If no path leads to any, return the status that says why.
     """
     grid = request.grid
     if goals:
-        way_out, ends = _way_and_reached(request, np.array(goals))
-        if len(ends):
-            return way_out, tuple((x, y) for x, y in ends.tolist())
+        way_out = _way_out_to(np.array(goals), request)
+        if way_out.ends:
+            return way_out
     if request.reach >= 1:
         free_cells = _cells_within(~grid.occupancy, request.goals[0], request.reach)
-        way_out, ends = _way_and_reached(request, free_cells)
-        if len(ends):
-            x, y = ends[0].tolist()  # the nearest to the goal
-            return way_out, ((x, y),)
+        way_out = _way_out_to(free_cells, request)
+        if way_out.ends:
+            return way_out._replace(ends=way_out.ends[:1])  # the nearest to the goal
     is_start_obstacle = grid.is_obstacle(request.start)
     if is_start_obstacle and not find_way_out(request, ~grid.occupancy):
         return PlanStatus.START_OCCUPIED
     return PlanStatus.NO_PATH if goals else PlanStatus.GOAL_OCCUPIED
 
 
-def _way_and_reached(
-    request: PlanRequest, ends: NDArray[np.int64]
-) -> tuple[tuple[Cell, ...], NDArray[np.int64]]:
-    """Return the way out of the start, and which of some cells (N, 2) paths reach."""
+def _way_out_to(candidates: NDArray[np.int64], request: PlanRequest) -> WayOut:
+    """Return how a path leaves the start, and which candidates (N, 2) paths reach."""
     grid = request.grid
     rule = request.move_rule
-    way_out: tuple[Cell, ...] = (request.start,)
+    cells: tuple[Cell, ...] = (request.start,)
     if not grid.is_free(request.start):
-        leads_to_end = grid.reachable(ends, rule, backward=True)
-        way_out = find_way_out(request, leads_to_end)
-    is_reached = grid.reachable(way_out[-1:], rule)  # (H, W)
-    x, y = ends.T
-    return way_out, ends[is_reached[y, x]]
+        leads_to_candidate = grid.reachable(candidates, rule, backward=True)  # (H, W)
+        cells = find_way_out(request, leads_to_candidate)
+    is_reached = grid.reachable(cells[-1:], rule)  # (H, W)
+    x, y = candidates.T
+    ends = candidates[is_reached[y, x]].tolist()
+    return WayOut(cells, tuple((end_x, end_y) for end_x, end_y in ends))
 
 
 def obstacles_in_the_way(
     grid: GridMap, start: Cell, clearing_radius: float
 ) -> Occupancy:
-    """Return the obstacles that count for a start, which may be one itself: (H, W).
+    """Return the obstacles through which no way out of a start may lead: (H, W) bool.
 
-    They are those before inflation. Where the robot stands on one, the obstacles within
-    the clearing radius, in cells, do not count.
+    These are the map's obstacles without inflation. If the start is an obstacle itself,
+    no obstacle within the clearing radius, in cells, of the start counts.
     """
     obstacles = grid.occupancy if grid.obstacles is None else grid.obstacles
     if clearing_radius > 0 and grid.is_obstacle(start):
@@ -166,13 +185,23 @@ def obstacles_in_the_way(
 
 
 def find_way_out(request: PlanRequest, ends: NDArray[np.bool_]) -> tuple[Cell, ...]:
-    """Return the shortest way from a start that is not free to one of some free cells.
+    """Return the shortest way from a start that is not free to a free cell.
 
-    It is empty if there is none.
+    Parameters
+    ----------
+    request : PlanRequest
+    ends : (H, W) bool
+        Free cells in which the way may end.
+
+    Returns
+    -------
+    tuple of (x, y)
+        The cells of the way; empty if there is none. Cells that are occupied only by
+        inflation may be passed, obstacles only within the request's clearing radius.
     """
     grid = request.grid
     obstacles = obstacles_in_the_way(grid, request.start, request.start_clearing_radius)
-    # The way leads through what is not free, and ends in the first cell that is.
+    # The way leads through cells that are not free, and ends in its first free cell.
     is_closed = ~ends & (obstacles | ~grid.occupancy)
     leaving = GridMap(is_closed, forbidden=grid.forbidden)
     goal_x, goal_y = request.goals[0]
@@ -185,15 +214,19 @@ def find_way_out(request: PlanRequest, ends: NDArray[np.bool_]) -> tuple[Cell, .
 def _cells_within(
     mask: NDArray[np.bool_], centre: Cell, radius: float
 ) -> NDArray[np.int64]:
-    """Return the cells (N, 2) of a mask within a radius of a cell, nearest first."""
+    """Return the cells (N, 2) of a mask (H, W) near a centre, the nearest first.
+
+    The cells are those within a radius, in cells, of the centre.
+    """
     x, y = centre
+    # Columns and rows to each side of the centre; a radius may be infinite.
     side = int(min(radius, max(mask.shape)))
     first_column = max(x - side, 0)
     first_row = max(y - side, 0)
     window = mask[first_row : y + side + 1, first_column : x + side + 1]
-    row, column = np.nonzero(window)
-    cells = np.column_stack([column + first_column, row + first_row])
-    distance = np.hypot(cells[:, 0] - x, cells[:, 1] - y)
+    rows, columns = np.nonzero(window)
+    cells = np.column_stack([columns + first_column, rows + first_row])  # (M, 2)
+    distance = np.hypot(cells[:, 0] - x, cells[:, 1] - y)  # (M,)
     order = np.argsort(distance, kind="stable")
     count = np.count_nonzero(distance <= radius)
     return cells[order[:count]]
@@ -203,7 +236,7 @@ def _cells_within(
 
 
 def _clipped(cells: Path, grid: GridMap) -> Path:
-    """Return cells of which none is farther outside the map than its sides are long."""
+    """Return cells (N, 2), moved to within a map's width and height around the map."""
     # Along a segment to a cell 1e9 m away lie more cells than memory holds.
     size = np.array([grid.width, grid.height])
     clipped: Path = np.clip(cells, -size, 2 * size).astype(np.int32)
@@ -213,51 +246,77 @@ def _clipped(cells: Path, grid: GridMap) -> Path:
 def rest_of_path(
     path: Cells, robot: Cell, grid: GridMap, move_rule: MoveRule | str
 ) -> Path:
-    """Return what is left of a path from a robot's cell on, (N, 2).
+    """Return the path that leads from a robot's cell back to a path and along the rest.
 
-    It is empty if the robot is too far from the path, or what is left is not legal.
+    It is empty if the robot is more than `REACH` cells away from the path, or the rest
+    of the path is not legal, or no legal way leads back to it.
+
+    Parameters
+    ----------
+    path : (N, 2)
+        Cells, joined by moves or by segments.
+    robot : (x, y)
+    grid : GridMap
+    move_rule : MoveRule
+
+    Returns
+    -------
+    (K, 2) int32
     """
     cells = np.asarray(path, dtype=np.int32).reshape(-1, 2)
+    no_path = cells[:0]
     if not len(cells) or not grid.is_free(robot):
-        return cells[:0]
+        return no_path
     cells = _clipped(cells, grid)
-    passed_cells, position = cells_along(cells)  # (M, 2) and (M,)
-    following = position.astype(np.int64) + 1  # (M,): the end of the segment there
-    is_legal = following >= _legal_from(cells, grid, move_rule)
+    # (M, 2): the cells that segments pass through, and (M,): where in the path each of
+    # them lies, in segments from the path's start.
+    passed_cells, position = cells_along(cells)
+    next_corner = position.astype(np.int64) + 1  # (M,): the row of `cells` after each
+    is_rest_legal = next_corner >= _legal_from(cells, grid, move_rule)  # (M,)
     distance = np.abs(passed_cells - robot).max(axis=1)  # (M,)
-    candidates = np.flatnonzero((distance <= REACH) & is_legal)
-    # The nearest first, and of those the farthest along the path.
+    candidates = np.flatnonzero((distance <= REACH) & is_rest_legal)
+    # The nearest to the robot first; of equally near cells, the last one of the path.
     order = np.lexsort((-candidates, distance[candidates]))
     for index in candidates[order].tolist():
-        for way in _ways_to(passed_cells[index], robot):
-            onward = cells[following[index] :]
-            joined = np.concatenate([way, onward], dtype=np.int32)
-            new_part = joined[: len(way) + 1]
-            is_short = len(way) <= REACH + 1
-            if is_short and legal_segments(new_part, grid, move_rule).all():
+        rest = cells[next_corner[index] :]
+        for way_back in _ways_to(passed_cells[index], robot):
+            if len(way_back) > REACH + 1:
+                continue
+            joined = np.concatenate([way_back, rest], dtype=np.int32)
+            new_part = joined[: len(way_back) + 1]  # with the first corner of the rest
+            if legal_segments(new_part, grid, move_rule).all():
                 return joined
-    return cells[:0]
+    return no_path
 
 
 def _ways_to(cell: Path, robot: Cell) -> Iterator[NDArray[np.int64]]:
-    """Yield three ways from a robot's cell to another one, each (K, 2)."""
-    # Diagonal moves first, or one axis after the other: past a corner that a segment
-    # grazes.
+    """Yield three ways from a robot's cell to a cell (2,): cells (K, 2) of moves.
+
+    The first one begins with diagonal moves. The others move along x first, or along y
+    first: past the corner of an obstacle that a diagonal move would touch.
+    """
     vector = cell - robot
     dx, dy = np.abs(vector).tolist()
-    for wait_x, wait_y in ((0, 0), (0, dx), (dy, 0)):
-        count = max(dx + wait_x, dy + wait_y)
+    # How many moves pass before the first one along x, and before the first along y.
+    for moves_before_x, moves_before_y in ((0, 0), (0, dx), (dy, 0)):
+        count = max(dx + moves_before_x, dy + moves_before_y)
         moves = np.arange(count + 1)
-        columns = np.clip(moves - wait_x, 0, dx)
-        rows = np.clip(moves - wait_y, 0, dy)
+        columns = np.clip(moves - moves_before_x, 0, dx)
+        rows = np.clip(moves - moves_before_y, 0, dy)
         yield robot + np.sign(vector) * np.column_stack([columns, rows])
 
 
 def keep_or_switch(request: PlanRequest, new_path: Path) -> tuple[Path, float | None]:
-    """Return the rest of the path under way and the share that it costs more.
+    """Return the path to follow: the rest of the path under way, or a new path.
 
-    Or the new path and None, if the rest costs more by the threshold, or ends neither
-    where the new path does nor at another goal.
+    It is the new path if the rest costs more by the request's threshold, or if it ends
+    neither where the new path does nor at a goal of the request.
+
+    Returns
+    -------
+    path : (N, 2)
+    extra_cost : float or None
+        By which share the rest costs more than the new path; None for a new path.
     """
     grid = request.grid
     rule = request.move_rule
@@ -274,18 +333,21 @@ def keep_or_switch(request: PlanRequest, new_path: Path) -> tuple[Path, float | 
     new_cost = cost_along(new_path, grid, rule)
     if not request.keeps(cost, new_cost):
         return new_path, None
-    # Only pulled straight through cells that are free by now: that is a new path.
+    # The rest is cheap enough only after it was straightened, through cells that have
+    # become free: that is a new path.
     if not request.keeps(cost_along(old_path, grid, rule), new_cost):
         return path, None
-    return path, cost / new_cost - 1 if new_cost else 0.0
+    if new_cost == 0:  # the robot is at the goal
+        return path, 0.0
+    return path, cost / new_cost - 1
 
 
 def _legal_from(cells: Path, grid: GridMap, move_rule: MoveRule | str) -> int:
-    """Return the first cell of a path (N, 2) from which on all of it is legal.
+    """Return the row of a path (N, 2) from which on all segments are legal.
 
-    It is N if the path's end is not.
+    It is N if the last cell is not free.
     """
-    # As a segment of no length the last cell has to be free too.
+    # A segment of no length at the end: so the last cell has to be free, too.
     path = np.concatenate([cells, cells[-1:]])
     is_legal = legal_segments(path, grid, move_rule)
     illegal = np.flatnonzero(~is_legal)

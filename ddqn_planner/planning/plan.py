@@ -67,7 +67,7 @@ class PathRequest(Generic[Place]):
     switch_threshold: float = field(default=0.0, kw_only=True)
 
     def keeps(self, cost: float, new_cost: float) -> bool:
-        """Return whether a path under way is kept, by its cost and a new path's."""
+        """Return whether a path under way of some cost is kept, not a new path."""
         return cost <= (1 + self.switch_threshold) * new_cost * SAME_COST
 
 
@@ -252,25 +252,26 @@ def joined(plans: Sequence[Plan]) -> Plan:
     """Return the plan through several goals, made of the plans of its legs.
 
     Each leg except the last succeeded, and ends where the next leg begins. If the last
-    leg has no path, its plan is returned, and the legs before it do not count.
+    leg has no path, its plan is returned as it is: the legs before it do not count.
     """
     last = plans[-1]
     if not last.path.size:
         return last
-    has_costs = plans[0].cost is not None
+    # All legs are on one map: all of them have a cost, or none.
+    costs = [plan.cost for plan in plans if plan.cost is not None]
     was_searched = PlanMethod.ASTAR_FALLBACK in {plan.method for plan in plans}
     return replace(
         _with_poses_of(plans) if isinstance(last, PosePlan) else last,
         path=_end_to_end([plan.path for plan in plans]),
         method=PlanMethod.ASTAR_FALLBACK if was_searched else PlanMethod.GREEDY,
-        cost=sum(plan.cost or 0.0 for plan in plans) if has_costs else None,
+        cost=sum(costs) if costs else None,
         field_ms=sum(plan.field_ms for plan in plans),
         rollout_ms=sum(plan.rollout_ms for plan in plans),
     )
 
 
 def _with_poses_of(plans: Sequence[Plan]) -> PosePlan:
-    """Return the last plan with the poses of all plans."""
+    """Return the plan of the last leg with the poses of all legs."""
     legs = [plan for plan in plans if isinstance(plan, PosePlan)]
     return replace(
         legs[-1],
@@ -281,5 +282,8 @@ def _with_poses_of(plans: Sequence[Plan]) -> PosePlan:
 
 
 def _end_to_end(legs: Sequence[NDArray[Number]]) -> NDArray[Number]:
-    """Return the rows of legs that begin with the last row of the leg before."""
+    """Return the rows of all legs, (N, 2) or (N, 3); each row is there once.
+
+    Each leg begins with the last row of the leg before it.
+    """
     return np.concatenate([legs[0][:1], *(leg[1:] for leg in legs)])

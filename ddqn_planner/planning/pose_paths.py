@@ -17,7 +17,7 @@ from ddqn_planner.robot.motions import BEHIND, TURN, turn_between
 
 Float64 = NDArray[np.float64]
 
-# Cells and radians that a robot may be beside its path.
+# Cells and radians by which a robot may be off its path.
 REACH: Final = 5.0, math.pi / 4
 OUTLINE_SPACING: Final = 0.25  # cells between two points of a body's outline
 # And inside: so each cell there, turned as it may be, has a point.
@@ -37,7 +37,7 @@ class PosePath(NamedTuple):
     least_cost: float  # a lower bound of the cost of any path between its ends
 
     def plan(self, first: int, grid: GridMap) -> PosePlan:
-        """Return the plan along the poses from one on."""
+        """Return the plan along the poses from number `first` on."""
         poses = self.poses[first:]
         poses.flags.writeable = False
         cells = self.cells[first:]
@@ -70,18 +70,27 @@ class BodyPoints(NamedTuple):
 
 
 def points_of(corners: Float64, resolution: float) -> BodyPoints:
-    """Return points of a footprint whose corners (C, 2) are in metres."""
-    body = corners / resolution
-    x = np.arange(body[:, 0].min(), body[:, 0].max(), FILL_SPACING)
-    y = np.arange(body[:, 1].min(), body[:, 1].max(), FILL_SPACING)
-    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    return BodyPoints(outline(body, OUTLINE_SPACING), points[inside(points, body)])
+    """Return points of a footprint whose corners (C, 2) are in metres.
+
+    The resolution is in metres per cell.
+    """
+    corners_in_cells = corners / resolution
+    min_x, min_y = corners_in_cells.min(axis=0)
+    max_x, max_y = corners_in_cells.max(axis=0)
+    x = np.arange(min_x, max_x, FILL_SPACING)
+    y = np.arange(min_y, max_y, FILL_SPACING)
+    lattice = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    return BodyPoints(
+        outline=outline(corners_in_cells, OUTLINE_SPACING),
+        inside=lattice[inside(lattice, corners_in_cells)],
+    )
 
 
 def in_cells(poses: Float64, grid: GridMap) -> Float64:
     """Return poses (N, 3) with x and y in cells from the centre of cell (0, 0).
 
-    They are turned with the map.
+    The given poses are in metres, in the map's frame; yaws become those from the map's
+    x axis.
     """
     poses = np.reshape(poses, (-1, 3))
     cells = grid.in_cells(poses[:, :2]) - 0.5
@@ -92,9 +101,21 @@ def in_cells(poses: Float64, grid: GridMap) -> Float64:
 def nearest_pose(
     poses: Float64, robot: Any, grid: GridMap, reach: tuple[float, float]
 ) -> int:
-    """Return which of some poses (N, 3) is nearest to a robot's pose.
+    """Return the number of the pose that is nearest to a robot's pose.
 
-    It is -1 if none is within reach: so many cells and radians.
+    Parameters
+    ----------
+    poses : (N, 3)
+        In metres and radians.
+    robot : (x, y, yaw)
+    grid : GridMap
+    reach : (float, float)
+        How many cells and how many radians the pose may be away from the robot's pose.
+
+    Returns
+    -------
+    int
+        -1 if no pose is within reach.
     """
     x, y, yaw = robot
     max_distance, max_turn = reach
@@ -103,21 +124,26 @@ def nearest_pose(
     candidates = np.flatnonzero((distance <= max_distance) & (turn <= max_turn))
     if not len(candidates):
         return -1
-    apartness = distance[candidates] / REACH[0] + turn[candidates] / REACH[1]
+    max_cells, max_radians = REACH
+    # Such a distance counts as much as such a turn.
+    apartness = distance[candidates] / max_cells + turn[candidates] / max_radians
     return int(candidates[apartness.argmin()])
 
 
 def is_free(poses: Float64, grid: GridMap, body: BodyPoints) -> bool:
-    """Return whether a body has room along a path, and leaves no cell as it forbids."""
+    """Return whether a body has room at all poses (N, 3), and no cell forbids the path.
+
+    The poses are in metres and radians, in the map's frame.
+    """
     path = in_cells(poses, grid)
     occupied = occupied_for_body(grid).view(np.uint8)
     height, width = occupied.shape
     cells = cells_of(path)
     if not ((cells >= 0) & (cells < (width, height))).all():
-        return False  # an origin outside of the body leaves the map
+        return False  # the origin, which may lie outside of the body, leaves the map
     if touches(path, body.outline, occupied):
         return False
-    # What is inside the body at a later pose has come through its outline.
+    # An obstacle that is inside the body at a later pose came in through the outline.
     if touches(path[:1], body.inside, occupied):
         return False
     if grid.forbidden is None:
@@ -130,23 +156,29 @@ def is_free(poses: Float64, grid: GridMap, body: BodyPoints) -> bool:
 
 
 def cells_of(path: Float64) -> NDArray[np.int32]:
-    """Return the cells in which poses `in_cells` lie, (N, 2)."""
+    """Return the cells (N, 2) in which poses (N, 3) from `in_cells` lie."""
     return np.floor(path[:, :2] + 0.5).astype(np.int32)
 
 
 def cost_of_poses(poses: Float64, grid: GridMap) -> float:
-    """Return nearly what the primitives of a free path cost."""
+    """Return the cost of a path along poses (N, 3), in cells.
+
+    It is nearly that of the primitives which make the path: each step between two poses
+    costs its length, more if it is not driven ahead, or its turn on the spot.
+    """
     path = in_cells(poses, grid)
-    dx, dy = np.diff(path[:, :2], axis=0).T  # (N - 1,) each, as all below
+    # Of each step, (N - 1,), as all arrays below.
+    dx, dy = np.diff(path[:, :2], axis=0).T
     length = np.hypot(dx, dy)
     yaw = path[:-1, 2]
     turn = turn_between(yaw, path[1:, 2])
-    yaw_between = yaw + turn / 2
-    length_ahead = dx * np.cos(yaw_between) + dy * np.sin(yaw_between)
-    cost = np.where(length_ahead > AHEAD * length, length, BEHIND * length)
+    mean_yaw = yaw + turn / 2
+    length_ahead = dx * np.cos(mean_yaw) + dy * np.sin(mean_yaw)
+    is_ahead = length_ahead > AHEAD * length
+    drive_cost = np.where(is_ahead, length, BEHIND * length)
     turn_cost = np.abs(turn) * TURN / grid.resolution
-    cost = np.where(length < ON_THE_SPOT, turn_cost, cost)
-    x, y = cells_of(path[:-1]).T
+    cost = np.where(length < ON_THE_SPOT, turn_cost, drive_cost)
+    x, y = cells_of(path[:-1]).T  # the cells in which the steps begin
     cell_costs = body_costs(grid)
     if cell_costs is not None:
         cost *= multipliers_of(cell_costs[y, x])
@@ -157,7 +189,17 @@ def cost_of_poses(poses: Float64, grid: GridMap) -> float:
 
 @in_place
 def touches(path: Float64, points: Float64, occupied: NDArray[np.uint8]) -> bool:
-    """Return whether points of a body touch an occupied cell, or leave the map."""
+    """Return whether points of a body touch an occupied cell, or leave the map.
+
+    Parameters
+    ----------
+    path : (N, 3)
+        Poses at which the body stands, see `in_cells`.
+    points : (M, 2)
+        From the origin of the body, ahead and to the left, in cells.
+    occupied : (H, W)
+        1 where a cell is occupied, else 0.
+    """
     height, width = occupied.shape
     for number in range(len(path)):
         # From the corner of cell (0, 0), so that rounding down gives the cell.

@@ -39,9 +39,9 @@ POSSIBLY_UNKNOWN: Final = (
 
 
 def has_more_to_say(grid: GridMap, plan: Plan, has_several_goals: bool) -> bool:
-    """Return whether there may be more to say than the status.
+    """Return whether the reason why a plan has no path may say more than its status.
 
-    That is unknown space as the reason, or the reason of each of several goals.
+    It may name unknown space, or say what stops each of several goals.
     """
     if has_several_goals and plan.status in DIFFERS_BY_GOAL:
         return True
@@ -51,7 +51,8 @@ def has_more_to_say(grid: GridMap, plan: Plan, has_several_goals: bool) -> bool:
 def reason_of(request: PlanRequest, plan: Plan) -> str:
     """Return why a plan has no path, in words.
 
-    It is the status, or unknown space with what to do.
+    These are the words of its status; if unknown space may be the reason, that and what
+    to do; and for several goals, what stops each of them.
     """
     grid = request.grid
     status: str = plan.status.value
@@ -77,7 +78,7 @@ def reason_of(request: PlanRequest, plan: Plan) -> str:
 
 
 def _leads_through_unknown_space(request: PlanRequest) -> bool:
-    """Return whether there is a path if the unknown cells are free."""
+    """Return whether there is a path for a request if all unknown cells are free."""
     if request.grid.unknown is None:
         return False
     for possible in _grids_without_unknown(request.grid):
@@ -100,7 +101,10 @@ def goal_in_words(grid: GridMap, cell: Cell) -> str:
 
 
 def place_in_words(grid: GridMap, cell: Cell) -> str:
-    """Return how a cell lies that unknown space closes; empty for all other cells."""
+    """Return in words why unknown space closes a cell.
+
+    It is empty for a cell that is free, or that is occupied for another reason.
+    """
     if grid.unknown is None or not grid.contains(cell) or grid.is_free(cell):
         return ""
     x, y = cell
@@ -108,14 +112,15 @@ def place_in_words(grid: GridMap, cell: Cell) -> str:
         return IN_UNKNOWN_SPACE
     if grid.obstacles is None or grid.is_obstacle(cell) or grid.body_radius == 0:
         return ""
-    cells = grid.body_radius * (1 - ROUNDING) / grid.resolution
+    # The body is near enough to something. If it is an obstacle, that is the reason.
+    radius = grid.body_radius * (1 - ROUNDING) / grid.resolution  # cells
     box_of_cell = Box(slice(y, y + 1), slice(x, x + 1))
-    box = wider(box_of_cell, int(cells) + 1, grid.occupancy.shape)
+    box = wider(box_of_cell, int(radius) + 1, grid.occupancy.shape)
     is_obstacle = grid.obstacles[box] & ~grid.unknown[box]
-    rows, columns = is_obstacle.nonzero()
-    # To each obstacle in the box, in cells.
-    distances = np.hypot(rows + box.rows.start - y, columns + box.columns.start - x)
-    if (distances < cells).any():
+    rows, columns = is_obstacle.nonzero()  # of obstacles, from the box's first cell
+    dy = rows + box.rows.start - y
+    dx = columns + box.columns.start - x
+    if (np.hypot(dx, dy) < radius).any():
         return ""
     return "is nearer to unknown space than the robot's body allows"
 
@@ -130,12 +135,19 @@ def reason_of_goals(places: Sequence[str], through: str) -> str:
     through : str
         The words for a path through unknown space; empty if there is no such path.
     """
-    is_unknown = [UNKNOWN_SPACE in place for place in places]
-    # Of many goals, those in unknown space are named first, as the remedy is for them.
-    unknown_first = sorted(range(len(places)), key=lambda index: not is_unknown[index])
-    named = sorted(unknown_first[:MOST_NAMED])
-    reasons = [f"goal {index + 1} {places[index]}" for index in named if places[index]]
-    cut_off = [str(index + 1) for index in named if not places[index]]
+    in_unknown_space = [
+        number for number, place in enumerate(places, 1) if UNKNOWN_SPACE in place
+    ]
+    others = [
+        number for number, place in enumerate(places, 1) if UNKNOWN_SPACE not in place
+    ]
+    # Not all of many goals are named. Those in unknown space come first, as the remedy
+    # is for them.
+    named = sorted([*in_unknown_space, *others][:MOST_NAMED])
+    reasons = [
+        f"goal {number} {places[number - 1]}" for number in named if places[number - 1]
+    ]
+    cut_off = [str(number) for number in named if not places[number - 1]]
     if cut_off:
         goals = "goals" if len(cut_off) > 1 else "goal"
         reasons.append(f"no path leads to {goals} {', '.join(cut_off)}")
@@ -144,13 +156,14 @@ def reason_of_goals(places: Sequence[str], through: str) -> str:
     if through:
         reasons.append(through)
     words = ", ".join(reasons)
-    return f"{words}; {REMEDY}" if through or any(is_unknown) else words
+    return f"{words}; {REMEDY}" if through or in_unknown_space else words
 
 
 def _grids_without_unknown(grid: GridMap) -> Iterator[GridMap]:
     """Yield maps whose unknown cells are free.
 
-    On the first map, only obstacles count; on the last map, the body's radius, too.
+    On the first map, only obstacles are occupied. On the last map, cells are, too, that
+    are too near to obstacles for the body.
     """
     if grid.body_radius > 0 and grid.obstacles is not None and grid.unknown is not None:
         # The first map is quick to make, and often shows that there is no path.
