@@ -333,8 +333,10 @@ def _number_buckets(
 
     Parameters
     ----------
-    distance, mark : (C,)
-        As in `Known`.
+    distance : (C,)
+        The cost of a path from each cell to a goal.
+    mark : (C,)
+        Is OPEN for the cells that wait.
     candidates : (K,)
         Cells; some of them may be there twice.
     opened, bucket_number : (K,)
@@ -468,7 +470,7 @@ def _lose_unsupported(
     Parameters
     ----------
     distance : (C,)
-        As in `Known`; changes in place.
+        The cost of a path from each cell to a goal, 0 without a path; changes in place.
     waiting : (W,)
         The cells to judge, `waiting_end` of them at first; others are appended.
     lost : (limit,)
@@ -549,7 +551,7 @@ def roll_out(
     Parameters
     ----------
     distance : (C,)
-        As in `Known`.
+        The cost of a path from each cell to a goal, 0 without a path.
     start : int
         The number of a closed cell.
     path : (N, 2)

@@ -175,9 +175,10 @@ def _last_touched(highest: float) -> int:
 def _touches_none(
     x: float, y: float, last_x: float, last_y: float, layers: Layers
 ) -> bool:
-    """Return whether no cell is in the way of a straight piece, see `_is_clear`.
+    """Return whether a straight piece touches no cell that is in its way.
 
-    The piece leads from (x, y) to (last_x, last_y), in cells.
+    The piece leads from (x, y) to (last_x, last_y), in cells. It touches a cell that it
+    comes nearer to than `MARGIN`.
     """
     dx = last_x - x
     dy = last_y - y

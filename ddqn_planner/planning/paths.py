@@ -87,10 +87,11 @@ def search(
 def _search(
     start: Cell, is_end: Any, value: Any, layers: Layers
 ) -> tuple[NDArray[np.int8], int]:
-    """Do the search of `search`.
+    """Search a path from a start to an end, where `is_end` (H, W), by A*.
 
-    Return the action by which each cell was entered, (H, W), and the end that was
-    reached: the number y * W + x of its cell, or NO_CELL if no path leads to an end.
+    The values (H, W) are minus the expected cost from each cell to an end. Return the
+    action by which each cell was entered, (H, W), and the end that was reached: the
+    number y * W + x of its cell, or NO_CELL if no path leads to an end.
     """
     height, width = is_end.shape
     entered_by = np.full(is_end.shape, -1, dtype=np.int8)
@@ -155,7 +156,10 @@ def way_and_ends(request: PlanRequest, goals: Goals) -> WayOut | PlanStatus:
 
 
 def _way_out_to(candidates: NDArray[np.int64], request: PlanRequest) -> WayOut:
-    """Return how a path leaves the start, and which candidates (N, 2) paths reach."""
+    """Return how a path leaves the start, and which candidates (N, 2) it can reach.
+
+    The candidates are free cells. Without a way out, no cell is reached.
+    """
     grid = request.grid
     rule = request.move_rule
     cells: tuple[Cell, ...] = (request.start,)
@@ -201,12 +205,14 @@ def find_way_out(request: PlanRequest, ends: NDArray[np.bool_]) -> tuple[Cell, .
     """
     grid = request.grid
     obstacles = obstacles_in_the_way(grid, request.start, request.start_clearing_radius)
-    # The way leads through cells that are not free, and ends in its first free cell.
+    # The way leads through occupied cells that are no obstacles, and ends in its first
+    # free cell.
     is_closed = ~ends & (obstacles | ~grid.occupancy)
     leaving = GridMap(is_closed, forbidden=grid.forbidden)
     goal_x, goal_y = request.goals[0]
     y, x = np.ogrid[: grid.height, : grid.width]
     goal_distance = np.hypot(x - goal_x, y - goal_y)  # (H, W)
+    # So little that it decides between shortest ways only.
     value = (-NEARER_TO_GOAL * goal_distance).astype(np.float32)
     return search(request.start, ends, leaving, request.move_rule, value)
 
@@ -278,12 +284,12 @@ def rest_of_path(
     # The nearest to the robot first; of equally near cells, the last one of the path.
     order = np.lexsort((-candidates, distance[candidates]))
     for index in candidates[order].tolist():
-        rest = cells[next_corner[index] :]
+        remaining_path = cells[next_corner[index] :]
         for way_back in _ways_to(passed_cells[index], robot):
             if len(way_back) > REACH + 1:
                 continue
-            joined = np.concatenate([way_back, rest], dtype=np.int32)
-            new_part = joined[: len(way_back) + 1]  # with the first corner of the rest
+            joined = np.concatenate([way_back, remaining_path], dtype=np.int32)
+            new_part = joined[: len(way_back) + 1]  # up to the next corner
             if legal_segments(new_part, grid, move_rule).all():
                 return joined
     return no_path

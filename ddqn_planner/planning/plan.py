@@ -171,7 +171,7 @@ class Plan:
             raise ValueError(f"the path has shape {path.shape}; give (N, 2)")
         path = path.reshape(-1, 2)
         path.flags.writeable = False
-        object.__setattr__(self, "path", path)
+        object.__setattr__(self, "path", path)  # as the plan is frozen
         for name, kind in (
             ("status", PlanStatus),
             ("method", PlanMethod),

@@ -41,10 +41,10 @@ class PosePath(NamedTuple):
         poses = self.poses[first:]
         poses.flags.writeable = False
         cells = self.cells[first:]
-        has_left_cell = (cells[1:] != cells[:-1]).any(axis=1)
+        is_new_cell = np.append(True, (cells[1:] != cells[:-1]).any(axis=1))
         cost = float(self.costs[-1] - self.costs[first])
         least_cost = self.least_cost - float(self.costs[first])
-        bound = math.inf
+        bound = math.inf  # on the ratio of the cost to the least cost of any path
         if cost <= least_cost * SAME:
             bound = 1.0
         elif least_cost > 0:
@@ -53,7 +53,7 @@ class PosePath(NamedTuple):
         goal_x, goal_y = cells[-1].tolist()
         return PosePlan(
             PlanStatus.SUCCEEDED,
-            cells[np.append(True, has_left_cell)],
+            cells[is_new_cell],
             cost=cost * (grid.seconds_per_cell or 1.0),
             goal=(goal_x, goal_y),
             poses=poses,

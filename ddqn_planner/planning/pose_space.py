@@ -149,10 +149,11 @@ def order(search: Search, tiles: NDArray[np.int64]) -> float:
 
 @inlined
 def _expand_pose(number: int, distance: Any, mark: Any, heap: Any, search: Any) -> None:
-    """Lower the cost of each state from which a primitive to a state makes it cheaper.
+    """Lower the cost of each state that is nearer to a goal by way of a state.
 
-    Such a state is marked as open and queued. State `number` was just closed. These
-    `distance`, `mark` and `heap` are those of the search.
+    Such a state is marked as open and queued. State `number` was just closed; its
+    predecessors are the states from which a primitive leads to it. `distance`, `mark`
+    and `heap` are those of the search.
     """
     aim = search.aim
     world = search.world
@@ -551,18 +552,21 @@ def _step_over_tiles(
 def _turn_into_cost(search: Any, last_key: Any, box: Any) -> None:
     """Turn the steps in `aim.remaining` into lower bounds of costs, in cells.
 
-    `last_key` is the key of the last corner that A* has visited, and `box` that of
-    `look`.
+    `last_key` is the key of the last corner that A* has visited: its steps, plus those
+    that are left at least to the box around all goals.
     """
     aim = search.aim
     was_stopped = search.heap.size[0] > 0
     for y in range(aim.remaining.shape[0]):
         for x in range(aim.remaining.shape[1]):
-            # The key of a corner that was not visited would be no less than the last.
+            # A corner that was not visited has a key that is no less than the last.
             least_steps = np.inf
             if was_stopped:
                 least_steps = last_key - steps_to_box(x, y, box)
             step_count = min(aim.remaining[y, x], least_steps)
-            # The start lies in its tile: its nearest corner is a diagonal away at most.
-            tiles = step_count / (STRAIGHT * LONGER) - math.sqrt(2.0)
-            aim.remaining[y, x] = tiles * (1 << aim.shift)
+            # The shortest path in tiles, from a corner of the start's tile: the path of
+            # these steps is longer by the factor `LONGER` at most.
+            from_corner = step_count / (STRAIGHT * LONGER)
+            # The start is no farther than a diagonal from that corner.
+            from_start = from_corner - math.sqrt(2.0)
+            aim.remaining[y, x] = from_start * (1 << aim.shift)

@@ -123,10 +123,10 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
     `swept` (P, S, S) are the cells that the body sweeps on each primitive, around the
     cell in which the primitive begins.
     """
-    passed = [_passed_cells(poses) for poses in motions.poses]
-    masks = _masks_of(motions, swept, passed)
-    lowest = np.array([cells.min(axis=0) for cells, _, _ in passed])
-    highest = np.array([cells.max(axis=0) for cells, _, _ in passed])
+    origin_cells = [_passed_cells(poses) for poses in motions.poses]
+    masks = _masks_of(motions, swept, origin_cells)
+    lowest = np.array([cells.min(axis=0) for cells, _, _ in origin_cells])
+    highest = np.array([cells.max(axis=0) for cells, _, _ in origin_cells])
     farthest_swept = np.abs(np.argwhere(masks.swept) - swept.shape[1] // 2).max()
     # An origin outside of the body may reach farther than what the body sweeps.
     reach = int(max(farthest_swept, (highest - lowest).max()))
@@ -141,8 +141,10 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
     ]
     row_counts = np.concatenate([part.counts for part in rows])
     primitives = len(motions.start)
-    passed_rows = [np.column_stack([cells, actions]) for cells, actions, _ in passed]
-    shares = np.concatenate([shares for _, _, shares in passed])
+    passed_rows = [
+        np.column_stack([cells, actions]) for cells, actions, _ in origin_cells
+    ]
+    shares = np.concatenate([shares for _, _, shares in origin_cells])
     pose_rows = [
         np.column_stack([poses, np.linspace(0, 1, len(poses))])[1:]
         for poses in motions.poses
@@ -177,7 +179,7 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
 
 
 def _masks_of(
-    motions: Motions, swept: NDArray[np.bool_], passed: list[PassedCells]
+    motions: Motions, swept: NDArray[np.bool_], origin_cells: list[PassedCells]
 ) -> Masks:
     """Return what the primitives of each heading sweep in common.
 
@@ -195,7 +197,7 @@ def _masks_of(
         swept_around = np.array(
             [
                 np.roll(mask, (-y, -x), axis=(0, 1))
-                for x, y in passed[primitive].cells.tolist()
+                for x, y in origin_cells[primitive].cells.tolist()
             ]
         )
         # The body stands in cells that all primitives sweep which begin or end there.
@@ -354,10 +356,11 @@ def differences(old: GridMap, new: GridMap) -> NDArray[np.int64] | None:
 
     def differs(box: Box) -> NDArray[np.bool_]:
         """Return which cells of a box differ."""
-        is_free = ~new_occupied[box]
-        has_other_layers = new.differs(old, box) & is_free
-        differs: NDArray[np.bool_] = old_occupied[box] != new_occupied[box]
-        return differs | has_other_layers
+        has_changed_occupancy: NDArray[np.bool_]
+        has_changed_occupancy = old_occupied[box] != new_occupied[box]
+        # Any layer of the map: costs of occupied cells do not count.
+        has_changed_layer = new.differs(old, box) & ~new_occupied[box]
+        return has_changed_occupancy | has_changed_layer
 
     return changed_cells(old, new, differs)
 

@@ -278,7 +278,7 @@ def _write_costs(
 def _is_right_angle(
     path: CellArray, first: int, corner: int, last: int, layers: Layers
 ) -> bool:
-    """Return whether a corner of a path turns at a right angle around an occupied cell.
+    """Return whether a path turns at a right angle around an occupied cell.
 
     Where corners of obstacles must not be cut, no straight line then leads past the
     corner on that side. On a map with costs, or where corners may be cut, it is False.
@@ -385,8 +385,8 @@ def _keep_corners(
             width = abs(path[first + 1, 0] - path[first, 0])
             height = abs(path[first + 1, 1] - path[first, 1])
             cost = (end - first) * _length(width, height)
-        # How much longer the segment can be is found by doubling and halving. Around a
-        # right angle the very next cell is not seen.
+        # By how many cells the segment can be longer is found by doubling a step, and
+        # then by halving it. No segment reaches the very next cell past a right angle.
         step = FIRST_STEP
         is_doubling = True
         shortest_step = 1
@@ -397,15 +397,15 @@ def _keep_corners(
             cost_to_candidate = _cost_between(
                 path, first, candidate, is_backward, layers
             )
-            is_straight = cost_to_candidate < np.inf
+            can_replace_moves = cost_to_candidate < np.inf
             if cost_to_cell.size > 0:
                 cost_of_moves = cost_to_cell[candidate] - cost_to_cell[first]
-                is_straight = cost_to_candidate <= SAME_COST * cost_of_moves
-            if is_straight:
+                can_replace_moves = cost_to_candidate <= SAME_COST * cost_of_moves
+            if can_replace_moves:
                 end = candidate
                 cost = cost_to_candidate
                 shortest_step = 1
-            is_doubling = is_doubling and is_straight
+            is_doubling = is_doubling and can_replace_moves
             step = 2 * step if is_doubling else step // 2
         first = end
         number += 1
@@ -443,7 +443,7 @@ def _move_corners(
         was_moved_by = moved_by
         first_action = 0
         end_action = 8
-        if was_moved_by != NO_ACTION:  # no action except this one is tried again
+        if was_moved_by != NO_ACTION:  # this action alone is tried once more
             first_action = was_moved_by
             end_action = was_moved_by + 1
         elif _is_right_angle(path, corner - 1, corner, corner + 1, layers):
@@ -460,8 +460,10 @@ def _move_corners(
             _leave_out(path, costs, corner + 1, count)
             moved_by = NO_ACTION
         has_moved_corners |= is_at_next or moved_by != NO_ACTION
-        if is_at_next or (was_moved_by != NO_ACTION and moved_by == NO_ACTION):
-            corner = max(corner - 1, 1)  # the corner before has a new neighbour
+        has_come_to_rest = was_moved_by != NO_ACTION and moved_by == NO_ACTION
+        if is_at_next or has_come_to_rest:
+            # The corner before has a new neighbour, and may move now.
+            corner = max(corner - 1, 1)
         elif moved_by == NO_ACTION:
             corner += 1
     return count, has_moved_corners

@@ -70,7 +70,7 @@ def reason_of(request: PlanRequest, plan: Plan) -> str:
         place = place_in_words(grid, request.goals[0])
         if place:
             return f"the goal {place}; {REMEDY}"
-        if request.reach < 1:
+        if request.reach < 1:  # no other cell is within the tolerance
             return status
     if _leads_through_unknown_space(request):
         return f"{status}, {THROUGH_UNKNOWN_SPACE}; {REMEDY}"
@@ -135,19 +135,9 @@ def reason_of_goals(places: Sequence[str], through: str) -> str:
     through : str
         The words for a path through unknown space; empty if there is no such path.
     """
-    in_unknown_space = [
-        number for number, place in enumerate(places, 1) if UNKNOWN_SPACE in place
-    ]
-    others = [
-        number for number, place in enumerate(places, 1) if UNKNOWN_SPACE not in place
-    ]
-    # Not all of many goals are named. Those in unknown space come first, as the remedy
-    # is for them.
-    named = sorted([*in_unknown_space, *others][:MOST_NAMED])
-    reasons = [
-        f"goal {number} {places[number - 1]}" for number in named if places[number - 1]
-    ]
-    cut_off = [str(number) for number in named if not places[number - 1]]
+    named = _goals_to_name(places)
+    reasons = [f"goal {index + 1} {places[index]}" for index in named if places[index]]
+    cut_off = [str(index + 1) for index in named if not places[index]]
     if cut_off:
         goals = "goals" if len(cut_off) > 1 else "goal"
         reasons.append(f"no path leads to {goals} {', '.join(cut_off)}")
@@ -156,7 +146,20 @@ def reason_of_goals(places: Sequence[str], through: str) -> str:
     if through:
         reasons.append(through)
     words = ", ".join(reasons)
-    return f"{words}; {REMEDY}" if through or in_unknown_space else words
+    has_remedy = bool(through) or any(UNKNOWN_SPACE in place for place in places)
+    return f"{words}; {REMEDY}" if has_remedy else words
+
+
+def _goals_to_name(places: Sequence[str]) -> list[int]:
+    """Return the indices of the goals that are named, `MOST_NAMED` at most, in order.
+
+    The goals whose places are in unknown space come first, as the remedy is for them.
+    """
+    indices = range(len(places))
+    unknown_first = sorted(
+        indices, key=lambda index: UNKNOWN_SPACE not in places[index]
+    )
+    return sorted(unknown_first[:MOST_NAMED])
 
 
 def _grids_without_unknown(grid: GridMap) -> Iterator[GridMap]:
