@@ -156,11 +156,11 @@ def _theta_star(
             number = to_y * width + to_x
             if not (0 <= to_x < width and 0 <= to_y < height) or closed[number]:
                 continue
-            through = cost[cell] + segment_cost(x, y, to_x, to_y, 0.0, layers)
+            through = cost[cell] + segment_cost(x, y, to_x, to_y, True, layers)
             if through == np.inf:
                 continue
             direct = cost[parent[cell]] + segment_cost(
-                from_x, from_y, to_x, to_y, 0.0, layers
+                from_x, from_y, to_x, to_y, True, layers
             )
             least = min(through, direct)
             if least < cost[number] * (1 - 1e-12):
@@ -215,7 +215,7 @@ def _optimum(points: NDArray[np.int64], layers: Any) -> float:
         for other in range(len(points)):
             to_x, to_y = points[other]
             if cost[number] + np.hypot(to_x - x, to_y - y) < cost[other] - 1e-9:
-                length = cost[number] + segment_cost(x, y, to_x, to_y, 0.0, layers)
+                length = cost[number] + segment_cost(x, y, to_x, to_y, True, layers)
                 if length < cost[other] - 1e-9:
                     cost[other] = length
                     order = length + np.hypot(points[1, 0] - to_x, points[1, 1] - to_y)

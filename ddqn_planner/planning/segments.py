@@ -275,13 +275,14 @@ def _write_costs(
 
 
 @inlined
-def _is_right_angle(
+def _turns_around_obstacle(
     path: CellArray, first: int, corner: int, last: int, layers: Layers
 ) -> bool:
     """Return whether a path turns at a right angle around an occupied cell.
 
-    Where corners of obstacles must not be cut, no straight line then leads past the
-    corner on that side. On a map with costs, or where corners may be cut, it is False.
+    Such a corner cannot be left out, as no straight line leads past the occupied cell
+    on that side. It is False on a map with costs, or where corners of obstacles may be
+    cut.
 
     Parameters
     ----------
@@ -302,10 +303,12 @@ def _is_right_angle(
     has_horizontal_side = first_dy == 0 or last_dy == 0
     if not (has_vertical_side and has_horizontal_side):
         return False
-    # The cell between the two sides of the angle.
+    # The cell between the two sides of the angle, one step from the corner.
     dx = first_dx + last_dx
     dy = first_dy + last_dy
-    return bool(layers.occupancy[y + (dy > 0) - (dy < 0), x + (dx > 0) - (dx < 0)])
+    inner_x = x + (dx > 0) - (dx < 0)
+    inner_y = y + (dy > 0) - (dy < 0)
+    return bool(layers.occupancy[inner_y, inner_x])
 
 
 @inlined
@@ -390,7 +393,7 @@ def _keep_corners(
         step = FIRST_STEP
         is_doubling = True
         shortest_step = 1
-        if end < last and _is_right_angle(path, first, end, end + 1, layers):
+        if end < last and _turns_around_obstacle(path, first, end, end + 1, layers):
             shortest_step = 2
         while step >= shortest_step and end < last:
             candidate = min(end + step, last)
@@ -446,7 +449,7 @@ def _move_corners(
         if was_moved_by != NO_ACTION:  # this action alone is tried once more
             first_action = was_moved_by
             end_action = was_moved_by + 1
-        elif _is_right_angle(path, corner - 1, corner, corner + 1, layers):
+        elif _turns_around_obstacle(path, corner - 1, corner, corner + 1, layers):
             end_action = 0  # no action is tried
         elif _move_to_next(path, costs, corner, layers):
             end_action = 0
