@@ -252,8 +252,9 @@ def _may_not_leave(
         return True
     if layers.cuts_corners or not is_at_corner:
         return False
-    is_beside_occupied = layers.occupancy[row, np.uint64(x + step_x)]
-    return is_beside_occupied or layers.occupancy[np.uint64(y + step_y), column]
+    beside_in_row = layers.occupancy[row, np.uint64(x + step_x)]
+    beside_in_column = layers.occupancy[np.uint64(y + step_y), column]
+    return bool(beside_in_row or beside_in_column)
 
 
 @in_place
