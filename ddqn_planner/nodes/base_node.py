@@ -121,7 +121,7 @@ class BaseNode(Node):
         self._quality_overrides = []
 
     def _on_jump(self, jump: TimeJump) -> None:
-        """Warn that ROS's clock was set back, and forget what depends on its time."""
+        """Warn that ROS's clock jumped or changed, and call `jump_back_callbacks`."""
         seconds = jump.delta.nanoseconds / 1e9
         change = f"jumped by {seconds:.6g} s" if seconds else "changed"
         self.get_logger().warning(
@@ -143,7 +143,7 @@ class BaseNode(Node):
         return msg.SetParametersResult(successful=True)
 
     def check_parameters(self, new: dict[str, Any]) -> None:
-        """Check new values beyond their types and ranges; an error refuses them all."""
+        """Check new values of parameters; an error refuses all of the values."""
         declared = {
             name: value for name, value in new.items() if name in self._declared
         }

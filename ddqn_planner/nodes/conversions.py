@@ -172,7 +172,7 @@ def occupancy_message(
 def path_message(
     points: Float64, yaws: Float64, header: Header, last: Quaternion | None = None
 ) -> Path:
-    """Make a path message of `path_bytes`'s parameters; `points` are its positions."""
+    """Make the message that `path_bytes` serializes; points are positions there."""
     path = Path(header=header)
     # Most of an answer's time is making messages. Poses in the same direction share a
     # quaternion, and all are copies, which take a quarter of the time of the messages'
@@ -278,7 +278,7 @@ def in_outer_frame(poses: Float64, origin: Origin) -> Float64:
 def path_bytes(
     positions: Float64, yaw: Float64, header: Header, last: Quaternion | None = None
 ) -> bytes:
-    """Return a path as it is sent.
+    """Return the serialized message of a path, as middleware sends it.
 
     Parameters
     ----------
@@ -394,7 +394,8 @@ def check_pose(
 def cell_from_pose(name: str, stamped: PoseStamped, grid: GridMap, frame: str) -> Cell:
     """Return the cell (x, y) of a pose, which may be off the map.
 
-    A ValueError says why there is none, as in `check_pose`, whose parameters these are.
+    The parameters are those of `check_pose`, and so are the reasons for a ValueError;
+    a pose that is too far away to have a cell is one, too.
     """
     check_pose(name, stamped, frame)
     position = stamped.pose.position
@@ -407,7 +408,7 @@ def cell_from_pose(name: str, stamped: PoseStamped, grid: GridMap, frame: str) -
 
 
 def pose_of(stamped: PoseStamped) -> Origin:
-    """Return x and y of a pose in metres, and its yaw in radians."""
+    """Return x, y (metres) and yaw (radians) of a pose."""
     position = stamped.pose.position
     return position.x, position.y, rotation(stamped.pose.orientation).yaw
 
@@ -418,7 +419,7 @@ def rotation(message: Quaternion) -> Rotation:
 
 
 def with_unit_quaternion(stamped: PoseStamped) -> PoseStamped:
-    """Return a pose whose quaternion has the norm 1: itself, or a copy.
+    """Return a pose with a quaternion scaled to the norm 1; the same object if it is 1.
 
     `check_pose` accepts rounded quaternions; Nav2 refuses them in a path.
     """
@@ -431,7 +432,7 @@ def with_unit_quaternion(stamped: PoseStamped) -> PoseStamped:
 
 
 def unit_quaternion(message: Quaternion) -> Quaternion:
-    """Return a quaternion with the norm 1: itself if it has that already."""
+    """Return a quaternion scaled to the norm 1; the same object if the norm is 1."""
     rounded = rotation(message)
     if abs(rounded.norm - 1) <= NORM_TOLERANCE:
         return message
@@ -448,9 +449,9 @@ def quaternion(yaw: float) -> Quaternion:
 
 
 def _check_pose(name: str, pose: Pose) -> None:
-    """Raise a ValueError if a number of a pose is not finite, or it is no rotation.
+    """Raise a ValueError if a pose has a number that is not finite, or no rotation.
 
-    The error calls the pose by its name.
+    `name` is the pose's name in errors, such as "the goal".
     """
     position = pose.position
     coordinates = (position.x, position.y, position.z)

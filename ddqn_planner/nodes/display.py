@@ -117,7 +117,7 @@ class FieldDisplay:
                 self._logger.error(f"{reason}; give a smaller map")
 
     def _publish_on(self, topic: Topic, picture: Picture) -> None:
-        """Publish a picture on a topic, unless the topic shows it already.
+        """Publish a picture on a topic, unless the topic shows the picture already.
 
         The topic of the other kind of robot, with or without a body, shows nothing.
         """
@@ -235,9 +235,9 @@ def _point(x: float, y: float) -> Point:
 
 
 def _value_message(picture: Picture, is_empty: bool) -> OccupancyGrid:
-    """Make the message of the field toward a goal, which is computed now if need be.
+    """Make the message of the field toward a goal; compute the field if need be.
 
-    On an empty one, no cell of the map has a value.
+    In an empty message, no cell of the map has a value.
     """
     planner = picture.outcome.planner
     request = picture.outcome.request
@@ -255,7 +255,7 @@ def _value_message(picture: Picture, is_empty: bool) -> OccupancyGrid:
 def _footprint_message(picture: Picture, is_empty: bool) -> MarkerArray:
     """Make the message of a body's outlines along the path of a plan.
 
-    An empty one deletes the last outlines.
+    An empty message deletes the last outlines.
     """
     if is_empty:
         return MarkerArray(markers=[_marker(picture.header, Marker.DELETE)])

@@ -98,7 +98,7 @@ class DrivingRobot:
         self.recorder.add(seconds, *position)
 
     def _look_up(self) -> None:
-        """Record the robot's pose by TF, or refuse it in the diagnostics."""
+        """Record the robot's pose by TF, or report in the diagnostics why not."""
         map_in_frame = self._node.map
         if map_in_frame is None:
             return
@@ -277,7 +277,7 @@ class Driving:
         return was_forgotten or places >= MORE_PLACES * self._places_of_prior
 
     def _show_slowness(self) -> None:
-        """Publish the slowness on the map if it is new and somebody subscribes.
+        """Publish the slowness on the map if it has changed and somebody subscribes.
 
         The message has 0 at the nominal speed, 100 at `SLOWEST`, on a log scale.
         """

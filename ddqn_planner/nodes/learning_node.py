@@ -101,7 +101,10 @@ class LearningNode(BaseNode):
         return as_path(self.value("output_folder"), "output_folder").absolute()
 
     def fail(self, activity: str, error: Exception) -> Answer:
-        """Log an error, and keep it for the diagnostics; return a service's answer."""
+        """Log an error, also for the diagnostics; return a service's failed answer.
+
+        `activity` says in words which activity failed.
+        """
         message = f"{activity}: {explained(error)}"
         if message != self.error:  # the learner may try again each second
             self.get_logger().error(message)

@@ -197,7 +197,7 @@ class ManagedNode(BaseNode):
         super().destroy_node()
 
     def warn_of_unread_qualities(self) -> None:
-        """Do nothing: a node without subscriptions logs them once it is configured."""
+        """Do nothing: `change` warns when the node has subscriptions."""
 
     async def prepare(self, transition: str) -> bool:
         """Do what takes long before a requested transition; return False to refuse."""
@@ -281,9 +281,10 @@ class ManagedNode(BaseNode):
     async def _on_change_state(
         self, request: ChangeState.Request, response: ChangeState.Response
     ) -> ChangeState.Response:
-        """Do the transition with the requested label, or number if it has no label.
+        """Do the transition of the request's label, or of its number without a label.
 
-        Refuse it while another one is done, and if the state does not have it.
+        A transition that the state does not have is refused, and any transition while
+        another one is done.
         """
         labels = {change.number: change.label for change in self._changes()}
         number = request.transition.id

@@ -112,7 +112,7 @@ class MapServerNode(BaseNode):
         return success
 
     def _serve(self, values: NDArray[np.int8]) -> None:
-        """Publish a map in the place of the loaded one, after its directions.
+        """Publish the directions, then values as the map, where the loaded map lies.
 
         `values` is (H, W), as in a map message.
         """
@@ -188,7 +188,7 @@ class MapServerNode(BaseNode):
 
 
 def known_path(grid: GridMap, map_file: MapFile) -> tuple[MoveRule, list[Cell]]:
-    """Return the safest move rule that allows a path, and the shortest path by it.
+    """Return the safest move rule by which a path leads, and the shortest such path.
 
     The path leads over a grid from the start to the goal that the grid's map file
     names. A ValueError says why there is none.

@@ -193,8 +193,8 @@ class MapSource:
     def _no_map(self) -> RequestError:
         """Return the error of a request without a map in use.
 
-        The error names the time since which the node listens, as the first map, or its
-        directions, may still come.
+        The error names the time since which the node listens: the first map, or the
+        directions of a map that waits, may still come.
         """
         refusal = self._diagnostics.refused.get("map")
         if refusal and self._waiting_map is not None:
@@ -205,7 +205,7 @@ class MapSource:
         return RequestError("NO_MAP", reason, self._listening_since)
 
     def _refusal_in_brackets(self) -> str:
-        """Return why the last map was refused; empty if it was not."""
+        """Return the reason why a map was refused, in brackets; empty without one."""
         refusal = self._diagnostics.refused.get("map")
         return f" ({refusal})" if refusal else ""
 
@@ -265,7 +265,7 @@ class MapSource:
         return self.times.apply(self._inflate(grid, radius, weight))
 
     def apply_parameters(self, changed: set[str]) -> None:
-        """Read and prepare the map anew if one of the changed parameters needs it."""
+        """Read and prepare the map anew if one of `PARAMETERS` has changed."""
         if not changed & PARAMETERS:
             return
         for received in (self._waiting_map, self._map_in_use):
@@ -280,7 +280,7 @@ class MapSource:
         self._on_map()
 
     def take(self, message: OccupancyGrid) -> None:
-        """Plan on a map as soon as its directions are there, or refuse the map."""
+        """Let a map wait until it may be used, at best at once; or refuse the map."""
         try:
             grid = self._read(message, self._newest_map)
         except (ValueError, MemoryError) as error:
@@ -349,7 +349,10 @@ class MapSource:
                 self.change()
 
     def _apply_update(self, received: Received, update: MapUpdate) -> None:
-        """Change a received map, also its message; a ValueError refuses the update."""
+        """Change the cells of a received map, also in its message, as an update says.
+
+        A ValueError refuses the update.
+        """
         values = values_of_update(received.message, update)
         received.grid = self._patched(received.grid, values, update.x, update.y)
         # When a parameter changes, the map is read anew from the message.
@@ -360,7 +363,7 @@ class MapSource:
         received.time = self.arrivals.note()
 
     def use_waiting_map(self) -> None:
-        """Plan on the map that waits from now on, unless it has to wait for longer."""
+        """Use the map that waits, unless there is a reason for which it has to wait."""
         received = self._waiting_map
         if received is None:
             return
@@ -377,7 +380,7 @@ class MapSource:
         self.change()
 
     def _reason_to_wait(self, received: Received) -> str:
-        """Apply the directions to a map; return why it has to wait, or nothing."""
+        """Apply the directions to a map; return why the map has to wait, or nothing."""
         if self.directions.required:
             return self.directions.required
         reason = self.directions.wait_for_new_publisher()
@@ -394,7 +397,7 @@ class MapSource:
             self._node.get_logger().info(f"map of {size}")
 
     def _refuse_waiting_map(self, reason: str) -> None:
-        """Report in the diagnostics why a map waits; log the reason if it lasts.
+        """Report in the diagnostics why a map waits; log the reason if the wait lasts.
 
         Live maps wait for the same reason with other numbers each time, such as their
         yaw: the reason is logged once.
@@ -410,7 +413,7 @@ class MapSource:
             self._diagnostics.refuse("map", reason, log=False)
 
     def _on_directions(self) -> None:
-        """Obey new directions, or another demand for them, on the maps received.
+        """Apply the directions to the maps received, as they or parameters changed.
 
         A map in use that must not be used without its directions waits again, unless a
         newer one waits.

@@ -91,7 +91,7 @@ class ModelSource:
         return FirstModel(model)
 
     async def wait_until_loaded(self) -> None:
-        """Wait for the first model, if it is still being loaded, and plan with it.
+        """Wait for the first model if that is still being loaded, and plan with it.
 
         A model that cannot be loaded is refused. If another model was set while this
         function waited, the first one is dropped.
@@ -157,7 +157,7 @@ class ModelSource:
         }
 
     def forget(self) -> None:
-        """Free the model and its fields, also objects that loading it has frozen."""
+        """Free the model and its fields, also objects frozen by `_load_and_compile`."""
         self.planner = None
         self.file = ""
         self.loading = None

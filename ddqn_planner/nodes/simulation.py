@@ -99,7 +99,8 @@ class Simulation:
     def _cell(self, name: str, pose: PoseStamped, map_in_frame: MapInFrame) -> Cell:
         """Return the cell of the start's or the goal's pose.
 
-        A ValueError says that it is no free cell of the map; it calls the pose by name.
+        A ValueError says that no free cell of the map has the pose. `name` is "start"
+        or "goal".
         """
         cell = cell_from_pose(
             f"the {name}", pose, map_in_frame.grid, map_in_frame.frame
@@ -135,7 +136,7 @@ class Simulation:
     def _open_run(self, map_in_frame: MapInFrame | None) -> TrainingRun:
         """Return a training as the node's parameters, map and poses say.
 
-        It continues from the checkpoint in the output folder, if there is one. A
+        A training with a checkpoint in the output folder continues from there. A
         ValueError or another error says why it cannot begin.
         """
         if map_in_frame is None:
@@ -206,8 +207,7 @@ class Simulation:
     def recorded(self, file: Path, map_in_frame: MapInFrame) -> Recording:
         """Return the episodes of a file, whose cells lie on a map.
 
-        If the file is that of the last training, its own map is used in place of the
-        one given.
+        If the last training wrote the file, the map of that training is used.
         """
         if self._run is not None and self._run.folder == file.parent:
             assert self._map_of_run is not None

@@ -137,7 +137,7 @@ class TrainerNode(LearningNode):
         )
 
     def _on_map(self, message: OccupancyGrid) -> None:
-        """Learn on a map from now on, or refuse it in the diagnostics."""
+        """Learn on a map from now on, or report in the diagnostics why not."""
         with self.diagnostics.receiving("map"):
             grid = grid_from_message(message, self._map_rules())
             self.map = MapInFrame(grid, message.header.frame_id)
@@ -170,7 +170,7 @@ class TrainerNode(LearningNode):
         return Answer(answer.success, f"{answer.message}; the replay was stopped")
 
     def _on_replay(self) -> Answer:
-        """Begin to publish the recorded episodes, each one place longer each time."""
+        """Begin to publish the recorded episodes, growing place by place."""
         if self.map is None:
             return Answer(False, NO_MAP)
         file = self.folder / "episodes.csv"

@@ -37,7 +37,7 @@ class Worker:
         return task
 
     async def run(self, function: Callable[..., Any], *arguments: object) -> Any:
-        """Return the result of a call; cancel it if the caller is closed first."""
+        """Return a call's result; cancel the call if the caller is closed first."""
         task = self.call(function, *arguments)
         try:
             return await task
@@ -45,7 +45,7 @@ class Worker:
             task.cancel()
 
     def close(self, patience: float | None = None) -> None:
-        """Accept no more calls, and wait for those that were made.
+        """Accept no more calls, and wait for the calls that were made.
 
         Parameters
         ----------
