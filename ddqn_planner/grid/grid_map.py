@@ -230,14 +230,17 @@ class GridMap:
         """
         patch = arguments.as_mask("occupancy", occupancy)
         box = self._box_of_patch(x, y, patch.shape)
-        patched_obstacles = patch
+        new_obstacles = patch
         if obstacles is not None:
             mask = arguments.as_mask("obstacles", obstacles, patch.shape)
-            patched_obstacles = patch & mask
+            new_obstacles = patch & mask
+        patched_obstacles = None
+        if self.obstacles is not None:
+            patched_obstacles = replaced(self.obstacles, box, new_obstacles)
         patched = self.with_layers(
             occupancy=replaced(self.occupancy, box, patch),
             cost=self._patched_cost(patch, box, cost),
-            obstacles=_replaced_if_any(self.obstacles, box, patched_obstacles),
+            obstacles=patched_obstacles,
             unknown=self._patched_unknown(patch, box, unknown),
         )
         # Where most of the map is new, it is quicker to compare all of it.
@@ -623,13 +626,6 @@ class Exploration(NamedTuple):
     share: float  # by which a path may be expected to take longer than the best one
     bold: GridMap  # by a standard deviation
     safe: GridMap  # by the share at most, so that each plan keeps it
-
-
-def _replaced_if_any(
-    layer: Occupancy | None, box: Box, values: Occupancy
-) -> Occupancy | None:
-    """Return a copy of a layer with other values in a box; None without a layer."""
-    return None if layer is None else replaced(layer, box, values)
 
 
 def _sum_of_words(layer: Occupancy | NDArray[np.int8]) -> int:

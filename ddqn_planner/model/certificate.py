@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Final, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import MAX_COST_MULTIPLIER, MOVES, OCCUPIED, UNKNOWN, MoveRule
 from ddqn_planner.model.move_costs import CENTRE, every_patch, legal_in_patches
+
+if TYPE_CHECKING:
+    from ddqn_planner.model.networks import PropagationQNetwork
 
 Float32: TypeAlias = NDArray[np.float32]
 Float64: TypeAlias = NDArray[np.float64]
@@ -35,24 +38,6 @@ NO_CERTIFICATE = (
 MAX_FILTERS = 256  # for more, the proof would take seconds, and it is not tried
 # The relative error of a float32 operation, and as much for errors in float64.
 ROUNDING = 2.0**-23
-
-
-class PatchNetwork(Protocol):
-    """A network whose moves follow from 3x3 patches, see `PropagationQNetwork`."""
-
-    uses_costs: ClassVar[bool]
-    sizes: dict[str, int]
-    tensors: dict[str, Float32]
-
-    @classmethod
-    def features(cls, patch_B9: NDArray[np.int8], move_rule: MoveRule) -> Float32:
-        """Return the inputs for patches: (B, I)."""
-
-    def success(self, feature_BI: Float32) -> Float32:
-        """Return p(s, a): (B, A)."""
-
-    def tries(self, feature_BI: Float32) -> Float32:
-        """Return how often a move is tried: (B, A)."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +96,7 @@ def _percent(error: float) -> str:
 
 
 def certify(
-    network: PatchNetwork, move_rules: Sequence[MoveRule] = MOVE_RULES
+    network: PropagationQNetwork, move_rules: Sequence[MoveRule] = MOVE_RULES
 ) -> Certificate:
     """Prove which moves a network takes for possible; bound its costs' errors.
 
@@ -163,7 +148,7 @@ class Margins(NamedTuple):
 
 
 def _count_wrong(
-    network: PatchNetwork,
+    network: PropagationQNetwork,
     feature_PI: Float32,
     legal_PA: NDArray[np.bool_],
     margins: Margins,
@@ -176,7 +161,7 @@ def _count_wrong(
 
     Parameters
     ----------
-    network : PatchNetwork
+    network : PropagationQNetwork
     feature_PI : (P, I) float32
         The inputs of each pattern.
     legal_PA : (P, A) bool
@@ -205,7 +190,7 @@ def _count_wrong(
 
 
 def logit_margins(
-    network: PatchNetwork, feature_PI: Float32, legal_PA: NDArray[np.bool_]
+    network: PropagationQNetwork, feature_PI: Float32, legal_PA: NDArray[np.bool_]
 ) -> Margins:
     """Bound how far each logit is on its right side of 0.
 
@@ -214,7 +199,7 @@ def logit_margins(
 
     Parameters
     ----------
-    network : PatchNetwork
+    network : PropagationQNetwork
     feature_PI : (P, I) float32
         The inputs of each pattern; those for costs and unknown cells are 0.
     legal_PA : (P, A) bool
@@ -326,7 +311,7 @@ def _extremes(weight_CPU: Float64, feature_PI: Float32) -> tuple[Float64, Float6
 
 
 def _multiplier_error(
-    network: PatchNetwork, feature_PI: Float32, legal_PA: NDArray[np.bool_]
+    network: PropagationQNetwork, feature_PI: Float32, legal_PA: NDArray[np.bool_]
 ) -> float:
     """Bound the relative error of legal moves' cost multipliers, for all costs.
 
@@ -335,7 +320,7 @@ def _multiplier_error(
 
     Parameters
     ----------
-    network : PatchNetwork
+    network : PropagationQNetwork
     feature_PI : (P, I) float32
         The inputs of each pattern; those for costs and unknown cells are 0.
     legal_PA : (P, A) bool
@@ -430,13 +415,13 @@ def _terms_of_values(cost_weight: float, unknown_weight: float) -> Float64:
 
 
 def _rounding_error(
-    network: PatchNetwork, greatest_of_input: Sequence[tuple[str, Float32]]
+    network: PropagationQNetwork, greatest_of_input: Sequence[tuple[str, Float32]]
 ) -> Float32:
     """Bound the rounding errors of the U outputs of the last of some layers: (U,).
 
     Parameters
     ----------
-    network : PatchNetwork
+    network : PropagationQNetwork
     greatest_of_input : sequence of (str, (I,))
         The layers in their order, and the greatest value of each input of the layer.
     """

@@ -128,6 +128,11 @@ class PaperQNetwork(QNetwork):
 
     @classmethod
     def _layers(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
+        """Return the shape of each layer's weights: first the outputs, then the inputs.
+
+        The convolution has a step of 2 cells, so it has a window for every second cell
+        of every second row.
+        """
         filters = sizes["filters"]
         units = sizes["hidden_units"]
         windows = ((sizes["height"] + 1) // 2) * ((sizes["width"] + 1) // 2)
@@ -254,6 +259,7 @@ class PropagationQNetwork(QNetwork):
 
     @classmethod
     def _layers(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
+        """Return the shape (outputs, inputs) of each layer's weights."""
         filters = sizes["filters"]
         layers: dict[str, tuple[int, ...]] = {
             "convolution": (filters, cls.inputs),
