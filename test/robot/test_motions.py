@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
-from hypothesis import example, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from ddqn_planner.robot.footprint import inside, read_footprint, swept_cells
@@ -177,8 +177,10 @@ def test_padding_makes_a_body_larger_on_each_side(form: str, padding: float) -> 
         form, form
     )
     body = shapely.Polygon(read_footprint(footprint))
-    closes = form in ("U", "forklift") and padding >= (0.2 if form == "U" else 0.1)
-    if closes:
+    half_gap = {"U": 0.2, "forklift": 0.1}.get(form, np.inf)
+    # With just half of the gap, the sides touch, which rounding decides.
+    assume(abs(padding / half_gap - 1) > 1e-5)
+    if padding > half_gap:
         with pytest.raises(
             ValueError, match=r"padding of .* closes a gap .*; give less"
         ):
