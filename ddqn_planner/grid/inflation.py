@@ -75,7 +75,7 @@ def inflate(
     if robot_radius == 0 and clearance_weight == 0:
         return grid
     metres = clearance(grid.occupancy) * grid.resolution
-    occupancy = grid.occupancy | (metres < robot_radius * (1 - ROUNDING))
+    occupancy = grid.occupancy | _is_touched(metres, robot_radius)
     cost = grid.cost
     if clearance_weight > 0:
         cost = _clearance_costs(metres - robot_radius, clearance_weight)
@@ -87,6 +87,12 @@ def inflate(
         obstacles=grid.occupancy,
         body_radius=robot_radius,
     )
+
+
+def _is_touched(metres: NDArray[np.float64], robot_radius: float) -> Occupancy:
+    """Return which distances to an obstacle are below a radius, despite rounding."""
+    is_touched: Occupancy = metres < robot_radius * (1 - ROUNDING)
+    return is_touched
 
 
 def _clearance_costs(
@@ -120,7 +126,7 @@ def with_unknown_free(grid: GridMap) -> GridMap:
         # Cells that were only too near to unknown cells are free, too.
         if grid.body_radius > 0:
             metres = clearance(obstacles) * grid.resolution
-            occupancy = obstacles | (metres < grid.body_radius * (1 - ROUNDING))
+            occupancy = obstacles | _is_touched(metres, grid.body_radius)
     return grid.with_layers(
         occupancy=occupancy,
         cost=None if grid.cost is None else grid.cost * ~occupancy,

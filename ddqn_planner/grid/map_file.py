@@ -85,6 +85,7 @@ class MapFile:
     files: tuple[Path, ...] = ()  # from which it was read
 
     def __post_init__(self) -> None:
+        """Check all values, and replace the arrays by read-only copies."""
         values = numbers(
             "the array of values", self.values, between=(UNKNOWN, OCCUPIED)
         )

@@ -83,6 +83,8 @@ class MoveCosts(NamedTuple):
         The table gets one more row, for a patch that no move leaves.
         """
         highest = float(table_PA.max(where=np.isfinite(table_PA), initial=1))
+        # Even actions are straight, odd actions diagonal. Two straight moves replace a
+        # diagonal one.
         straight = float(table_PA[:, 0::2].min(initial=highest))
         diagonal = float(table_PA[:, 1::2].min(initial=2 * straight))
         table = np.append(table_PA, np.full(ACTIONS, np.inf, np.float32))
@@ -396,6 +398,9 @@ def _read_cells(
 ) -> Any:
     """Write patch numbers and cost codes of a map's cells; return the least cost.
 
+    A patch number has bit 3 y + x where cell (x, y) of the 3x3 patch around the cell is
+    occupied. A cost code is the cost plus 1, 0 where unknown and 101 where occupied.
+
     Parameters
     ----------
     occupied : (H + 2, W + 2) uint8
@@ -403,7 +408,7 @@ def _read_cells(
     cost : (H, W) uint8
         The costs without a border: 0 to 99, 0 where occupied, 255 where unknown.
     patch_number, cost_code : (H + 2, W + 2) uint16 and uint8
-        The arrays to write, see `CellsRead`. Their borders are not written.
+        The arrays to write. Their borders are not written.
     has_costs : bool
         Without costs, `cost` and `cost_code` are not used, and 100 is returned.
     """
