@@ -59,7 +59,10 @@ PYTEST := $(BIN)/python -m pytest --numprocesses $(PROCESSES) --dist loadfile --
 
 # Compiled before, by two processes at once: each process of the tests would compile it all.
 $(VENV)/compiled: $(VENV)/full $(wildcard ddqn_planner/*.py ddqn_planner/*/*.py)
-	$(BIN)/ddqn-planner warm-up & first=$$!; $(BIN)/ddqn-planner warm-up differential_robot && wait $$first
+	rm -rf $(VENV)/trained
+	{ $(BIN)/ddqn-planner warm-up && \
+		$(BIN)/ddqn-planner train dilemma --steps 300 --filters 4 --out $(VENV)/trained; } & first=$$!; \
+		$(BIN)/ddqn-planner warm-up differential_robot && wait $$first
 	touch $@
 
 test: $(VENV)/compiled
