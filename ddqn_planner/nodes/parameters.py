@@ -6,7 +6,7 @@ from typing import Final
 from ddqn_planner.grid import MoveRule
 from ddqn_planner.nodes.declared import Declared, declared_by, parameter
 from ddqn_planner.planning import PlanMethod
-from ddqn_planner.planning.field import CACHE_BYTES
+from ddqn_planner.planning.field_cache import CACHE_BYTES
 
 MOVE_RULES: Final = [rule.value for rule in MoveRule]
 METHODS: Final = [method.value for method in PlanMethod]

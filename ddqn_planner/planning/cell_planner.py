@@ -9,10 +9,13 @@ import numpy as np
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import Cells
+from ddqn_planner.grid.grid_map import Exploration
+from ddqn_planner.grid.map_changes import changed_cells
 from ddqn_planner.model import QNetwork
 from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning import unknown_space
-from ddqn_planner.planning.field import DistanceField, FieldCache, Goals, QField
+from ddqn_planner.planning.field import DistanceField, Goals, QField, network_field
+from ddqn_planner.planning.field_cache import CACHE_BYTES, FieldCache
 from ddqn_planner.planning.path_finder import Clock, Finding, PathFinder, last_step
 from ddqn_planner.planning.paths import (
     keep_or_switch,
@@ -45,13 +48,61 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
     Parameters
     ----------
     network : QNetwork
-    fields : FieldCache
-        The fields of that network.
     """
 
-    def __init__(self, network: QNetwork, fields: FieldCache) -> None:
+    def __init__(self, network: QNetwork) -> None:
         self.network = network
-        self.fields = fields
+        self.fields = FieldCache[QField](CACHE_BYTES, changed_cells)
+
+    def field(
+        self,
+        grid: GridMap,
+        goals: Goals,
+        rule: MoveRule,
+        start: Cell | None = None,
+        costs: MoveCosts | None = None,
+    ) -> QField:
+        """Return the field of a map toward the nearest of some goals.
+
+        It is kept, repaired or new, see `FieldCache.get`.
+
+        Parameters
+        ----------
+        grid : GridMap
+        goals : tuple of (x, y)
+            Free cells; only one if the network gives no costs of moves.
+        rule : MoveRule
+        start : (x, y), optional
+            From where the field is needed; None for all of it.
+        costs : MoveCosts, optional
+            What `move_costs` returned for the map, if that was asked before.
+        """
+
+        def new_field() -> QField:
+            costs_of_moves = costs or self.move_costs(grid, rule)
+            if costs_of_moves is None:
+                return network_field(self.network, grid, goals[0], rule)
+            return DistanceField(goals, grid, costs_of_moves, rule)
+
+        return self.fields.get((goals, rule), grid, new_field, start)
+
+    def move_costs(self, grid: GridMap, rule: MoveRule) -> MoveCosts | None:
+        """Return the costs of a map's moves; None if the network gives none.
+
+        They are those of a kept field on the same map, or on the map of which this one
+        is a patched copy; else the network reads all of the map.
+        """
+        for field in reversed(self.fields.kept):
+            if not isinstance(field, DistanceField) or field.move_rule is not rule:
+                continue
+            if grid.same_cells(field.grid):
+                return field.costs
+            boxes = grid.patches_since(field.grid)
+            if boxes is not None:
+                costs = field.costs.after(grid, boxes)
+                if costs is not None:
+                    return costs
+        return self.network.move_costs(grid, rule)
 
     def rest_of_path(self, request: PlanRequest) -> Path:
         """Return the rest of the path under way, (N, 2)."""
@@ -64,23 +115,15 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
         yield from ()
         return unknown_space.reason_of(request, plan)
 
-    def _find(self, request: PlanRequest, clock: Clock) -> Finding[Plan]:
-        """Return the plan, whose reason is its status in words."""
-        if request.grid.exploration is None:
-            plan = yield from self._find_on_map(request, clock)
-        else:
-            plan = yield from self._explore(request, clock)
-        return plan
-
-    def _explore(self, request: PlanRequest, clock: Clock) -> Finding[Plan]:
+    def _explore(
+        self, request: PlanRequest, exploration: Exploration, clock: Clock
+    ) -> Finding[Plan]:
         """Plan on the optimistic map; fall back if the path costs more than the share.
 
         The share is that by which it may cost more than the best path that is expected.
         """
         grid = request.grid
         rule = request.move_rule
-        exploration = grid.exploration
-        assert exploration is not None
         bold_request = replace(request, grid=exploration.bold)
         plan = yield from self._find_on_map(bold_request, clock)
         if not plan.path.size:
@@ -137,7 +180,7 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
         request = task.request
         if not request.grid.is_free(request.start):
             return None
-        field = self.fields.find(request.grid, task.goals, request.move_rule)
+        field = self.fields.find((task.goals, request.move_rule), request.grid)
         if field is None or not field.is_known(request.start):
             return None
         return _roll_out(task, field)
@@ -149,14 +192,14 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
         yield
         request = task.request
         grid = request.grid
-        task.costs = self.fields.costs(grid, request.move_rule)
+        task.costs = self.move_costs(grid, request.move_rule)
         if task.costs is None:  # a network that gives no costs of moves
             if len(task.goals) > 1:
                 task.goals = self._nearest_alone(request, task.goals)
             return None
         if not task.goals or not grid.is_free(request.start):
             return None
-        field = self.fields.get(
+        field = self.field(
             grid, task.goals, request.move_rule, request.start, task.costs
         )
         if isinstance(field, DistanceField):
@@ -176,7 +219,7 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
         if isinstance(escape, PlanStatus):
             return Plan(escape, move_rule=request.move_rule)
         task.escape_path, task.goals = escape
-        task.field = self.fields.get(
+        task.field = self.field(
             request.grid,
             task.goals,
             request.move_rule,

@@ -1,9 +1,8 @@
-"""The Q field: Q(s, a) of every cell toward one goal, its repair, rollouts, and those kept."""
+"""The Q field: Q(s, a) of every cell toward one goal, its growth, repair and rollouts."""
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any, TypeAlias
 
@@ -12,11 +11,11 @@ from numpy.typing import NDArray
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import cell_inside, numbers
-from ddqn_planner.grid.map_changes import changed_cells
 from ddqn_planner.model import PropagationQNetwork, QNetwork
 from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning import cell_space, wavefront
 from ddqn_planner.planning.cell_space import Known, step_costs
+from ddqn_planner.planning.field_cache import Field, memory_of
 from ddqn_planner.planning.plan import Plan, PlanStatus
 
 # Different free cells, sorted: a path may end in any of them.
@@ -26,15 +25,9 @@ REPAIRED = 100  # cells that a repair may take back before a new field is begun
 # take a cell back takes longer, and it is visited again. See docs/benchmarks.md.
 VISITS = 8
 REPAIRED_SHARE = 0.02  # of the map's cells that a repair may take back
-# For a planner's Q fields: 3 of 500 x 500 cells, at 9 bytes per cell.
-CACHE_BYTES = 2**23
-# Fields, whatever their size: to and fro, or the three of `Exploration`.
-ALWAYS_KEPT = 3
-MOST_KEPT = 64  # fields, however small: a request's map is compared with that of each
-OBJECTS = 4_000  # bytes of a field, its costs and its map beside their arrays
 
 
-class QField:
+class QField(Field[Known]):
     """Q(s, a) of every cell of one map toward one goal.
 
     Parameters
@@ -49,12 +42,6 @@ class QField:
     move_rule : MoveRule
         The rule by which they are legal.
     """
-
-    grid: GridMap  # the last one with such cells, of a field that a planner keeps
-    costs: MoveCosts | None = None
-    # The number and the bytes of arrays of its map and its costs, which others may
-    # keep, too.
-    shared: Sequence[tuple[int, int]] = ()
 
     def __init__(
         self,
@@ -88,6 +75,10 @@ class QField:
         best = np.where(legal_q.max(axis=0) > -np.inf, legal_q.argmax(axis=0), -1)
         return best.astype(np.int8)
 
+    def is_on(self, grid: GridMap) -> bool:
+        """Return whether a map has the same cells as the field's, wherever it lies."""
+        return grid.same_cells(self.grid)
+
     @property
     def nbytes(self) -> int:
         """Memory of its arrays, with those that were asked for, bytes."""
@@ -95,7 +86,7 @@ class QField:
         arrays = [
             state[name] for name in ("q", "legal", "value", "policy") if name in state
         ]
-        return sum(_owner(array).nbytes for array in arrays)
+        return sum(memory_of(array).nbytes for array in arrays)
 
     def unmasked(self) -> QField:
         """Return the field without action masking: a rollout is trapped by an illegal move."""
@@ -137,35 +128,16 @@ class DistanceField(QField):
     def __init__(
         self, goals: Goals, grid: GridMap, costs: MoveCosts, move_rule: MoveRule
     ) -> None:
+        super(QField, self).__init__()
         self.grid = grid
         self.costs = costs
         self.move_rule = move_rule
         self.goal = goals[0]
         self.goals = goals
-        self._lock = threading.RLock()
-        # None before the first growth, and while a thread changes it: if it is
-        # interrupted, the field begins anew.
-        self._known: Known | None = None
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy has: it grows anew, under a lock of its own."""
-        state = vars(self).copy()  # other threads add to it
-        for name in ("_known", "_lock"):
-            del state[name]
-        return state
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Begin as a copy."""
-        vars(self).update(state)
-        self._lock = threading.RLock()
-        self._known = None
-
-    @property
-    def known(self) -> Known:
-        """What is known, at first the goals alone."""
-        if self._known is None:
-            self._known = self._goals_alone()
-        return self._known
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how a copy is made: it grows anew."""
+        return DistanceField, (self.goals, self.grid, self.costs, self.move_rule)
 
     def _goals_alone(self) -> Known:
         """Return what is known before any growth."""
@@ -180,12 +152,6 @@ class DistanceField(QField):
     def _number(self, cell: Any) -> Any:
         """Return the number of a cell on the padded map; of many, if x and y are arrays."""
         return (cell[1] + 1) * self.costs.width + cell[0] + 1
-
-    def _take_known(self) -> Known:
-        """Take what is known away, to change it, and return it."""
-        known = self.known
-        self._known = None
-        return known
 
     def grow(self, start: Cell | None = None, limit: int = 2**62) -> bool:
         """Compute all of the field, or what a start needs; return if so many visits were enough."""
@@ -226,32 +192,37 @@ class DistanceField(QField):
             )
         return Plan(PlanStatus.SUCCEEDED, path[:length], move_rule=self.move_rule)
 
-    def take_over(self, old: DistanceField, start: Cell | None = None) -> bool:
-        """Repair what an older field knows and take it, or begin where that is quicker.
+    def take_over(
+        self,
+        older: DistanceField,
+        changed: NDArray[np.int64] | None,
+        start: Cell | None = None,
+    ) -> bool:
+        """Repair what an older field knows and take it, see `Field.take_over`.
 
-        Return False, and change nothing, if that field is of another map.
+        A field on a map that cannot be compared stays in the cache: requests may take
+        turns between maps.
         """
-        cells = changed_cells(old.grid, self.grid)
-        if cells is None:
+        if changed is None:
             return False
-        changed = self._numbers_around(cells)
+        to_judge = self._numbers_around(changed)
         # For one start, repair and new field take turns, each time with four times the
         # limit: the quicker one wins. The older field then begins anew; or it stays as
         # it is.
         most_repaired = max(REPAIRED, int(REPAIRED_SHARE * self.grid.occupancy.size))
         limit = most_repaired if start is None else REPAIRED
-        with old._lock:
+        with older._lock:
             # A repair may look at any cell, also where the older field read no rows.
             self.costs.read_rows(0, self.grid.height)
-            known = old._take_known()
-            repaired = cell_space.take_back(known, self.costs, changed, limit)
+            known = older._take_known()
+            repaired = cell_space.take_back(known, self.costs, to_judge, limit)
             while repaired is None:
                 limit *= 4
                 is_repair_slower = start is None or limit > most_repaired
                 if is_repair_slower or self.grow(start, VISITS * limit):
-                    old._known = known
+                    older._known = known
                     return True
-                repaired = cell_space.take_back(known, self.costs, changed, limit)
+                repaired = cell_space.take_back(known, self.costs, to_judge, limit)
             self._known = repaired
         return True
 
@@ -331,133 +302,3 @@ def network_field(
     else:
         q = network.q_values(grid, goal, move_rule)
     return QField(goal, q, grid.legal_moves(move_rule), move_rule)
-
-
-# The fields that a planner keeps
-
-
-class FieldCache:
-    """Gives the Q fields of a network, computed, repaired or kept. Several threads may use it."""
-
-    def __init__(self, network: QNetwork) -> None:
-        self.network = network
-        self.nbytes = CACHE_BYTES  # the bound; the fields used last are kept
-        # Used last at the end. The list is replaced and never changed, so that a thread
-        # may read it without the lock.
-        self._kept: list[QField] = []
-        self._lock = threading.Lock()
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy has, also in another process: no fields."""
-        return {"network": self.network, "nbytes": self.nbytes}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Begin without fields."""
-        vars(self).update(state)
-        self._kept = []
-        self._lock = threading.Lock()
-
-    def _of_rule(self, rule: MoveRule) -> list[DistanceField]:
-        """Return the fields of distances that are kept for a move rule, used last first."""
-        fields = [
-            field for field in self._kept[::-1] if isinstance(field, DistanceField)
-        ]
-        return [field for field in fields if field.move_rule is rule]
-
-    def find(self, grid: GridMap, goals: Goals, rule: MoveRule) -> QField | None:
-        """Return the kept field of a map toward the nearest of some goals, or None.
-
-        The field is then the one used last, and lies where this map does.
-        """
-        for field in self._kept:
-            if (
-                field.goals == goals
-                and field.move_rule is rule
-                and grid.same_cells(field.grid)
-            ):
-                # A map with the same cells may have another origin and other arrays.
-                field.grid = grid
-                field.shared = _shared_arrays(field)
-                with self._lock:
-                    others = [other for other in self._kept if other is not field]
-                    self._kept = [*others, field]
-                return field
-        return None
-
-    def costs(self, grid: GridMap, rule: MoveRule) -> MoveCosts | None:
-        """Return the costs of a map's moves, if a network gives them: see `DistanceField`."""
-        for field in self._of_rule(rule):
-            if grid.same_cells(field.grid):
-                return field.costs
-            boxes = grid.patches_since(field.grid)
-            if (
-                boxes is not None
-                and (costs := field.costs.on_changed_map(grid, boxes)) is not None
-            ):
-                return costs
-        return self.network.move_costs(grid, rule)
-
-    def get(
-        self,
-        grid: GridMap,
-        goals: Goals,
-        rule: MoveRule,
-        start: Cell | None = None,
-        costs: MoveCosts | None = None,
-    ) -> QField:
-        """Return the field of a map toward the nearest of some goals: several, if it has costs."""
-        known = self.find(grid, goals, rule)
-        if known is not None:
-            return known
-        costs, replaced = costs or self.costs(grid, rule), None
-        if costs is None:
-            field = network_field(self.network, grid, goals[0], rule)
-            field.grid = grid
-        else:
-            field = DistanceField(goals, grid, costs, rule)
-            older = [old for old in self._of_rule(rule) if old.goals == goals]
-            # The place will hardly be again what it was. If the last ones are of other
-            # maps, so are those before them: with new expected times all are.
-            for old in older[:ALWAYS_KEPT]:
-                if field.take_over(old, start):
-                    replaced = old
-                    break
-        field.shared = _shared_arrays(field)
-        with self._lock:
-            others = [other for other in self._kept if other is not replaced]
-            kept = [*others, field]
-            self._kept = kept[-self._most(kept) :]
-        return field
-
-    def _most(self, kept: list[QField]) -> int:
-        """Return how many of some fields may be kept, those at the end."""
-        held, counted = 0, set[int]()
-        for number, field in enumerate(reversed(kept)):
-            held += OBJECTS + field.nbytes
-            for array, size in field.shared:
-                if array not in counted:
-                    counted.add(array)
-                    held += size
-            if number >= ALWAYS_KEPT and (held > self.nbytes or number >= MOST_KEPT):
-                return number
-        return len(kept)
-
-
-def _shared_arrays(field: QField) -> list[tuple[int, int]]:
-    """Return what `QField.shared` holds."""
-    maps = [field.grid]
-    exploration = field.grid.exploration
-    if exploration is not None:
-        maps += [exploration.bold, exploration.safe]
-    values: list[Any] = [*(field.costs or ())]
-    for grid in maps:
-        values += vars(grid).copy().values()  # other threads add to it
-    arrays = [_owner(value) for value in values if isinstance(value, np.ndarray)]
-    return [(id(array), array.nbytes) for array in arrays]
-
-
-def _owner(array: NDArray[Any]) -> NDArray[Any]:
-    """Return the array whose memory another one, a view, is of."""
-    while isinstance(array.base, np.ndarray):
-        array = array.base
-    return array

@@ -10,6 +10,7 @@ from typing import Any, Generic, TypeVar
 
 from numpy.typing import NDArray
 
+from ddqn_planner.grid.grid_map import Exploration
 from ddqn_planner.planning import unknown_space
 from ddqn_planner.planning.plan import PathRequest, Plan
 
@@ -82,9 +83,22 @@ class PathFinder(ABC, Generic[Request, AnyPlan]):
             plan = replace(plan, reason=reason)
         return plan
 
-    @abstractmethod
     def _find(self, request: Request, clock: Clock) -> Finding[AnyPlan]:
         """Return the plan, whose reason is its status in words."""
+        exploration = request.grid.exploration
+        if exploration is None:
+            return (yield from self._find_on_map(request, clock))
+        return (yield from self._explore(request, exploration, clock))
+
+    @abstractmethod
+    def _find_on_map(self, request: Request, clock: Clock) -> Finding[AnyPlan]:
+        """Return the plan on a map without an exploration."""
+
+    @abstractmethod
+    def _explore(
+        self, request: Request, exploration: Exploration, clock: Clock
+    ) -> Finding[AnyPlan]:
+        """Return the plan on a map of expected times that comes with more daring maps."""
 
     @abstractmethod
     def _reason(self, request: Request, plan: AnyPlan) -> Generator[None, None, str]:

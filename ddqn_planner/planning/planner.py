@@ -16,7 +16,7 @@ from ddqn_planner.grid.arguments import as_cell, as_flag, as_number, as_pose, li
 from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.model import ModelMetadata, QNetwork, load_model, save_model
 from ddqn_planner.planning.cell_planner import CellPlanner
-from ddqn_planner.planning.field import FieldCache, QField
+from ddqn_planner.planning.field import QField
 from ddqn_planner.planning.path_finder import PathFinder, last_step
 from ddqn_planner.planning.plan import (
     Plan,
@@ -51,8 +51,8 @@ class Planner:
             raise ValueError(f"{values}; give what load_model returns")
         self.network = network
         self.metadata = metadata
-        self.fields = FieldCache(network)
-        self.cell_planner = CellPlanner(network, self.fields)
+        self.cell_planner = CellPlanner(network)
+        self.fields = self.cell_planner.fields
         self.pose_planner = (
             PosePlanner(network) if hasattr(network, "motions") else None
         )
@@ -92,7 +92,7 @@ class Planner:
         if not self.network.supports((grid.height, grid.width)):
             problem = f"the model was not trained for maps of {grid.width} x {grid.height} cells"
             raise ValueError(f"{problem}; train one on such a map")
-        return self.fields.get(grid, (goal,), rule)
+        return self.cell_planner.field(grid, (goal,), rule)
 
     def _rule(self, move_rule: MoveRule | str | None) -> MoveRule:
         return self.metadata.move_rule if move_rule is None else MoveRule(move_rule)

@@ -11,7 +11,8 @@ from numpy.typing import DTypeLike, NDArray
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.planning import pose_space, wavefront
-from ddqn_planner.planning.pose_paths import SAME, PosePath
+from ddqn_planner.planning.field_cache import Field
+from ddqn_planner.planning.pose_paths import SAME, PosePath, cells_of
 from ddqn_planner.planning.pose_space import Aim, Search
 from ddqn_planner.planning.pose_world import (
     SHIFT,
@@ -22,6 +23,7 @@ from ddqn_planner.planning.pose_world import (
 )
 from ddqn_planner.planning.queues import make_heap
 from ddqn_planner.planning.wavefront import DONE, Progress, Target
+from ddqn_planner.robot.motions import turn_between
 
 NO_RESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)  # not in all versions of Python
 HEAP = 2**18  # entries that a heap has room for, at least
@@ -30,6 +32,7 @@ LOST = 1 / 2
 UNGUIDED = 2**14  # states that are visited before a look at the map pays
 FINEST = 1  # the shift of the smallest tiles that it looks at
 NOWHERE = Aim(0, 0, -1, 1.0, np.empty((0, 0), np.float32), SHIFT + 1)
+ALL_STATES = 2**62  # no map has so many
 # A bound that each path keeps: a greater one would make the weight infinite.
 ANY_PATH = 1e6
 GREEDY = 1.5  # the first round's weight is the bound to the power of this: mostly that will do
@@ -45,8 +48,17 @@ def _untouched(count: int, dtype: DTypeLike) -> NDArray[Any]:
     return np.frombuffer(memory, dtype)
 
 
-class PoseField:
-    """The least costs that are known from poses to the nearest of some goals."""
+class PoseField(Field[Search]):
+    """The least costs that are known from poses to the nearest of some goals.
+
+    Parameters
+    ----------
+    goals : (N, 3) int64
+        States (x, y, heading) in which a path may end.
+    grid : GridMap
+    world : World
+        The body on this map.
+    """
 
     # Grown from the goals toward a start: first by weighted A* that closes a state
     # once, as the rounds of ARA* do (Likhachev et al. 2003), then, if the bound is not
@@ -55,64 +67,100 @@ class PoseField:
     # these, plus what is left from there at least, is a lower bound, which proves how
     # good the start's cost is.
 
-    def __init__(
-        self, goals: NDArray[np.int64], grid: GridMap, world: World, aim: Aim = NOWHERE
-    ) -> None:
-        self.goals = goals  # (N, 3): x, y, heading
+    def __init__(self, goals: NDArray[np.int64], grid: GridMap, world: World) -> None:
+        super().__init__()
+        self.goals = goals
         self.grid = grid
         self.world = world
-        self.path: PosePath | None = None  # the last path that followed it
-        self.visits = 0  # for the start of the aim
-        self._aim = aim._replace(number=-1)
-        self._heap = make_heap(0)
-        self._least = math.inf  # a lower bound of the cost from the start
+        self.path: PosePath | None = None
+        """The last path that was made from the field."""
+        self.visits = 0
+        """States that were visited for the start that is aimed at."""
+        self._least_cost = math.inf
+        """A lower bound of the cost from that start."""
+
+    def _goals_alone(self) -> Search:
+        """Return what is known before any growth."""
+        world = self.world
         tiles = world.tile.size
         states = tiles << pose_space.TILE_BITS
-        self._distance = _untouched(states, np.float32)
-        self._mark = _untouched(states, np.uint8)
-        self._touched = np.zeros(tiles, np.bool_)
-        x, y, heading = goals.T
+        search = Search(
+            distance=_untouched(states, np.float32),
+            mark=_untouched(states, np.uint8),
+            touched=np.zeros(tiles, np.bool_),
+            heap=make_heap(0),
+            aim=NOWHERE,
+            world=world,
+        )
+        x, y, heading = self.goals.T
         numbers = pose_space.number_of(x, y, heading, world)
-        self._mark[numbers] = wavefront.OPEN
-        self._touched[numbers >> pose_space.TILE_BITS] = True
+        search.mark[numbers] = wavefront.OPEN
+        search.touched[numbers >> pose_space.TILE_BITS] = True
+        return search
+
+    @property
+    def nbytes(self) -> int:
+        """Memory, bytes, if all states of the map are reached: most never are."""
+        return 5 * self.world.tile.size << pose_space.TILE_BITS
 
     def reach(self, start: State, bound: float, limit: int) -> float | None:
         """Grow until the cost from a start is known within a bound, or known not to exist.
 
-        Return the bound that is proved, infinite without a path; or None if more states
-        than the limit must be visited.
+        Parameters
+        ----------
+        start : State
+        bound : float
+            How many times the least cost the cost may be at most, 1 or more.
+        limit : int
+            How many states may be visited now.
+
+        Returns
+        -------
+        float, optional
+            The bound that is proved, infinite if there is no path; None if more states
+            must be visited.
         """
         finite_bound = min(bound, ANY_PATH)
-        self._aim_at(start, finite_bound)
-        visits_left = limit
-        while not self._is_enough(finite_bound):
-            if visits_left <= 0:
-                return None
-            if self._should_look_at_map():
-                if self._proved() == math.inf and not self._can_leave():
-                    return math.inf
-                self._look_at_map(self._aim.shift - 1)
-                self._order(self._aim.weight)
-            else:
-                most_visits = min(visits_left, UNGUIDED)
-                visits_left -= self._grow(finite_bound, most_visits)
-        return self._proved()
+        with self._lock:
+            self._aim_at(start, finite_bound)
+            visits_left = limit
+            while not self._is_enough(finite_bound):
+                if visits_left <= 0:
+                    return None
+                if self._should_look_at_map():
+                    if self._proved_bound() == math.inf and not self._can_leave():
+                        return math.inf
+                    aim = self.known.aim
+                    self._begin_round(self._with_look_at_map(aim, aim.shift - 1))
+                else:
+                    most_visits = min(visits_left, UNGUIDED)
+                    visits_left -= self._visit(finite_bound, most_visits)
+            return self._proved_bound()
 
     def _aim_at(self, start: State, bound: float) -> None:
         """Begin the first round toward a start, unless it is the start of before."""
+        aim = self.known.aim
         number = int(pose_space.number_of(*start, self.world))
-        if number == self._aim.number:
+        if number == aim.number:
             return
-        # What was seen of the map holds for all headings of a cell.
-        aim = self._aim if start[:2] == self._aim[:2] else NOWHERE
         x, y, _ = start
-        self._aim = aim._replace(x=x, y=y, number=number)
+        # What was seen of the map holds for all headings of a cell.
+        if (x, y) != (aim.x, aim.y):
+            aim = NOWHERE
         self.visits = 0
-        self._order(bound**GREEDY)
+        self._begin_round(aim._replace(x=x, y=y, number=number, weight=bound**GREEDY))
+
+    def _begin_round(self, aim: Aim) -> None:
+        """Queue all states that are open or wait, in the order toward an aim."""
+        tiles = np.flatnonzero(self.known.touched)
+        heap = make_heap((len(tiles) << pose_space.TILE_BITS) + HEAP)
+        search = self.known._replace(aim=aim, heap=heap)
+        self._known = search
+        self._least_cost = pose_space.order(search, tiles)
 
     def _is_enough(self, bound: float) -> bool:
         """Return whether a bound is proved, or no path from the start is left to find."""
-        return self._proved() <= bound * SAME or self._least == math.inf
+        return self._proved_bound() <= bound * SAME or self._least_cost == math.inf
 
     def _should_look_at_map(self) -> bool:
         """Return whether to look at the map's tiles for a better lower bound, now.
@@ -120,143 +168,143 @@ class PoseField:
         Tiles of half the size take 4 times as long, and show that narrower gaps are
         closed. Once a path is known, they hardly prove more.
         """
-        shift = self._aim.shift - 1
+        shift = self.known.aim.shift - 1
         has_paid = self.visits >= UNGUIDED << 3 * (SHIFT - shift)
         if shift == SHIFT:
             return has_paid
-        return has_paid and shift >= FINEST and self._proved() == math.inf
+        has_no_path = self._proved_bound() == math.inf
+        return has_paid and shift >= FINEST and has_no_path
 
-    def _grow(self, bound: float, most_visits: int) -> int:
+    def _visit(self, bound: float, most_visits: int) -> int:
         """Visit states, at most so many; return how many. A round may end, and the next begin."""
-        share = 1.0 if self._aim.weight > 1 else 1 / bound
-        target = Target(self._aim.number, share, bound * self._least, most_visits)
-        progress = self._spread(target)
-        self.visits += progress.visits
-        if self._proved() > bound * SAME and progress.visits < most_visits:
-            # The round is over; or the heap is full, and it begins again.
-            is_over = progress.reason == DONE
-            self._order(1.0 if is_over else self._aim.weight)
-        return progress.visits
-
-    def _spread(self, target: Target) -> Progress:
-        """Close states until the cost of a target is known well enough."""
-        search = self._search
+        search = self.known
+        aim = search.aim
+        # The rounds of weighted A* end when the start's cost is the least key, the last
+        # round as soon as the bound is proved.
+        share = 1.0 if aim.weight > 1 else 1 / bound
+        target = Target(aim.number, share, bound * self._least_cost, most_visits)
         progress: Progress = pose_space.spread_over_poses(
             search.distance, search.mark, search.heap, target, None, search
         )
-        return progress
+        self.visits += progress.visits
+        is_proved = self._proved_bound() <= bound * SAME
+        if not is_proved and progress.visits < most_visits:
+            # The round is over; or the heap is full, and it begins again.
+            is_over = progress.reason == DONE
+            self._begin_round(aim._replace(weight=1.0) if is_over else aim)
+        return progress.visits
 
-    @property
-    def _search(self) -> Search:
-        return Search(
-            self._distance,
-            self._mark,
-            self._touched,
-            self._heap,
-            self._aim,
-            self.world,
-        )
+    def _proved_bound(self) -> float:
+        """Return how many times the least cost the cost from the start may be.
 
-    def _cost(self) -> float:
-        """Return the least cost that was found from the start, infinite before."""
-        number = self._aim.number
-        if number < 0 or self._mark[number] == wavefront.UNREACHED:
-            return math.inf
-        return float(self._distance[number])
-
-    def _proved(self) -> float:
-        """Return how many times the least cost that of the start may be."""
-        cost = self._cost()
+        It is infinite as long as no path is known.
+        """
+        cost = _cost_from_start(self.known)
         if cost == math.inf:
             return math.inf
-        if cost <= self._least:
+        if cost <= self._least_cost:
             return 1.0
-        return cost / self._least if self._least > 0 else math.inf
-
-    def _order(self, weight: float) -> None:
-        """Begin a round: what is open or waits is ordered toward the start."""
-        tiles = np.flatnonzero(self._touched)
-        self._heap = make_heap((len(tiles) << pose_space.TILE_BITS) + HEAP)
-        self._aim = self._aim._replace(weight=weight)
-        self._least = pose_space.order(self._search, tiles)
+        return cost / self._least_cost if self._least_cost > 0 else math.inf
 
     def _can_leave(self) -> bool:
         """Return whether primitives lead from the start to more than a few states."""
-        mark = _untouched(self._mark.size, np.uint8)
+        search = self.known
+        mark = _untouched(search.mark.size, np.uint8)
         queue = np.empty(UNGUIDED, np.int64)
-        count = pose_space.leads_to(self._aim.number, mark, queue, self.world)
+        count = pose_space.leads_to(search.aim.number, mark, queue, self.world)
         return bool(count == queue.size)
 
-    def _look_at_map(self, shift: int) -> None:
-        """Write to `_aim` what remains to the start, a lower bound, by corners of tiles.
+    def _with_look_at_map(self, aim: Aim, shift: int) -> Aim:
+        """Return an aim with a lower bound of the cost to it from each corner of tiles.
 
         A tile has a side of 2**shift cells. R rows of C tiles have (R + 1) x (C + 1)
-        corners.
+        corners; tile (y, x) lies above and right of corner (y, x).
         """
         world = self.world
-        rows = -(-world.height >> shift)
-        columns = -(-world.width >> shift)
+        tile_side = 1 << shift  # cells
+        rows = math.ceil(world.height / tile_side)
+        columns = math.ceil(world.width / tile_side)
+        # (R, C): whether the body may pass a tile, 0 as long as nobody asked.
         room = world.room if shift == SHIFT else np.zeros((rows, columns), np.uint8)
-        remaining = np.empty((rows + 1, columns + 1), np.float32)
-        self._aim = self._aim._replace(remaining=remaining, shift=shift)
-        x, y, _ = self.goals.T >> shift
+        remaining = np.empty((rows + 1, columns + 1), np.float32)  # cells
+        aim_with_look = aim._replace(remaining=remaining, shift=shift)
+        goal_x, goal_y = self.goals[:, :2].T >> shift  # tiles
         is_goal = np.zeros(remaining.shape, np.bool_)
-        is_goal[y, x] = True
-        box = np.array([x.min(), y.min(), x.max(), y.max()])
-        heap = make_heap(8 * remaining.size + 4)  # a corner opens its neighbours once
-        pose_space.look(self._search._replace(heap=heap), room, is_goal, box)
+        is_goal[goal_y, goal_x] = True
+        box = np.array([goal_x.min(), goal_y.min(), goal_x.max(), goal_y.max()])
+        # First the 4 corners of the start's tile; then each opens its 8 neighbours once.
+        heap = make_heap(4 + 8 * remaining.size)
+        search = self.known._replace(aim=aim_with_look, heap=heap)
+        pose_space.look(search, room, is_goal, box)  # writes `remaining`
+        return aim_with_look
 
-    def rollout(self, start: State) -> NDArray[np.float64] | None:
-        """Return poses to a goal, (4, N); None without a path.
+    def rollout(self, start: State, bound: float) -> PosePath:
+        """Return the path from a start to a goal; there is one, see `reach`.
 
-        The rows are x and y in cells, yaw, and the cost until there.
+        It costs at most `bound` times the least.
         """
         body = self.world.body
-        number = int(pose_space.number_of(*start, self.world))
-        if self._mark[number] == wavefront.UNREACHED:
-            return None
-        most_primitives = int(self._distance[number] / body.cost.min()) + 1
-        most_poses = int(np.diff(body.first_pose).max())  # of a primitive
-        rows = np.empty((4, 1 + most_primitives * most_poses))
-        count = pose_space.follow(self._search, number, most_primitives, rows)
-        return rows[:, :count]
+        with self._lock:
+            proved_bound = self.reach(start, bound, ALL_STATES)
+            assert proved_bound is not None
+            search = self.known
+            cost = search.distance[search.aim.number]
+            most_primitives = int(cost / body.cost.min()) + 1
+            most_poses = int(np.diff(body.first_pose).max())  # of a primitive
+            rows = np.empty((4, 1 + most_primitives * most_poses))
+            count = pose_space.follow(search, search.aim.number, most_primitives, rows)
+        x, y, yaw, costs = rows[:, :count]  # cells, radians on the map, cells
+        grid = self.grid
+        in_cells = np.column_stack([x, y])
+        yaw_in_frame = turn_between(0, yaw + grid.origin[2])
+        self.path = PosePath(
+            poses=np.column_stack([grid.centres(in_cells), yaw_in_frame]),
+            cells=cells_of(in_cells),
+            costs=costs.copy(),
+            least_cost=float(costs[-1]) / proved_bound,
+        )
+        return self.path
 
-    def repaired(
-        self, grid: GridMap, world: World, cells: NDArray[np.int64]
-    ) -> PoseField:
-        """Return the field for a map that differs in cells (N, 2).
+    def take_over(
+        self, older: PoseField, changed: NDArray[np.int64] | None, start: State | None
+    ) -> bool:
+        """Repair what an older field knows and take it, see `Field.take_over`.
 
-        It is this field, changed; or a new one where that is quicker.
+        The cache forgets the older field always: it takes much memory.
         """
-        opens = not occupied_for_body(grid)[cells[:, 1], cells[:, 0]].all()
-        self.grid = grid
-        self.world = world
-        self.path = None
-        self.visits = 0
-        tiles = np.flatnonzero(self._touched)
-        is_near = self._tiles_near(cells)
-        near_tiles = np.flatnonzero(is_near.ravel() & self._touched)
-        cost = self._cost()
-        self._least = min(self._least, cost)
-        room = len(tiles) << pose_space.TILE_BITS
-        # A path may have become cheaper where a cell is free: then the lower bounds are
-        # void. Otherwise what is open stays in order, and `_least` a lower bound.
-        if opens:
-            self._aim = NOWHERE
-            self._heap = make_heap(room)
-        elif self._heap.size[0] + room > self._heap.keys.size:
-            self._aim = self._aim._replace(number=-1)
-            self._heap = make_heap(room)
-        cost_to_keep = LOST * cost if cost < math.inf else 0.0
-        unsupported = pose_space.least_unsupported(self._search, near_tiles)
-        if unsupported < cost_to_keep:
-            return PoseField(self.goals, grid, world, self._aim)
-        if unsupported < math.inf:
-            pose_space.take_back(self._search, tiles, unsupported)
-        if opens:  # states beside the cells are visited again
-            mark = self._mark.reshape(world.tile.size, -1)
-            mark[near_tiles] = np.minimum(mark[near_tiles], wavefront.OPEN)
-        return self
+        if changed is None:
+            return True
+        occupied = occupied_for_body(self.grid)
+        has_opened = not occupied[changed[:, 1], changed[:, 0]].all()
+        with older._lock:
+            search = older._take_known()._replace(world=self.world)
+            cost = _cost_from_start(search)
+            self._least_cost = min(older._least_cost, cost)
+            tiles = np.flatnonzero(search.touched)
+            is_near = self._tiles_near(changed)
+            near_tiles = np.flatnonzero(is_near.ravel() & search.touched)
+            room = len(tiles) << pose_space.TILE_BITS
+            # A path may have become cheaper where a cell is free: then the lower bounds
+            # are void. Otherwise what is open stays in order, and `_least_cost` a lower
+            # bound.
+            if has_opened:
+                search = search._replace(aim=NOWHERE, heap=make_heap(room))
+            elif search.heap.size[0] + room > search.heap.keys.size:
+                aim = search.aim._replace(number=-1)
+                search = search._replace(aim=aim, heap=make_heap(room))
+            cost_to_keep = LOST * cost if cost < math.inf else 0.0
+            unsupported_cost = pose_space.least_unsupported(search, near_tiles)
+            if unsupported_cost < cost_to_keep:
+                aim = search.aim._replace(number=-1)
+                search = self._goals_alone()._replace(aim=aim)
+            else:
+                if unsupported_cost < math.inf:
+                    pose_space.take_back(search, tiles, unsupported_cost)
+                if has_opened:  # states beside the cells are visited again
+                    mark = search.mark.reshape(self.world.tile.size, -1)
+                    mark[near_tiles] = np.minimum(mark[near_tiles], wavefront.OPEN)
+            self._known = search
+        return True
 
     def _tiles_near(self, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which tiles primitives may leave that sweep some cells (N, 2)."""
@@ -268,3 +316,11 @@ class PoseField:
             columns_near = slice(max(x - reach, 0), x + reach + 1)
             is_near[rows_near, columns_near] = True
         return is_near
+
+
+def _cost_from_start(search: Search) -> float:
+    """Return the least cost that was found from the aimed start, infinite without a path."""
+    number = search.aim.number
+    if number < 0 or search.mark[number] == wavefront.UNREACHED:
+        return math.inf
+    return float(search.distance[number])

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
-import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import compress
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap
+from ddqn_planner.grid.grid_map import Exploration
 from ddqn_planner.grid.inflation import with_unknown_free
 from ddqn_planner.planning import pose_paths as paths
 from ddqn_planner.planning import unknown_space
+from ddqn_planner.planning.field_cache import FieldCache
 from ddqn_planner.planning.path_finder import Clock, Finding, PathFinder
 from ddqn_planner.planning.plan import (
     ROUNDING,
@@ -40,7 +41,6 @@ VISITS = 2**16  # states that a field visits in one step of a plan: some 30 ms
 # Whether a path leads through unknown space is looked for in so many such steps, some
 # 0.5 s, within a bound that hardly takes longer than any path.
 MOST_STEPS_OF_REASON, BOUND_OF_REASON = 16, 10.0
-KEPT: Final = 3  # fields, those used last
 # Cells and radians: no yaw is farther from the two headings nearest to it.
 SAME_END = 1.0, 0.5
 # So near to its path, a robot keeps it even if there is none from the state nearest to
@@ -55,52 +55,33 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
     """Keeps the fields of the goals used last. Several threads may use it."""
 
     def __init__(self, network: Any) -> None:
-        self.motions, self.footprint = network.motions, network.footprint
+        self._network = network
+        self.motions = network.motions
+        self.footprint = network.footprint
         self.body = body_of(network.motions, network.swept())
         self.points = paths.points_of(self.footprint, self.motions.resolution)
-        self._forget()
-
-    def _forget(self) -> None:
-        """Begin without fields."""
-        self._fields: dict[tuple[Any, ...], PoseField] = {}  # used last at the end
-        self._map: tuple[GridMap, World] | None = None  # the last one
+        # A request compares the same two maps for its path, its world and its field.
         self._differences = lru_cache(maxsize=1)(differences)
-        self._lock = threading.Lock()
+        self.fields = FieldCache[PoseField](0, self._differences)
+        self._map: tuple[GridMap, World] | None = None  # the last one
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy has, also in another process: no fields, and no lock."""
-        return {
-            name: value
-            for name, value in vars(self).items()
-            if not name.startswith("_")
-        }
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how a copy is made, also in another process: without fields."""
+        return PosePlanner, (self._network,)
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Begin as a copy."""
-        vars(self).update(state)
-        self._forget()
-
-    def steps(self, request: PoseRequest) -> Iterator[PosePlan | None]:
-        """Yield None before each slow step, and last the plan.
-
-        On a map with an exploration, the path is the one on the safe map, and its cost
-        the expected one.
-        """
-        exploration = request.grid.exploration
-        if exploration is None:
-            yield from super().steps(request)
-            return
+    def _explore(
+        self, request: PoseRequest, exploration: Exploration, clock: Clock
+    ) -> Finding[PosePlan]:
+        """Return the plan on the safe map, with the cost on the map of expected times."""
         safe_request = replace(request, grid=exploration.safe)
-        for plan in super().steps(safe_request):
-            if plan is None or len(plan.poses) < 2:
-                yield plan
-            else:
-                yield _with_expected_cost(plan, request.grid, exploration.safe)
+        plan = yield from self._find_on_map(safe_request, clock)
+        if len(plan.poses) < 2:
+            return plan
+        return _with_expected_cost(plan, request.grid, exploration.safe)
 
-    def _find(self, request: PoseRequest, clock: Clock) -> Finding[PosePlan]:
-        """Return the plan, whose reason is its status in words."""
-        with self._lock:
-            plan = self._from_last_path(request)
+    def _find_on_map(self, request: PoseRequest, clock: Clock) -> Finding[PosePlan]:
+        """Return the plan on a map without an exploration."""
+        plan = self._from_last_path(request)
         if plan is None:
             plan = yield from self._from_grown_field(request, clock)
         is_outside = plan.status in (
@@ -123,8 +104,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         if not is_start_inside:
             return PosePlan(PlanStatus.START_OUTSIDE_MAP)
         yield
-        with self._lock:
-            world = self._world(grid)
+        world = self._world(grid)
         starts = self._at(grid, request.start, world)
         if not len(starts):
             return PosePlan(PlanStatus.START_OCCUPIED)
@@ -149,11 +129,20 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         """Return the plan from a start to the nearest of some states."""
         if not len(states):
             return PosePlan(PlanStatus.GOAL_OCCUPIED)
-        plan = self._grow(request, states, start, clock)
-        while plan is None:
+        grid = request.grid
+        key = request.goals, request.tolerance, states.tobytes()
+        field = self.fields.get(
+            key, grid, lambda: PoseField(states, grid, self._world(grid))
+        )
+        bound = field.reach(start, request.bound, VISITS)
+        while bound is None:
             yield
-            plan = self._grow(request, states, start, clock)
-        return plan
+            bound = field.reach(start, request.bound, VISITS)
+        clock.end_field()
+        if bound == math.inf:
+            return PosePlan(PlanStatus.NO_PATH, field_ms=clock.field_ms)
+        plan = field.rollout(start, request.bound).plan(0, grid)
+        return replace(plan, field_ms=clock.field_ms, rollout_ms=clock.rollout_ms)
 
     def _reason(self, request: PoseRequest, plan: PosePlan) -> Finding[str]:
         """Return why there is no path, in words."""
@@ -236,8 +225,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         cell = grid.world_to_cell(*goal[:2])
         if not grid.contains(cell):
             return unknown_space.OUTSIDE
-        with self._lock:
-            world = self._world(grid)
+        world = self._world(grid)
         if len(self._at(grid, goal, world)):
             return ""
         if len(self._at(with_unknown_free(grid), goal, possible)):
@@ -385,11 +373,11 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
 
     def _from_last_path(self, request: PoseRequest) -> PosePlan | None:
         """Return the rest of a path that was planned before, with the start on it."""
-        for (goals, tolerance, _), field in self._fields.items():
-            if goals != request.goals or tolerance != request.tolerance:
-                continue
+        for field in self.fields.kept:
             path = field.path
-            if path is None:
+            goals, tolerance, _ = field.key
+            is_for_goals = goals == request.goals and tolerance == request.tolerance
+            if path is None or not is_for_goals:
                 continue
             changed = self._differences(field.grid, request.grid)
             if changed is None or len(changed):
@@ -412,62 +400,6 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         world = world_of(grid, self.body, older_world, changed)
         self._map = grid, world
         return world
-
-    def _field(self, request: PoseRequest, states: NDArray[np.int64]) -> PoseField:
-        """Return a field toward some states: as it is, repaired, or new."""
-        key = request.goals, request.tolerance, states.tobytes()
-        older = self._fields.pop(key, None)
-        field = self._field_on(request.grid, states, older)
-        used_last = [*self._fields.items(), (key, field)]
-        self._fields = dict(used_last[-KEPT:])
-        return field
-
-    def _field_on(
-        self, grid: GridMap, states: NDArray[np.int64], older: PoseField | None
-    ) -> PoseField:
-        """Return a field on a map: an older one toward the same states, repaired, or new.
-
-        It is new where there is no older one, or where its map cannot be compared.
-        """
-        if older is None:
-            return PoseField(states, grid, self._world(grid))
-        if older.grid is grid:
-            return older
-        changed = self._differences(older.grid, grid)
-        world = self._world(grid)
-        if changed is None:
-            return PoseField(states, grid, world)
-        return older.repaired(grid, world, changed)
-
-    def _grow(
-        self,
-        request: PoseRequest,
-        states: NDArray[np.int64],
-        start: State,
-        clock: Clock,
-    ) -> PosePlan | None:
-        """Grow the field by a step; return the plan if it is known then."""
-        grid = request.grid
-        with self._lock:  # between two steps another request may use the field
-            field = self._field(request, states)
-            bound = field.reach(start, request.bound, VISITS)
-            if bound is None:
-                return None
-            clock.end_field()
-            rows = field.rollout(start)
-            if rows is None:
-                return PosePlan(PlanStatus.NO_PATH, field_ms=clock.field_ms)
-            x, y, yaw, costs = rows
-            in_cells = np.column_stack([x, y])
-            yaw_on_map = turn_between(0, yaw + grid.origin[2])
-            field.path = paths.PosePath(
-                poses=np.column_stack([grid.centres(in_cells), yaw_on_map]),
-                cells=paths.cells_of(in_cells),
-                costs=costs.copy(),
-                least_cost=float(costs[-1]) / bound,
-            )
-            plan = field.path.plan(0, grid)
-        return replace(plan, field_ms=clock.field_ms, rollout_ms=clock.rollout_ms)
 
 
 def _with_expected_cost(

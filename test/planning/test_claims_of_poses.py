@@ -17,7 +17,7 @@ from ddqn_planner import GridMap, Planner
 from ddqn_planner.model import RobotNetwork
 from ddqn_planner.planning.plan import PlanStatus, PosePlan
 from ddqn_planner.planning.planner import last_step
-from ddqn_planner.planning.pose_field import PoseField
+from ddqn_planner.planning.pose_field import NOWHERE, PoseField
 from ddqn_planner.planning.pose_planner import Pose, PosePlanner, PoseRequest
 from ddqn_planner.planning.pose_space import remaining_cost
 from ddqn_planner.planning.pose_world import State, world_of
@@ -223,10 +223,9 @@ def lower_bounds(
         np.array([goal]), grid, world_of(grid, PosePlanner(planner.network).body)
     )
     x, y, _ = start
-    field._aim = field._aim._replace(x=x, y=y)
-    field._look_at_map(shift)
+    aim = field._with_look_at_map(NOWHERE._replace(x=x, y=y), shift)
     cells = np.ndindex(grid.occupancy.shape)
-    bounds = [remaining_cost(column, row, field._aim) for row, column in cells]
+    bounds = [remaining_cost(column, row, aim) for row, column in cells]
     return np.array(bounds).reshape(grid.occupancy.shape)
 
 

@@ -81,7 +81,7 @@ def test_a_copy_of_a_planner_plans_as_the_original_before_and_after_a_plan(
     for copied in (before, after):
         assert copied.metadata == planner.metadata
         assert copied.fields.nbytes == 12_345
-        assert copied.fields.network is copied.network
+        assert copied.cell_planner.network is copied.network
         assert (copied.plan(grid, *ends) if ends else plan_of(copied, grid)) == plan
     assert plan.path.size or planner.metadata.network == "paper"
 
@@ -204,7 +204,7 @@ def test_a_dropped_planner_is_freed_at_once(
         assert plan_of(dropped, grid).path.size
     parts = [dropped, dropped.network, dropped.fields, dropped.pose_planner]
     references = [weakref.ref(part) for part in parts if part is not None]
-    references += [weakref.ref(field) for field in dropped.fields._kept]
+    references += [weakref.ref(field) for field in dropped.fields.kept]
     assert len(references) > 3 or not has_planned
     del dropped, parts
     assert [reference() for reference in references] == [None] * len(references)
@@ -217,7 +217,7 @@ def test_a_map_that_nobody_has_is_freed_at_once() -> None:
         grid = walls().with_patch([[True]], 3, 3)
         reference = weakref.ref(grid)
         assert plan_of(planner, grid).path.size
-        planner.fields._kept.clear()
+        planner.fields.kept.clear()
         del grid
         assert reference() is None
     assert ANY_MAP.network is planner.network

@@ -37,7 +37,7 @@ from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.grid.oracle import shortest_distances
 from ddqn_planner.model import move_costs as move_costs_module
 from ddqn_planner.model.move_costs import MoveCosts
-from ddqn_planner.planning import cell_space, queues, wavefront
+from ddqn_planner.planning import cell_space, field_cache, queues, wavefront
 from ddqn_planner.planning import field as fields
 from ddqn_planner.planning.field import DistanceField, QField, network_field
 from ddqn_planner.planning.segments import cost_along
@@ -315,7 +315,9 @@ def test_a_map_made_of_others_is_as_new(
         assert planner.plan(grid, start, goal, rule) == new_planner().plan(
             fresh, start, goal, rule
         )
-        costs, new = (one.fields.costs(grid, rule) for one in (planner, new_planner()))
+        costs, new = (
+            one.cell_planner.move_costs(grid, rule) for one in (planner, new_planner())
+        )
         assert costs is not None
         assert new is not None
         for layer in ("patch_number", "cost_code", "multiplier"):
@@ -340,7 +342,8 @@ def test_a_changed_map_uses_what_is_known_of_the_one_before() -> None:
     )
     assert isinstance(older, DistanceField)
     known = np.count_nonzero(older.known.distance)
-    assert field.take_over(older)
+    cells = map_changes.changed_cells(grid, changed)
+    assert field.take_over(older, cells)
     assert np.count_nonzero(field.known.distance) > 0.9 * known
     assert np.count_nonzero(older.known.distance) == 1  # it handed over its memory
     assert field.rollout(start) == fresh_field(
@@ -392,7 +395,7 @@ def test_a_repair_that_takes_too_long_leaves_the_older_field_as_it_was() -> None
         changed, start, goal
     )
     assert (
-        planner.fields.find(grid, (goal,), MoveRule.ROBOT_SAFE) is None
+        planner.fields.find(((goal,), MoveRule.ROBOT_SAFE), grid) is None
     )  # the place has changed
     assert older.is_known((0, 0))
     assert older.rollout((0, 0)) == before
@@ -439,14 +442,14 @@ def test_a_field_that_is_interrupted_anywhere_is_as_a_new_one(
 
 def run_until(line: int, step: Callable[[], object]) -> None:
     """Run a step, and fail where so many lines of the field's code were run, if it gets there."""
-    modules = fields, cell_space, queues, wavefront
+    modules = fields, field_cache, cell_space, queues, wavefront
     files = {module.__file__ for module in modules}
     left = line
 
     def trace(frame: FrameType, event: str, _: object) -> Any:
         nonlocal left
         # A trace that fails where a lock is left leaves it locked.
-        is_cache = isinstance(frame.f_locals.get("self"), fields.FieldCache)
+        is_cache = isinstance(frame.f_locals.get("self"), field_cache.FieldCache)
         if is_cache or frame.f_code.co_filename not in files:
             return None
         left -= event == "line"
@@ -609,7 +612,7 @@ def test_few_rows_of_a_large_map_are_read(monkeypatch: pytest.MonkeyPatch) -> No
     cost = np.zeros((side, side), np.int8)
     grid, planner = GridMap(np.zeros((side, side)), cost=cost), new_planner()
     assert planner.plan(grid, (500, 500), (560, 500)).path.size
-    (field,) = planner.fields._kept
+    (field,) = planner.fields.kept
     assert isinstance(field, DistanceField)
     rows = field.costs.rows_read
     assert rows is not None
@@ -617,7 +620,7 @@ def test_few_rows_of_a_large_map_are_read(monkeypatch: pytest.MonkeyPatch) -> No
     assert rows.end - rows.first < 300
     # A map that changes is read as a whole.
     planner.plan(grid.with_patch([[True]], 505, 500), (500, 500), (560, 500))
-    (field,) = planner.fields._kept
+    (field,) = planner.fields.kept
     assert isinstance(field, DistanceField)
     assert field.costs.rows_read is None
     # Around a wall, it has to look on.
@@ -671,15 +674,15 @@ def test_what_is_kept_takes_no_more_memory_than_the_bound(kind: str, side: int) 
             planner.plan(grid, (0, 0), free[-number % len(free)])
             number += 1
         taken = tracemalloc.get_traced_memory()[0]
-        number = len(planner.fields._kept)
-        planner.fields._kept.clear()
+        number = len(planner.fields.kept)
+        planner.fields.kept.clear()
         freed = taken - tracemalloc.get_traced_memory()[0]
     finally:
         tracemalloc.stop()
-    assert 3 < number <= fields.MOST_KEPT
+    assert 3 < number <= field_cache.MOST_KEPT
     assert freed < 1.1 * planner.fields.nbytes
     # And it is made use of.
-    assert number == fields.MOST_KEPT or freed > 0.5 * planner.fields.nbytes
+    assert number == field_cache.MOST_KEPT or freed > 0.5 * planner.fields.nbytes
 
 
 @KINDS
@@ -699,7 +702,7 @@ def test_a_request_on_a_new_map_looks_at_a_bounded_number_of_others(
         repaired += 1
         return take_over(self, *arguments)
 
-    planner, most = new_planner(), fields.MOST_KEPT
+    planner, most = new_planner(), field_cache.MOST_KEPT
     monkeypatch.setattr(GridMap, "same_cells", counted)
     monkeypatch.setattr(DistanceField, "take_over", tried)
     for grid in islice(new_maps(8, kind), 2 * most):
@@ -707,8 +710,8 @@ def test_a_request_on_a_new_map_looks_at_a_bounded_number_of_others(
         planner.plan(grid, (7, 7), (0, 0))
         # Of fields toward one goal, and of all for costs.
         assert compared <= 3 * most
-        assert repaired <= fields.ALWAYS_KEPT
-    assert len(planner.fields._kept) <= most
+        assert repaired <= field_cache.ALWAYS_KEPT
+    assert len(planner.fields.kept) <= most
 
 
 def test_the_last_64_fields_are_kept_and_3_whatever_their_size() -> None:
@@ -716,11 +719,11 @@ def test_the_last_64_fields_are_kept_and_3_whatever_their_size() -> None:
     *goals, last = grid.free_cells()[:80]
     for goal in goals:
         planner.q_field(grid, goal)
-    assert [field.goal for field in planner.fields._kept] == goals[-64:]
+    assert [field.goal for field in planner.fields.kept] == goals[-64:]
     planner.q_field(grid, goals[-5])  # used last by now
     planner.fields.nbytes = 0
     planner.q_field(grid, last)
-    assert [field.goal for field in planner.fields._kept] == [
+    assert [field.goal for field in planner.fields.kept] == [
         goals[-1],
         goals[-5],
         last,
@@ -744,11 +747,11 @@ def test_fields_toward_other_goals_or_by_other_rules_are_not_repaired() -> None:
 def test_arrays_that_fields_share_count_once() -> None:
     side = 50
     planner, grid = new_planner(), GridMap(np.zeros((side, side)))
-    planner.fields.nbytes = 16 * 9 * (side + 2) ** 2 + 16 * fields.OBJECTS
+    planner.fields.nbytes = 16 * 9 * (side + 2) ** 2 + 16 * field_cache.OBJECTS
     for goal in grid.free_cells()[:30]:
         planner.q_field(grid, goal)
     # One map and one set of costs; by themselves they would count as much as 4 of the fields.
-    assert 14 <= len(planner.fields._kept) <= 16
+    assert 14 <= len(planner.fields.kept) <= 16
     whole = planner.q_field(grid, (0, 0))
     before = whole.nbytes
     assert whole.q.base is not None

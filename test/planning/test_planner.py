@@ -29,7 +29,8 @@ from ddqn_planner.planning import (
     QField,
     simplify,
 )
-from ddqn_planner.planning.field import OBJECTS, DistanceField
+from ddqn_planner.planning.field import DistanceField
+from ddqn_planner.planning.field_cache import OBJECTS
 from ddqn_planner.planning.path_finder import last_step
 from ddqn_planner.planning.plan import ROUNDING
 from ddqn_planner.planning.segments import cost_along
@@ -46,7 +47,7 @@ def random_planner(height: int, width: int, seed: int) -> Planner:
 def known_field(
     planner: Planner, grid: GridMap, goal: Cell, rule: MoveRule
 ) -> QField | None:
-    return planner.fields.find(grid, (goal,), rule)
+    return planner.fields.find(((goal,), rule), grid)
 
 
 def is_answered_at_once(

@@ -74,7 +74,7 @@ def plan(
 
 
 def last_field(planner: PosePlanner) -> pose_field.PoseField:
-    return [*planner._fields.values()][-1]
+    return planner.fields.kept[-1]
 
 
 def pose_of(grid: GridMap, state: State) -> Pose:
@@ -234,12 +234,12 @@ def test_what_the_map_tells_is_left_at_least(motion: str, seed: int) -> None:
     x, y, heading = (int(random.integers(n)) for n in (44, 30, 16))
     world = world_of(grid, planner(motion).body)
     field = pose_field.PoseField(np.array([(43, 29, 0)]), grid, world)
-    field._aim = field._aim._replace(x=x, y=y)
+    aim = pose_field.NOWHERE._replace(x=x, y=y)
     best = least_costs(grid, *robot(motion), (x, y, heading))
     for shift in (2, 1):  # tiles of 4 cells, and of 2
-        field._look_at_map(shift)
+        aim = field._with_look_at_map(aim, shift)
         for row, column, _ in np.argwhere(np.isfinite(best)):
-            left = remaining_cost(column, row, field._aim)
+            left = remaining_cost(column, row, aim)
             assert left <= best[row, column].min() + 1e-3
 
 
@@ -314,11 +314,12 @@ def test_a_box_on_the_path_is_driven_around_at_the_least_cost(motion: str) -> No
     body = planner(motion)
     way = plan(body, grid, start, goal, bound=1.0)
     for ahead in random.integers(30, 80, 3):
-        field = last_field(body)
+        distance = last_field(body).known.distance
         x, y = grid.world_to_cell(*way.poses[ahead, :2])
         grid = grid.with_patch(np.ones((3, 3), np.bool_), x - 1, y - 1)
         way = plan(body, grid, start, goal, bound=1.0)
-        assert last_field(body) is field  # it is repaired, not begun anew
+        # It is repaired, not begun anew.
+        assert last_field(body).known.distance is distance
         fresh = plan(planner(motion), grid, start, goal, bound=1.0)
         assert way.cost == pytest.approx(fresh.cost, rel=1e-5)
 

@@ -1,0 +1,211 @@
+"""Fields that grow and are repaired, and the cache of them: for cells and for poses."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any, Generic, TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.grid import GridMap
+from ddqn_planner.model.move_costs import MoveCosts
+
+# For a planner's Q fields: 3 of 500 x 500 cells, at 9 bytes per cell.
+CACHE_BYTES = 2**23
+# Fields, whatever their size: to and fro, or the three of `Exploration`.
+ALWAYS_KEPT = 3
+MOST_KEPT = 64  # fields, however small: a request's map is compared with that of each
+OBJECTS = 4_000  # bytes of a field, its costs and its map beside their arrays
+
+Known = TypeVar("Known")
+AnyField = TypeVar("AnyField", bound="Field[Any]")
+# Returns the cells (N, 2) in which an older and a newer map differ. It returns None if
+# they show different places, or differ in so many cells that a repair does not pay.
+Comparison: TypeAlias = Callable[[GridMap, GridMap], NDArray[np.int64] | None]
+
+
+class Field(Generic[Known]):
+    """Costs toward goals on a map. Several threads may use it.
+
+    What is known (`Known`: arrays of costs and the states whose costs may still fall)
+    grows from the goals. The field of a changed map takes it over and repairs it.
+    """
+
+    grid: GridMap
+    costs: MoveCosts | None = None
+    key: Any = None
+    """The goals and whatever else a request must have in common to use the field."""
+    map_arrays: Sequence[tuple[int, int]] = ()
+    """The id and the bytes of each array of its map and costs, which fields may share."""
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+        # None before the first growth, and while a thread changes it: if that thread is
+        # interrupted, the field begins anew.
+        self._known: Known | None = None
+
+    @property
+    def known(self) -> Known:
+        """What is known, at first the goals alone."""
+        if self._known is None:
+            self._known = self._goals_alone()
+        return self._known
+
+    def _goals_alone(self) -> Known:
+        """Return what is known before any growth."""
+        raise NotImplementedError
+
+    def _take_known(self) -> Known:
+        """Remove what is known from the field, to change it, and return it."""
+        known = self.known
+        self._known = None
+        return known
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the arrays that are the field's alone, bytes."""
+        raise NotImplementedError
+
+    def is_on(self, grid: GridMap) -> bool:
+        """Return whether the field may be used on a map as it is."""
+        return grid is self.grid
+
+    def take_over(
+        self, older: Any, changed: NDArray[np.int64] | None, start: Any
+    ) -> bool:
+        """Repair what an older field with the same key knows, and take it.
+
+        The older field then begins anew, if it is still used. Where growing this field
+        toward a start is quicker than the repair, it takes nothing.
+
+        Parameters
+        ----------
+        older : Field
+        changed : (N, 2) int64, optional
+            The cells in which the maps of both fields differ, see `Comparison`.
+        start : cell or pose state, optional
+            None for any.
+
+        Returns
+        -------
+        bool
+            Whether the cache should forget the older field.
+        """
+        return False
+
+
+class FieldCache(Generic[AnyField]):
+    """The fields that a planner used last. Several threads may use it.
+
+    Parameters
+    ----------
+    nbytes : int
+        Memory that the fields may take together with their maps, in bytes. The last
+        `ALWAYS_KEPT` fields are kept whatever their size.
+    changed_cells : Comparison
+    """
+
+    def __init__(self, nbytes: int, changed_cells: Comparison) -> None:
+        self.nbytes = nbytes
+        self.changed_cells = changed_cells
+        # Used last at the end. The list is replaced and never changed, so that a thread
+        # may read it without the lock.
+        self.kept: list[AnyField] = []
+        self._lock = threading.Lock()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how a copy is made, also in another process: without fields."""
+        return FieldCache, (self.nbytes, self.changed_cells)
+
+    def find(self, key: Hashable, grid: GridMap) -> AnyField | None:
+        """Return the field with a key on a map, or None; mark it as used last."""
+        for field in self.kept:
+            if field.key == key and field.is_on(grid):
+                # The same cells may lie at another origin, in other arrays.
+                _put_on(field, grid)
+                with self._lock:
+                    others = [other for other in self.kept if other is not field]
+                    self.kept = [*others, field]
+                return field
+        return None
+
+    def get(
+        self,
+        key: Hashable,
+        grid: GridMap,
+        new_field: Callable[[], AnyField],
+        start: Any = None,
+    ) -> AnyField:
+        """Return the field with a key on a map: the kept one, a repaired one, or a new one.
+
+        Parameters
+        ----------
+        key : hashable
+            See `Field.key`.
+        grid : GridMap
+        new_field : callable
+            Makes a field with this key on this map that knows its goals alone.
+        start : cell or pose state, optional
+            From where the field is needed; None for all of it.
+        """
+        field = self.find(key, grid)
+        if field is not None:
+            return field
+        field = new_field()
+        field.key = key
+        _put_on(field, grid)
+        replaced = self._repaired_by(field, start)
+        with self._lock:
+            others = [other for other in self.kept if other is not replaced]
+            fields = [*others, field]
+            self.kept = fields[-self._most(fields) :]
+        return field
+
+    def _repaired_by(self, field: AnyField, start: Any) -> AnyField | None:
+        """Let a new field take over what an older one knows; return the older one."""
+        older_fields = [older for older in self.kept[::-1] if older.key == field.key]
+        # The place will hardly be again what it was. If the fields used last are on other
+        # maps, so are those before them: with new expected times all are.
+        for older in older_fields[:ALWAYS_KEPT]:
+            changed = self.changed_cells(older.grid, field.grid)
+            if field.take_over(older, changed, start):
+                return older
+        return None
+
+    def _most(self, fields: list[AnyField]) -> int:
+        """Return how many fields, those at the end of a list, may be kept."""
+        held_bytes = 0
+        counted_arrays = set[int]()
+        for count, field in enumerate(reversed(fields)):
+            held_bytes += OBJECTS + field.nbytes
+            for array, nbytes in field.map_arrays:
+                if array not in counted_arrays:
+                    counted_arrays.add(array)
+                    held_bytes += nbytes
+            is_too_much = held_bytes > self.nbytes or count >= MOST_KEPT
+            if is_too_much and count >= ALWAYS_KEPT:
+                return count
+        return len(fields)
+
+
+def _put_on(field: Field[Any], grid: GridMap) -> None:
+    """Set the map of a field, and the list of arrays that it then shares."""
+    field.grid = grid
+    maps = [grid]
+    exploration = grid.exploration
+    if exploration is not None:
+        maps += [exploration.bold, exploration.safe]
+    values: list[Any] = [*(field.costs or ())]
+    for map_ in maps:
+        values += vars(map_).copy().values()  # other threads add to it
+    arrays = [memory_of(value) for value in values if isinstance(value, np.ndarray)]
+    field.map_arrays = [(id(array), array.nbytes) for array in arrays]
+
+
+def memory_of(array: NDArray[Any]) -> NDArray[Any]:
+    """Return the array that owns the memory of an array, which may be a view."""
+    while isinstance(array.base, np.ndarray):
+        array = array.base
+    return array
