@@ -16,7 +16,12 @@ from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning import unknown_space
 from ddqn_planner.planning.field import DistanceField, Goals, QField, network_field
 from ddqn_planner.planning.field_cache import CACHE_BYTES, FieldCache
-from ddqn_planner.planning.path_finder import Clock, Finding, PathFinder, last_step
+from ddqn_planner.planning.path_finder import (
+    Clock,
+    PathFinder,
+    PausingGenerator,
+    last_step,
+)
 from ddqn_planner.planning.paths import (
     keep_or_switch,
     rest_of_path,
@@ -31,15 +36,20 @@ VISITS = 2**18  # about how many cells a field visits in one step of a plan: som
 
 @dataclass
 class _Task:
-    """A request, and what the attempts before have shown of it."""
+    """A request, and what the attempts to answer it have shown up to now."""
 
     request: PlanRequest
     clock: Clock
-    goals: Goals  # those that are free
-    costs: MoveCosts | None = None  # of the map's moves, once they are known
-    failed: Plan | None = None  # the last rollout, which found no path
-    escape_path: tuple[Cell, ...] = ()  # from an occupied start to its first free cell
-    field: QField | None = None  # toward the goals that such a path can reach
+    goals: Goals
+    """The free goals of the request, or those that a path can reach, once known."""
+    costs: MoveCosts | None = None
+    """The costs of the map's moves, once they are known."""
+    failed_rollout: Plan | None = None
+    """The last rollout; it found no path."""
+    escape_path: tuple[Cell, ...] = ()
+    """From the start to its first free cell: the start alone if that is free."""
+    field: QField | None = None
+    """The field toward the goals that the escape path's end can reach."""
 
 
 class CellPlanner(PathFinder[PlanRequest, Plan]):
@@ -99,7 +109,7 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
                 return field.costs
             boxes = grid.patches_since(field.grid)
             if boxes is not None:
-                costs = field.costs.after(grid, boxes)
+                costs = field.costs.on_changed_map(grid, boxes)
                 if costs is not None:
                     return costs
         return self.network.move_costs(grid, rule)
@@ -110,26 +120,28 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
             request.under_way, request.start, request.grid, request.move_rule
         )
 
-    def _reason(self, request: PlanRequest, plan: Plan) -> Finding[str]:
+    def _reason(self, request: PlanRequest, plan: Plan) -> PausingGenerator[str]:
         """Return why there is no path, in words."""
-        yield from ()
+        yield from ()  # it never pauses, but must be a generator
         return unknown_space.reason_of(request, plan)
 
     def _explore(
         self, request: PlanRequest, exploration: Exploration, clock: Clock
-    ) -> Finding[Plan]:
-        """Plan on the optimistic map; fall back if the path costs more than the share.
+    ) -> PausingGenerator[Plan]:
+        """Return the plan on the bold map, or the plan on the safe map.
 
-        The share is that by which it may cost more than the best path that is expected.
+        Both maps make cells quick that were seldom driven through, most the bold map.
+        The path on the bold map is taken if the cost that is expected of it is at most
+        (1 + `exploration.share`) times the least expected cost.
         """
-        grid = request.grid
+        grid = request.grid  # has the expected times
         rule = request.move_rule
         bold_request = replace(request, grid=exploration.bold)
         plan = yield from self._find_on_map(bold_request, clock)
         if not plan.path.size:
             return plan
-        # A path under way was judged when it was new.
-        if plan.extra_cost is None:
+        is_under_way = plan.extra_cost is not None
+        if not is_under_way:  # a path under way was judged when it was new
             best_request = replace(request, under_way=())
             best = yield from self._find_on_map(best_request, clock)
             best_cost = best.cost or math.inf
@@ -141,8 +153,13 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
             return plan
         return replace(plan, cost=_cost(plan.path, grid, rule))
 
-    def _find_on_map(self, request: PlanRequest, clock: Clock) -> Finding[Plan]:
-        """Return the plan on a map of expected costs: by the first attempt that answers."""
+    def _find_on_map(
+        self, request: PlanRequest, clock: Clock
+    ) -> PausingGenerator[Plan]:
+        """Return the plan on a map without an exploration.
+
+        Attempts to find it are made one after another, until one returns a plan.
+        """
         grid = request.grid
         free_goals = {goal for goal in request.goals if grid.is_free(goal)}
         goals = tuple(sorted(free_goals))
@@ -157,11 +174,11 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
             plan = yield from attempt(task)
             if plan is not None:
                 return plan
-        assert task.failed is not None
-        return replace(task.failed, goal=task.goals[0], field_ms=clock.field_ms)
+        assert task.failed_rollout is not None
+        return replace(task.failed_rollout, goal=task.goals[0], field_ms=clock.field_ms)
 
     def _refusal(self, request: PlanRequest, free_goals: Goals) -> PlanStatus | None:
-        """Return why there is no path, where one look at start and goals says so."""
+        """Return why there is no path if start and goals alone tell, or None."""
         grid = request.grid
         if not grid.contains(request.start):
             return PlanStatus.START_OUTSIDE_MAP
@@ -176,7 +193,10 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
         return None
 
     def _from_known_field(self, task: _Task) -> Plan | None:
-        """Return the plan by a field that is known as far as the start, at once."""
+        """Return the plan by a kept field that is known as far as the start.
+
+        None if there is no such field, or if it leads nowhere.
+        """
         request = task.request
         if not request.grid.is_free(request.start):
             return None
@@ -185,11 +205,15 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
             return None
         return _roll_out(task, field)
 
-    def _from_grown_field(self, task: _Task) -> Finding[Plan | None]:
-        """Return the plan by a field that is grown as far as the start."""
-        if task.failed is not None:  # the field is known, and leads nowhere
+    def _from_grown_field(self, task: _Task) -> PausingGenerator[Plan | None]:
+        """Return the plan by a field that is grown as far as the start.
+
+        None if the start or all goals are occupied, or if the field leads nowhere. Sets
+        the costs of the task.
+        """
+        if task.failed_rollout is not None:  # a kept field leads nowhere
             return None
-        yield
+        yield  # a pause: a slow step follows
         request = task.request
         grid = request.grid
         task.costs = self.move_costs(grid, request.move_rule)
@@ -204,21 +228,22 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
         )
         if isinstance(field, DistanceField):
             while not field.grow(request.start, VISITS):
-                yield
+                yield  # a pause: a slow step follows
         return _roll_out(task, field)
 
-    def _by_escape(self, task: _Task) -> Finding[Plan | None]:
-        """Return the plan from the first free cell, to a goal that it can reach.
+    def _by_escape(self, task: _Task) -> PausingGenerator[Plan | None]:
+        """Return the plan from the first free cell to a goal that a path can reach.
 
-        A look at the whole map finds both, or why there is no path.
+        A look at the whole map finds both, and sets them in the task, or it finds why
+        there is no path. None if the rollout from that cell fails.
         """
         request = task.request
-        if task.failed is not None and request.reach >= 1:
-            yield
-        escape = way_and_ends(request, task.goals)
-        if isinstance(escape, PlanStatus):
-            return Plan(escape, move_rule=request.move_rule)
-        task.escape_path, task.goals = escape
+        if task.failed_rollout is not None and request.reach >= 1:
+            yield  # a pause: a slow step follows
+        outcome = way_and_ends(request, task.goals)
+        if isinstance(outcome, PlanStatus):
+            return Plan(outcome, move_rule=request.move_rule)
+        task.escape_path, task.goals = outcome
         task.field = self.field(
             request.grid,
             task.goals,
@@ -228,12 +253,15 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
         )
         return _roll_out(task, task.field)
 
-    def _by_search(self, task: _Task) -> Finding[Plan | None]:
-        """Return the plan by a search in the order of the Q field, if it is allowed."""
+    def _by_search(self, task: _Task) -> PausingGenerator[Plan | None]:
+        """Return the plan by a search in the order of the Q field, if that is allowed.
+
+        None if the request wants greedy steps alone.
+        """
         request = task.request
         if request.method is not PlanMethod.ASTAR_FALLBACK or task.field is None:
             return None
-        yield
+        yield  # a pause: a slow step follows
         task.clock.end_field()
         cells = search(
             task.escape_path[-1],
@@ -245,7 +273,10 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
         return _finished(task, np.array(cells), PlanMethod.ASTAR_FALLBACK)
 
     def _nearest_alone(self, request: PlanRequest, goals: Goals) -> Goals:
-        """Return the nearest of several goals, by a field toward each."""
+        """Return the nearest of several goals alone, by a plan to each.
+
+        Without a path to any, return the first goal.
+        """
         plans = []
         for goal in goals:
             request_of_goal = replace(request, goals=(goal,), under_way=())
@@ -259,23 +290,32 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
 
 
 def _roll_out(task: _Task, field: QField) -> Plan | None:
-    """Return the plan by greedy steps in a field; None where another attempt follows."""
+    """Return the plan by greedy steps in a field, from the first free cell.
+
+    Where the steps fail, but another attempt may find a path, set `failed_rollout` of
+    the task and return None.
+    """
     request = task.request
     task.clock.end_field()
     start = task.escape_path[-1] if task.escape_path else request.start
     rollout = field.rollout(start, request.simplified)
     if rollout.path.size:
         return _finished(task, rollout.path, rollout.method)
-    # The whole map was looked at in vain, unless another goal may do.
+    # The field has looked at the whole map: no path leads from a free start to these
+    # goals. With a tolerance, a path to another goal may do.
     is_cut_off = rollout.status is PlanStatus.NO_PATH and request.reach < 1
     if is_cut_off and not task.escape_path:
         return replace(rollout, field_ms=task.clock.field_ms)
-    task.failed = rollout
+    task.failed_rollout = rollout
     return None
 
 
 def _finished(task: _Task, path: Path, method: PlanMethod) -> Plan:
-    """Return the plan of a path, which is straightened or gives way to the path under way."""
+    """Return the plan of a path (N, 2) from the first free cell to a goal.
+
+    If the request says so, the path is straightened; if the rest of the path under way
+    hardly costs more, that is taken instead. Then the escape path comes before it.
+    """
     request = task.request
     grid = request.grid
     rule = request.move_rule
@@ -287,7 +327,8 @@ def _finished(task: _Task, path: Path, method: PlanMethod) -> Plan:
     goal = (int(path[-1, 0]), int(path[-1, 1]))
     if len(task.escape_path) > 1:
         path = np.concatenate([task.escape_path[:-1], path], dtype=np.int32)
-        # From the first free cell on it is the path under way; is it as a whole?
+        # The extra cost is that of a path under way. This path is one only if its escape
+        # path belongs to the path under way, too.
         under_way = np.asarray(request.under_way)
         if not np.array_equal(path, under_way[-len(path) :]):
             extra_cost = None
@@ -305,5 +346,5 @@ def _finished(task: _Task, path: Path, method: PlanMethod) -> Plan:
 
 
 def _cost(path: Cells, grid: GridMap, rule: MoveRule) -> float:
-    """Return what a path costs: seconds, on a map of expected times."""
+    """Return the cost of a path (N, 2), in seconds on a map of expected times."""
     return cost_along(path, grid, rule) * (grid.seconds_per_cell or 1.0)

@@ -1,4 +1,4 @@
-"""The Q field: Q(s, a) of every cell toward one goal, its growth, repair and rollouts."""
+"""The Q field: Q(s, a) of every cell toward one goal; growth, repair and rollouts."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class QField(Field[Known]):
 
     @cached_property
     def value(self) -> NDArray[np.float32]:
-        """(H, W) float32: the greatest Q of a legal move, and at the goal the greatest of all."""
+        """(H, W) float32: the greatest Q of a legal move; at the goal, of all cells."""
         legal_q = np.where(self.legal, self.q, np.float32(-np.inf))
         value: NDArray[np.float32] = legal_q.max(axis=0)
         value[self.goal[1], self.goal[0]] = value.max()
@@ -89,30 +89,32 @@ class QField(Field[Known]):
         return sum(memory_of(array).nbytes for array in arrays)
 
     def unmasked(self) -> QField:
-        """Return the field without action masking: a rollout is trapped by an illegal move."""
+        """Return the field without action masking: an illegal move traps a rollout."""
         greedy_1HW = self.q.argmax(axis=0, keepdims=True)
         actions_A11 = np.arange(len(MOVES)).reshape(-1, 1, 1)
         legal = self.legal & (actions_A11 == greedy_1HW)
         return QField(self.goal, self.q, legal, self.move_rule)
 
     def is_known(self, start: Cell) -> bool:
-        """Return whether no more of the field is needed for the rollout from a start."""
+        """Return whether the field is grown as far as a rollout from a start needs."""
         return True
 
     def rollout(self, start: Cell, straight: bool = False) -> Plan:
         """Take greedy steps from a free cell until the goal, and return the path.
 
         The plan is ROLLOUT_TRAPPED as soon as a cell is entered again: the steps would
-        repeat. A start that is no cell of the map is a ValueError. A straight rollout
-        takes, of steps as good as each other, those along the line to the goal: a
-        `DistanceField` has many.
+        repeat. A start that is no cell of the map is a ValueError. `straight` matters
+        to a `DistanceField` alone, see there.
         """
-        policy, steps = self.policy, MOVES.tolist()
+        policy = self.policy  # (H, W): an action, or -1
         cell = cell_inside(start, policy.shape, "the start")
-        cells, visited = [cell], {cell}
+        cells = [cell]
+        visited = {cell}
         while cell != self.goal:
-            action = int(policy[cell[1], cell[0]])
-            cell = (cell[0] + steps[action][0], cell[1] + steps[action][1])
+            x, y = cell
+            action = policy[y, x]
+            dx, dy = MOVES[action].tolist()
+            cell = (x + dx, y + dy)
             if action < 0 or cell in visited:
                 return Plan(PlanStatus.ROLLOUT_TRAPPED, move_rule=self.move_rule)
             visited.add(cell)
@@ -121,7 +123,17 @@ class QField(Field[Known]):
 
 
 class DistanceField(QField):
-    """The Q field that costs of moves give; it grows from its goals as far as a request needs."""
+    """The Q field that costs of moves give; it grows as far as a request needs.
+
+    Parameters
+    ----------
+    goals : tuple of (x, y)
+        Different free cells, sorted; it grows from all of them.
+    grid : GridMap
+    costs : MoveCosts
+        Of the moves on this map.
+    move_rule : MoveRule
+    """
 
     costs: MoveCosts
 
@@ -142,37 +154,46 @@ class DistanceField(QField):
     def _goals_alone(self) -> Known:
         """Return what is known before any growth."""
         cells = self.costs.patch_number.size
-        distance = np.zeros(cells)
+        distance = np.zeros(cells)  # 0: not reached
         mark = np.zeros(cells, np.uint8)
-        roots = np.array([self._number(goal) for goal in self.goals], np.int32)
-        distance[roots] = cell_space.AT_GOAL
-        mark[roots] = wavefront.OPEN
-        return Known(distance, mark, roots)
+        numbers = np.array([self._number(*goal) for goal in self.goals], np.int32)
+        distance[numbers] = cell_space.AT_GOAL
+        mark[numbers] = wavefront.OPEN
+        return Known(distance, mark, opened=numbers)
 
-    def _number(self, cell: Any) -> Any:
-        """Return the number of a cell on the padded map; of many, if x and y are arrays."""
-        return (cell[1] + 1) * self.costs.width + cell[0] + 1
+    def _number(self, x: Any, y: Any) -> Any:
+        """Return the number of a cell on the padded map; of many cells for arrays."""
+        return (y + 1) * self.costs.width + x + 1
 
     def grow(self, start: Cell | None = None, limit: int = 2**62) -> bool:
-        """Compute all of the field, or what a start needs; return if so many visits were enough."""
-        number = 0 if start is None else self._number(start)
+        """Grow until a start's distance is known; without a start, over all of the map.
+
+        Visit about `limit` cells at most. Return whether that was enough.
+        """
+        # No path reaches cell 0, of the border: toward it, all of the map is visited.
+        number = 0 if start is None else self._number(*start)
         with self._lock:
-            done = _is_final(self.known, number)
-            if not done:
-                self._known, done = cell_space.grow(
+            is_enough = _is_final(self.known, number)
+            if not is_enough:
+                self._known, is_enough = cell_space.grow(
                     self._take_known(), self.costs, number, limit
                 )
-        return done
+        return is_enough
 
     def is_known(self, start: Cell) -> bool:
-        """Return whether no more of the field is needed for the rollout from a start."""
+        """Return whether the field is grown as far as a rollout from a start needs."""
         known = self._known  # None while another thread computes it
-        return known is not None and _is_final(known, self._number(start))
+        return known is not None and _is_final(known, self._number(*start))
 
     def rollout(self, start: Cell, straight: bool = False) -> Plan:
-        """Return the path; there is none only if there is no way to the goal."""
+        """Grow toward a start and return the path of greedy steps from there to a goal.
+
+        It is empty only if no path leads to a goal. Of steps that are as good as each
+        other, it takes those nearest to the line from the start: to the goal if
+        `straight`, else in no direction, so that the first action counts.
+        """
         start = cell_inside(start, self.grid.occupancy.shape, "the start")
-        number = self._number(start)
+        number = self._number(*start)
         toward_x, toward_y = self.goal if straight else start
         with self._lock:
             self.grow(start)
@@ -205,42 +226,50 @@ class DistanceField(QField):
         """
         if changed is None:
             return False
-        to_judge = self._numbers_around(changed)
-        # For one start, repair and new field take turns, each time with four times the
-        # limit: the quicker one wins. The older field then begins anew; or it stays as
-        # it is.
+        cells_to_judge = self._numbers_around(changed)
+        # For one start, a repair of at most `limit` cells and the growth of this field
+        # take turns, each time with four times the limit: the quicker one wins. If that
+        # is the growth, the older field gets back what it knows.
         most_repaired = max(REPAIRED, int(REPAIRED_SHARE * self.grid.occupancy.size))
         limit = most_repaired if start is None else REPAIRED
         with older._lock:
             # A repair may look at any cell, also where the older field read no rows.
             self.costs.read_rows(0, self.grid.height)
             known = older._take_known()
-            repaired = cell_space.take_back(known, self.costs, to_judge, limit)
+            repaired = cell_space.take_back(known, self.costs, cells_to_judge, limit)
             while repaired is None:
                 limit *= 4
                 is_repair_slower = start is None or limit > most_repaired
                 if is_repair_slower or self.grow(start, VISITS * limit):
                     older._known = known
                     return True
-                repaired = cell_space.take_back(known, self.costs, to_judge, limit)
+                repaired = cell_space.take_back(
+                    known, self.costs, cells_to_judge, limit
+                )
             self._known = repaired
         return True
 
     def _numbers_around(self, cells: NDArray[np.int64]) -> NDArray[np.int32]:
         """Return the numbers of some cells (N, 2) and of their neighbours, sorted.
 
-        Moves of the neighbours may differ, too. On the map's border there are none.
+        Moves from the neighbours may have changed, too. Numbers in the first and the
+        last row of the padded map, where there are no moves, are left out.
         """
         width = self.costs.width
+        steps = np.arange(-1, 2)
+        offsets = (steps[:, None] * width + steps).reshape(9, 1)
+        x, y = cells.T
+        numbers = (offsets + self._number(x, y)).astype(np.int32)  # (9, N)
         end = self.costs.patch_number.size - width - 1
-        offsets = (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel()  # (9,)
-        numbers = (offsets[:, None] + self._number(cells.T)).astype(np.int32)  # (9, N)
         inside = np.sort(numbers[(numbers > width) & (numbers < end)])
         is_new = np.diff(inside, prepend=0) > 0  # a fifth of the time of `np.unique`
         return inside[is_new]
 
     def _layer(self, write: Callable[..., None], layer: NDArray[Any]) -> NDArray[Any]:
-        """Return what a kernel writes for each cell of the whole field: (..., H, W)."""
+        """Return a layer (..., H, W) of the whole field.
+
+        A kernel writes it to `layer` (..., C), the C cells of the padded map.
+        """
         with self._lock:
             self.grow()
             write(self.known.distance, layer, step_costs(self.costs))
@@ -248,7 +277,7 @@ class DistanceField(QField):
 
     @cached_property
     def q(self) -> NDArray[np.float32]:  # type: ignore[override]
-        """(8, H, W) float32: Q(s, a); -inf where no path to the goal begins with the action."""
+        """(8, H, W) float32: Q(s, a); -inf if no path begins with a in s."""
         return self._layer(
             cell_space.write_q,
             np.full((8, self.costs.patch_number.size), -np.inf, np.float32),
@@ -261,7 +290,7 @@ class DistanceField(QField):
 
     @cached_property
     def value(self) -> NDArray[np.float32]:
-        """(H, W) float32: the greatest Q of a legal move, and at the goal the greatest of all."""
+        """(H, W) float32: the greatest Q of a legal move; at the goal, of all cells."""
         value = self._layer(
             cell_space.write_value,
             np.full(self.costs.patch_number.size, -np.inf, np.float32),
@@ -287,15 +316,22 @@ class DistanceField(QField):
 
 
 def _is_final(known: Known, number: int) -> bool:
-    """Return whether no more of a field is needed to know the distance of a cell."""
-    closed = known.mark[number] == wavefront.CLOSED
-    return bool(not known.opened.size or (known.closed_is_final and closed))
+    """Return whether the distance of a cell, by its number, is known for good.
+
+    It is also if no path can be found any more.
+    """
+    is_closed = known.mark[number] == wavefront.CLOSED
+    is_whole = known.opened.size == 0
+    return bool(is_whole or (known.closed_is_final and is_closed))
 
 
 def network_field(
     network: QNetwork, grid: GridMap, goal: Cell, move_rule: MoveRule
 ) -> QField:
-    """Return the field of a network that may judge moves wrong, or see the whole map at once."""
+    """Return the field of a network that gives no costs of moves.
+
+    It may judge moves wrong, or see the whole map at once.
+    """
     if isinstance(network, PropagationQNetwork):
         costs = network.believed_costs(grid, move_rule)
         q = DistanceField((goal,), grid, costs, move_rule).q

@@ -38,7 +38,7 @@ class Field(Generic[Known]):
     key: Any = None
     """The goals and whatever else a request must have in common to use the field."""
     map_arrays: Sequence[tuple[int, int]] = ()
-    """The id and the bytes of each array of its map and costs, which fields may share."""
+    """Id and bytes of each array of its map and costs, which fields may share."""
 
     def __init__(self) -> None:
         self._lock = threading.RLock()
@@ -138,7 +138,7 @@ class FieldCache(Generic[AnyField]):
         new_field: Callable[[], AnyField],
         start: Any = None,
     ) -> AnyField:
-        """Return the field with a key on a map: the kept one, a repaired one, or a new one.
+        """Return the field with a key on a map: a kept, a repaired or a new one.
 
         Parameters
         ----------
@@ -166,8 +166,9 @@ class FieldCache(Generic[AnyField]):
     def _repaired_by(self, field: AnyField, start: Any) -> AnyField | None:
         """Let a new field take over what an older one knows; return the older one."""
         older_fields = [older for older in self.kept[::-1] if older.key == field.key]
-        # The place will hardly be again what it was. If the fields used last are on other
-        # maps, so are those before them: with new expected times all are.
+        # A map that changes hardly returns to what it was. If the fields used last are
+        # on maps that cannot be compared, so are those before them: with new expected
+        # times, all are.
         for older in older_fields[:ALWAYS_KEPT]:
             changed = self.changed_cells(older.grid, field.grid)
             if field.take_over(older, changed, start):

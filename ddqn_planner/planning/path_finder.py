@@ -17,9 +17,9 @@ from ddqn_planner.planning.plan import PathRequest, Plan
 AnyPlan = TypeVar("AnyPlan", bound=Plan)
 Request = TypeVar("Request", bound="PathRequest[Any]")
 Result = TypeVar("Result")
-# A part of the flow, a generator: it yields before each slow step, so that whoever runs it
-# may do other work first, and returns its result.
-Finding = Generator[None, None, Result]
+# A part of the flow: a generator that yields None before each slow step, so that
+# whoever iterates `PathFinder.steps` may do other work first, and returns its result.
+PausingGenerator = Generator[None, None, Result]
 
 
 class Clock:
@@ -53,6 +53,7 @@ class Clock:
         return 1e3 * (self._seconds() - self._seconds_of_field)
 
     def _seconds(self) -> float:
+        """Return the time until now, without the pauses."""
         return self._seconds_before + time.perf_counter() - self._began
 
 
@@ -68,22 +69,26 @@ class PathFinder(ABC, Generic[Request, AnyPlan]):
         Last of all, yield the plan.
         """
         clock = Clock()
-        for plan in _with_plan_last(self._answer(request, clock)):
+        for plan_or_none in _with_plan_last(self._answer(request, clock)):
             clock.pause()
-            yield plan
+            yield plan_or_none
             clock.resume()
 
-    def _answer(self, request: Request, clock: Clock) -> Finding[AnyPlan]:
-        """Return the plan; without a path, its reason names unknown space, too."""
+    def _answer(self, request: Request, clock: Clock) -> PausingGenerator[AnyPlan]:
+        """Return the plan of a request.
+
+        If it has no path, and unknown space or the goals tell more than the status, the
+        plan's reason says so.
+        """
         plan = yield from self._find(request, clock)
         has_several_goals = len(request.goals) > 1
         if unknown_space.has_more_to_say(request.grid, plan, has_several_goals):
-            yield
+            yield  # a pause: a slow step follows
             reason = yield from self._reason(request, plan)
             plan = replace(plan, reason=reason)
         return plan
 
-    def _find(self, request: Request, clock: Clock) -> Finding[AnyPlan]:
+    def _find(self, request: Request, clock: Clock) -> PausingGenerator[AnyPlan]:
         """Return the plan, whose reason is its status in words."""
         exploration = request.grid.exploration
         if exploration is None:
@@ -91,14 +96,14 @@ class PathFinder(ABC, Generic[Request, AnyPlan]):
         return (yield from self._explore(request, exploration, clock))
 
     @abstractmethod
-    def _find_on_map(self, request: Request, clock: Clock) -> Finding[AnyPlan]:
+    def _find_on_map(self, request: Request, clock: Clock) -> PausingGenerator[AnyPlan]:
         """Return the plan on a map without an exploration."""
 
     @abstractmethod
     def _explore(
         self, request: Request, exploration: Exploration, clock: Clock
-    ) -> Finding[AnyPlan]:
-        """Return the plan on a map of expected times that comes with more daring maps."""
+    ) -> PausingGenerator[AnyPlan]:
+        """Return the plan on a map of expected times that has an exploration."""
 
     @abstractmethod
     def _reason(self, request: Request, plan: AnyPlan) -> Generator[None, None, str]:
@@ -112,14 +117,16 @@ class PathFinder(ABC, Generic[Request, AnyPlan]):
         """
 
 
-def _with_plan_last(finding: Finding[AnyPlan]) -> Iterator[AnyPlan | None]:
-    """Yield None as a finding does, and then the plan that it returns."""
-    plan = yield from finding
+def _with_plan_last(
+    generator: PausingGenerator[AnyPlan],
+) -> Iterator[AnyPlan | None]:
+    """Yield None for each pause of a generator, and then the plan that it returns."""
+    plan = yield from generator
     yield plan
 
 
 def last_step(steps: Iterator[AnyPlan | None]) -> AnyPlan:
-    """Take all steps that are left of `PathFinder.steps`, and return the plan."""
+    """Run the rest of `PathFinder.steps` without pauses, and return the plan."""
     *_, plan = steps
     assert plan is not None
     return plan

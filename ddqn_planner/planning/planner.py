@@ -61,26 +61,30 @@ class Planner:
 
     @classmethod
     def load(cls, model: str | Path) -> Planner:
-        """Load a shipped model by its name (``"any_map"``), or a model file by its path.
+        """Load a shipped model by its name (``"any_map"``), or a file by its path.
 
         A ModelFileError says that there is none, or why it cannot be used.
         """
         return cls(*load_model(model))
 
     def save(self, path: str | Path) -> None:
-        """Save the model to a file for `load`; after an OSError, an old file is unchanged."""
+        """Save the model to a file for `load`.
+
+        After an OSError, a file that was there is unchanged.
+        """
         save_model(path, self.network, self.metadata)
 
     def q_field(
         self, grid: GridMap, goal: Cell, move_rule: MoveRule | str | None = None
     ) -> QField:
-        """Return the Q field of a map toward a goal, a free cell, computed or from the cache.
+        """Return the Q field of a map toward a goal: a kept, a repaired or a new one.
 
         The move rule is by default the one that the model was trained for. A goal that
         is not free, or a map of a size that the model cannot plan on, is a ValueError.
         """
         check_grid(grid)
-        goal, rule = as_cell(goal, "the goal"), self._rule(move_rule)
+        goal = as_cell(goal, "the goal")
+        rule = self._rule(move_rule)
         if self.pose_planner is not None:
             raise ValueError(
                 f"{HAS_BODY}: there is no Q field of cells; use plan_poses"
@@ -90,11 +94,14 @@ class Planner:
                 f"the goal {goal} is not a free cell of the map; give another"
             )
         if not self.network.supports((grid.height, grid.width)):
-            problem = f"the model was not trained for maps of {grid.width} x {grid.height} cells"
-            raise ValueError(f"{problem}; train one on such a map")
+            size = f"{grid.width} x {grid.height} cells"
+            raise ValueError(
+                f"the model was not trained for maps of {size}; train one on such a map"
+            )
         return self.cell_planner.field(grid, (goal,), rule)
 
     def _rule(self, move_rule: MoveRule | str | None) -> MoveRule:
+        """Return a move rule; for None that of the model."""
         return self.metadata.move_rule if move_rule is None else MoveRule(move_rule)
 
     def plan(
@@ -124,9 +131,9 @@ class Planner:
         simplified : bool
             Whether to leave out cells, see `simplify`.
         start_clearing_radius : float
-            Where the start is an obstacle, those within so many cells of it do not
-            count until the path has reached its first free cell, the nearest one. With
-            0 they count.
+            For a start on an obstacle: obstacles within this distance of the start, in
+            cells, do not count until the path has reached its first free cell. That is
+            the free cell nearest to the start. With 0, all obstacles count.
 
         Returns
         -------
@@ -138,8 +145,8 @@ class Planner:
         Raises
         ------
         ValueError
-            If the tolerance or the radius is negative or NaN, the start or a goal is no
-            pair of whole numbers, or there is no goal or no such move rule or method.
+            If the tolerance or the radius is negative or NaN, the start or the goal is
+            no pair of whole numbers, or there is no such move rule or method.
         """
         return self._answer(
             grid,
@@ -162,7 +169,9 @@ class Planner:
         simplified: bool = False,
         start_clearing_radius: float = 0.0,
     ) -> Plan:
-        """Plan a path to the goal that the cheapest path reaches; `Plan.goal` tells which.
+        """Plan a path to the goal that the cheapest path reaches.
+
+        `Plan.goal` tells which that is.
 
         Goals that are occupied or outside the map are left out. If all are, the status
         says so: GOAL_OCCUPIED if any lies on the map.
@@ -235,7 +244,7 @@ class Planner:
         tolerance: tuple[float, float] = (0.0, 0.0),
         bound: float = 1.2,
     ) -> PosePlan:
-        """Plan a path for a robot with a body and a heading, with a model that learned it.
+        """Plan a path for a robot with a body and a heading, by a model of that robot.
 
         Parameters
         ----------
@@ -267,11 +276,13 @@ class Planner:
             is wrong.
         """
         check_grid(grid)
-        limits = _tolerance_of_poses(tolerance)
-        ratio = as_number("the bound", bound, 1, math.inf, "1 or more")
-        goals = _poses_of_goals(goal)
-        pose = as_pose("the start", start)
-        request = PoseRequest(grid, pose, goals, tolerance=limits, bound=ratio)
+        request = PoseRequest(
+            grid,
+            as_pose("the start", start),
+            _poses_of_goals(goal),
+            tolerance=_tolerance_of_poses(tolerance),
+            bound=as_number("the bound", bound, 1, math.inf, "1 or more"),
+        )
         if self.pose_planner is None:
             raise ValueError(
                 "the model knows no body; give one of ddqn-planner train-robot"
@@ -305,22 +316,22 @@ class Planner:
         simplified: bool,
         start_clearing_radius: float,
     ) -> Plan:
-        """Check the arguments but the goals, which are checked; return the plan."""
+        """Check the arguments and return the plan; the goals are checked already."""
         rule = self._rule(move_rule)
         check_grid(grid)
         if self.pose_planner is not None:
             raise ValueError(f"{HAS_BODY}; use plan_poses, or a planner_node")
-        limits = 0, math.inf, "0 cells or more"
+        at_least_zero = 0, math.inf, "0 cells or more"
         request = PlanRequest(
             grid,
             as_cell(start, "the start"),
             goals,
             move_rule=rule,
             method=PlanMethod(method),
-            tolerance=as_number("the tolerance", tolerance, *limits),
+            tolerance=as_number("the tolerance", tolerance, *at_least_zero),
             simplified=as_flag("simplified", simplified),
             start_clearing_radius=as_number(
-                "start_clearing_radius", start_clearing_radius, *limits
+                "start_clearing_radius", start_clearing_radius, *at_least_zero
             ),
         )
         return last_step(self.cell_planner.steps(request))
@@ -343,15 +354,17 @@ def _tolerance_of_poses(tolerance: Any) -> tuple[float, float]:
 
 
 def _poses_of_goals(goal: Any) -> tuple[Pose, ...]:
-    """Return the poses of one goal, or of several."""
+    """Return the poses of one goal (x, y, yaw), or of a sequence of goals, checked."""
     values = listed(goal, "the goal", "give a pose (x, y, yaw), or several")
     if not values:
         raise ValueError("there is no goal; give at least one pose (x, y, yaw)")
-    is_one = not any(isinstance(value, (Sequence, np.ndarray)) for value in values)
-    return tuple(as_pose("the goal", pose) for pose in ([values] if is_one else values))
+    has_several = any(isinstance(value, (Sequence, np.ndarray)) for value in values)
+    poses = values if has_several else [values]
+    return tuple(as_pose("the goal", pose) for pose in poses)
 
 
 def _cells_of_goals(goals: Sequence[Cell]) -> tuple[Cell, ...]:
+    """Return the cells of one or more goals, checked."""
     numbered = enumerate(listed(goals, "goals"), 1)
     cells = tuple(as_cell(goal, f"goal {number}") for number, goal in numbered)
     if not cells:

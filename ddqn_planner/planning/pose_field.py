@@ -1,4 +1,4 @@
-"""The least costs of poses toward a goal: grown as far as a start needs, with a proved bound."""
+"""The least costs of poses toward a goal: grown as a start needs, proved by a bound."""
 
 from __future__ import annotations
 
@@ -27,20 +27,31 @@ from ddqn_planner.robot.motions import turn_between
 
 NO_RESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)  # not in all versions of Python
 HEAP = 2**18  # entries that a heap has room for, at least
-# Of the cost of the last start: if a repair takes more back, a new field is quicker.
-LOST = 1 / 2
+# Of the cost of the last start: if a repair takes back smaller costs, too, then a new
+# field is quicker.
+KEPT_SHARE = 1 / 2
 UNGUIDED = 2**14  # states that are visited before a look at the map pays
-FINEST = 1  # the shift of the smallest tiles that it looks at
-NOWHERE = Aim(0, 0, -1, 1.0, np.empty((0, 0), np.float32), SHIFT + 1)
+FINEST_SHIFT = 1  # of the smallest tiles that the look uses
+NO_STATE = -1
+# An aim at no start, before the first look, which is at tiles of 2**SHIFT cells a side.
+NOWHERE = Aim(
+    x=0,
+    y=0,
+    number=NO_STATE,
+    weight=1.0,
+    remaining=np.empty((0, 0), np.float32),
+    shift=SHIFT + 1,
+)
 ALL_STATES = 2**62  # no map has so many
 # A bound that each path keeps: a greater one would make the weight infinite.
 ANY_PATH = 1e6
-GREEDY = 1.5  # the first round's weight is the bound to the power of this: mostly that will do
+# The first round's weight is the bound to the power of this: mostly one round will do.
+GREEDY_EXPONENT = 1.5
 
 
 def _untouched(count: int, dtype: DTypeLike) -> NDArray[Any]:
-    """Return zeros, in memory that is used where it is touched."""
-    # Pages of 4 KiB: NumPy would ask for larger ones.
+    """Return `count` zeros, in memory that is used only where it is touched."""
+    # In pages of 4 KiB: NumPy would ask for larger ones, which waste more.
     size = count * np.dtype(dtype).itemsize
     flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | NO_RESERVE
     memory = mmap.mmap(-1, size, flags=flags)
@@ -104,7 +115,7 @@ class PoseField(Field[Search]):
         return 5 * self.world.tile.size << pose_space.TILE_BITS
 
     def reach(self, start: State, bound: float, limit: int) -> float | None:
-        """Grow until the cost from a start is known within a bound, or known not to exist.
+        """Grow until the cost from a start is known within a bound, or to be none.
 
         Parameters
         ----------
@@ -138,7 +149,7 @@ class PoseField(Field[Search]):
             return self._proved_bound()
 
     def _aim_at(self, start: State, bound: float) -> None:
-        """Begin the first round toward a start, unless it is the start of before."""
+        """Begin the first round toward a start, unless the field aims at it already."""
         aim = self.known.aim
         number = int(pose_space.number_of(*start, self.world))
         if number == aim.number:
@@ -148,7 +159,9 @@ class PoseField(Field[Search]):
         if (x, y) != (aim.x, aim.y):
             aim = NOWHERE
         self.visits = 0
-        self._begin_round(aim._replace(x=x, y=y, number=number, weight=bound**GREEDY))
+        self._begin_round(
+            aim._replace(x=x, y=y, number=number, weight=bound**GREEDY_EXPONENT)
+        )
 
     def _begin_round(self, aim: Aim) -> None:
         """Queue all states that are open or wait, in the order toward an aim."""
@@ -159,24 +172,28 @@ class PoseField(Field[Search]):
         self._least_cost = pose_space.order(search, tiles)
 
     def _is_enough(self, bound: float) -> bool:
-        """Return whether a bound is proved, or no path from the start is left to find."""
+        """Return whether a bound is proved, or that no path leads from the start."""
         return self._proved_bound() <= bound * SAME or self._least_cost == math.inf
 
     def _should_look_at_map(self) -> bool:
-        """Return whether to look at the map's tiles for a better lower bound, now.
+        """Return whether to look at the map's tiles now, for a better lower bound.
 
-        Tiles of half the size take 4 times as long, and show that narrower gaps are
-        closed. Once a path is known, they hardly prove more.
+        The next look is at tiles of half the side of those before: it takes 4 times as
+        long, and shows that narrower gaps are closed. So 8 times as many states must
+        have been visited before, and once a path is known, only the first look pays.
         """
         shift = self.known.aim.shift - 1
         has_paid = self.visits >= UNGUIDED << 3 * (SHIFT - shift)
         if shift == SHIFT:
             return has_paid
         has_no_path = self._proved_bound() == math.inf
-        return has_paid and shift >= FINEST and has_no_path
+        return has_paid and shift >= FINEST_SHIFT and has_no_path
 
     def _visit(self, bound: float, most_visits: int) -> int:
-        """Visit states, at most so many; return how many. A round may end, and the next begin."""
+        """Close states in the order of the round, at most so many; return how many.
+
+        If the round ends and the bound is not proved, begin the next round.
+        """
         search = self.known
         aim = search.aim
         # The rounds of weighted A* end when the start's cost is the least key, the last
@@ -207,9 +224,11 @@ class PoseField(Field[Search]):
         return cost / self._least_cost if self._least_cost > 0 else math.inf
 
     def _can_leave(self) -> bool:
-        """Return whether primitives lead from the start to more than a few states."""
+        """Return whether primitives lead from the start to `UNGUIDED` states."""
         search = self.known
-        mark = _untouched(search.mark.size, np.uint8)
+        mark = _untouched(
+            search.mark.size, np.uint8
+        )  # its own: of states from the start
         queue = np.empty(UNGUIDED, np.int64)
         count = pose_space.leads_to(search.aim.number, mark, queue, self.world)
         return bool(count == queue.size)
@@ -232,7 +251,7 @@ class PoseField(Field[Search]):
         is_goal = np.zeros(remaining.shape, np.bool_)
         is_goal[goal_y, goal_x] = True
         box = np.array([goal_x.min(), goal_y.min(), goal_x.max(), goal_y.max()])
-        # First the 4 corners of the start's tile; then each opens its 8 neighbours once.
+        # The 4 corners of the start's tile; and each opens its 8 neighbours once.
         heap = make_heap(4 + 8 * remaining.size)
         search = self.known._replace(aim=aim_with_look, heap=heap)
         pose_space.look(search, room, is_goal, box)  # writes `remaining`
@@ -270,44 +289,49 @@ class PoseField(Field[Search]):
     ) -> bool:
         """Repair what an older field knows and take it, see `Field.take_over`.
 
-        The cache forgets the older field always: it takes much memory.
+        The cache always forgets the older field, as that takes much memory.
         """
         if changed is None:
             return True
-        occupied = occupied_for_body(self.grid)
-        has_opened = not occupied[changed[:, 1], changed[:, 0]].all()
         with older._lock:
-            search = older._take_known()._replace(world=self.world)
-            cost = _cost_from_start(search)
-            self._least_cost = min(older._least_cost, cost)
-            tiles = np.flatnonzero(search.touched)
-            is_near = self._tiles_near(changed)
-            near_tiles = np.flatnonzero(is_near.ravel() & search.touched)
-            room = len(tiles) << pose_space.TILE_BITS
-            # A path may have become cheaper where a cell is free: then the lower bounds
-            # are void. Otherwise what is open stays in order, and `_least_cost` a lower
-            # bound.
-            if has_opened:
-                search = search._replace(aim=NOWHERE, heap=make_heap(room))
-            elif search.heap.size[0] + room > search.heap.keys.size:
-                aim = search.aim._replace(number=-1)
-                search = search._replace(aim=aim, heap=make_heap(room))
-            cost_to_keep = LOST * cost if cost < math.inf else 0.0
-            unsupported_cost = pose_space.least_unsupported(search, near_tiles)
-            if unsupported_cost < cost_to_keep:
-                aim = search.aim._replace(number=-1)
-                search = self._goals_alone()._replace(aim=aim)
-            else:
-                if unsupported_cost < math.inf:
-                    pose_space.take_back(search, tiles, unsupported_cost)
-                if has_opened:  # states beside the cells are visited again
-                    mark = search.mark.reshape(self.world.tile.size, -1)
-                    mark[near_tiles] = np.minimum(mark[near_tiles], wavefront.OPEN)
-            self._known = search
+            search = older._take_known()
+            self._least_cost = min(older._least_cost, _cost_from_start(search))
+            self._known = self._repaired(search._replace(world=self.world), changed)
         return True
 
+    def _repaired(self, search: Search, changed: NDArray[np.int64]) -> Search:
+        """Return what was known before cells (N, 2) changed, repaired in place.
+
+        Where too much would be lost, return the goals alone, with the look at the map
+        if that holds still.
+        """
+        cost = _cost_from_start(search)
+        tiles = np.flatnonzero(search.touched)
+        is_near = self._tiles_near(changed)
+        near_tiles = np.flatnonzero(is_near.ravel() & search.touched)
+        most_opened = len(tiles) << pose_space.TILE_BITS  # states that a repair opens
+        occupied = occupied_for_body(self.grid)
+        has_freed_cell = not occupied[changed[:, 1], changed[:, 0]].all()
+        # A path may have become cheaper where a cell is free: then the lower bounds are
+        # void. Otherwise what is open stays in order, and `_least_cost` a lower bound.
+        if has_freed_cell:
+            search = search._replace(aim=NOWHERE, heap=make_heap(most_opened))
+        elif search.heap.size[0] + most_opened > search.heap.keys.size:
+            aim = search.aim._replace(number=NO_STATE)  # so that a new round begins
+            search = search._replace(aim=aim, heap=make_heap(most_opened))
+        unsupported_cost = pose_space.least_unsupported(search, near_tiles)
+        if cost < math.inf and unsupported_cost < KEPT_SHARE * cost:
+            aim = search.aim._replace(number=NO_STATE)
+            return self._goals_alone()._replace(aim=aim)
+        if unsupported_cost < math.inf:
+            pose_space.take_back(search, tiles, unsupported_cost)
+        if has_freed_cell:  # states near the cells are visited again
+            mark = search.mark.reshape(self.world.tile.size, -1)
+            mark[near_tiles] = np.minimum(mark[near_tiles], wavefront.OPEN)
+        return search
+
     def _tiles_near(self, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which tiles primitives may leave that sweep some cells (N, 2)."""
+        """Return from which tiles (R, C) primitives may sweep some cells (N, 2)."""
         is_near = np.zeros(self.world.tile.shape, np.bool_)
         reach = self.world.body.reach // TILE + 1  # tiles
         columns, rows = (cells // TILE).T.tolist()
@@ -319,7 +343,7 @@ class PoseField(Field[Search]):
 
 
 def _cost_from_start(search: Search) -> float:
-    """Return the least cost that was found from the aimed start, infinite without a path."""
+    """Return the least cost found from the aim's start; infinite without a path."""
     number = search.aim.number
     if number < 0 or search.mark[number] == wavefront.UNREACHED:
         return math.inf

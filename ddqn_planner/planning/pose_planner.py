@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from ddqn_planner.grid.inflation import with_unknown_free
 from ddqn_planner.planning import pose_paths as paths
 from ddqn_planner.planning import unknown_space
 from ddqn_planner.planning.field_cache import FieldCache
-from ddqn_planner.planning.path_finder import Clock, Finding, PathFinder
+from ddqn_planner.planning.path_finder import Clock, PathFinder, PausingGenerator
 from ddqn_planner.planning.plan import (
     ROUNDING,
     PlanStatus,
@@ -71,15 +70,17 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
 
     def _explore(
         self, request: PoseRequest, exploration: Exploration, clock: Clock
-    ) -> Finding[PosePlan]:
-        """Return the plan on the safe map, with the cost on the map of expected times."""
+    ) -> PausingGenerator[PosePlan]:
+        """Return the plan on the safe map, with the expected cost of its path."""
         safe_request = replace(request, grid=exploration.safe)
         plan = yield from self._find_on_map(safe_request, clock)
         if len(plan.poses) < 2:
             return plan
         return _with_expected_cost(plan, request.grid, exploration.safe)
 
-    def _find_on_map(self, request: PoseRequest, clock: Clock) -> Finding[PosePlan]:
+    def _find_on_map(
+        self, request: PoseRequest, clock: Clock
+    ) -> PausingGenerator[PosePlan]:
         """Return the plan on a map without an exploration."""
         plan = self._from_last_path(request)
         if plan is None:
@@ -94,27 +95,35 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
 
     def _from_grown_field(
         self, request: PoseRequest, clock: Clock
-    ) -> Finding[PosePlan]:
-        """Return the plan by a field that is grown as far as the start."""
+    ) -> PausingGenerator[PosePlan]:
+        """Return the plan by a field that is grown as far as the start.
+
+        First to the goals themselves; without a path to these, and if the request has a
+        tolerance, to the states around its goal.
+        """
         grid = request.grid
-        self._check(grid)
-        is_start_inside, *inside = (grid.contains(cell) for cell in request.cells)
-        if not any(inside):
+        self._check_resolution(grid)
+        start_cell, *goal_cells = request.cells
+        goals = [
+            goal
+            for goal, cell in zip(request.goals, goal_cells, strict=True)
+            if grid.contains(cell)
+        ]
+        if not goals:
             return PosePlan(PlanStatus.GOAL_OUTSIDE_MAP)
-        if not is_start_inside:
+        if not grid.contains(start_cell):
             return PosePlan(PlanStatus.START_OUTSIDE_MAP)
-        yield
+        yield  # a pause: a slow step follows
         world = self._world(grid)
-        starts = self._at(grid, request.start, world)
-        if not len(starts):
+        start = self._state_at(grid, request.start, world)
+        if start is None:
             return PosePlan(PlanStatus.START_OCCUPIED)
-        start: State = tuple(starts[0].tolist())
-        goals = compress(request.goals, inside)
-        states = np.concatenate([self._at(grid, goal, world) for goal in goals])
-        plan = yield from self._to_states(request, states, start, clock)
-        if plan.poses.size or not any(request.tolerance):
+        goal_states = self._states_at(grid, goals, world)
+        plan = yield from self._to_states(request, goal_states, start, clock)
+        has_path = plan.status is PlanStatus.SUCCEEDED
+        if has_path or not any(request.tolerance):
             return plan
-        states_around = self._around(request, start, world)
+        states_around = self._states_around_goal(request, start, world)
         if not len(states_around):
             return plan
         return (yield from self._to_states(request, states_around, start, clock))
@@ -125,8 +134,11 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         states: NDArray[np.int64],
         start: State,
         clock: Clock,
-    ) -> Finding[PosePlan]:
-        """Return the plan from a start to the nearest of some states."""
+    ) -> PausingGenerator[PosePlan]:
+        """Return the plan from a start to the nearest of some states (N, 3).
+
+        N may be 0: then the goal is occupied.
+        """
         if not len(states):
             return PosePlan(PlanStatus.GOAL_OCCUPIED)
         grid = request.grid
@@ -136,7 +148,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         )
         bound = field.reach(start, request.bound, VISITS)
         while bound is None:
-            yield
+            yield  # a pause: a slow step follows
             bound = field.reach(start, request.bound, VISITS)
         clock.end_field()
         if bound == math.inf:
@@ -144,7 +156,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         plan = field.rollout(start, request.bound).plan(0, grid)
         return replace(plan, field_ms=clock.field_ms, rollout_ms=clock.rollout_ms)
 
-    def _reason(self, request: PoseRequest, plan: PosePlan) -> Finding[str]:
+    def _reason(self, request: PoseRequest, plan: PosePlan) -> PausingGenerator[str]:
         """Return why there is no path, in words."""
         status: str = plan.status.value
         start_cell, *goal_cells = request.cells
@@ -152,28 +164,27 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
             outside = [unknown_space.OUTSIDE] * len(goal_cells)
             return unknown_space.reason_of_goals(outside, "")
         free_grid = with_unknown_free(request.grid)
-        possible = world_of(free_grid, self.body)
-        starts = self._at(free_grid, request.start, possible)
-        has_start = len(starts) > 0
+        free_world = world_of(free_grid, self.body)
+        start = self._state_at(free_grid, request.start, free_world)
         has_several_goals = len(request.goals) > 1
         if plan.status is PlanStatus.START_OCCUPIED:
-            if not has_start:
+            if start is None:
                 return status
-            place = self._place(request, start_cell)
+            place = self._place_in_words(request, start_cell)
             return f"the start {place}; {unknown_space.REMEDY}"
-        if not has_start and not has_several_goals:
+        if start is None and not has_several_goals:
             return status
         places = [
-            self._goal_in_words(request, goal, possible) for goal in request.goals
+            self._goal_in_words(request, goal, free_grid, free_world)
+            for goal in request.goals
         ]
-        reason_of_places = _reason_of_places(places, request.grid, has_start)
-        if reason_of_places:
+        reason_of_places = _reason_of_places(places, request.grid, start is not None)
+        if reason_of_places or start is None:
             return reason_of_places
-        start: State = tuple(starts[0].tolist())
-        states = self._ends_with_room(request, places, start, free_grid, possible)
+        states = self._ends_with_room(request, places, start, free_grid, free_world)
         if not len(states):
             return status
-        field = PoseField(states, free_grid, possible)
+        field = PoseField(states, free_grid, free_world)
         through = yield from self._through_unknown_space(field, start)
         if has_several_goals:
             return unknown_space.reason_of_goals(places, through)
@@ -187,25 +198,27 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         places: Sequence[str],
         start: State,
         free_grid: GridMap,
-        possible: World,
+        free_world: World,
     ) -> NDArray[np.int64]:
         """Return the states (N, 3) in which a path may end if unknown cells are free.
 
-        `places` says of each goal why no path can end there, empty where the body has
-        room: of several goals, those with room count.
+        Of several goals, those count in which a path may end on the map as it is, if
+        there are any: their words in `places` are empty, see `_goal_in_words`.
         """
         if any(request.tolerance):
-            return self._around(replace(request, grid=free_grid), start, possible)
-        goals = [
+            free_request = replace(request, grid=free_grid)
+            return self._states_around_goal(free_request, start, free_world)
+        goals_with_room = [
             goal for goal, place in zip(request.goals, places, strict=True) if not place
         ]
-        goals = goals or [*request.goals]
-        return np.concatenate([self._at(free_grid, goal, possible) for goal in goals])
+        return self._states_at(free_grid, goals_with_room or request.goals, free_world)
 
-    def _through_unknown_space(self, field: PoseField, start: State) -> Finding[str]:
-        """Return words if a path leads through unknown space, or may.
+    def _through_unknown_space(
+        self, field: PoseField, start: State
+    ) -> PausingGenerator[str]:
+        """Return words that say that a path leads through unknown space, or may.
 
-        They are empty if none does.
+        They are empty if no path does. In the field, unknown cells are free.
         """
         for _ in range(MOST_STEPS_OF_REASON):
             bound = field.reach(start, BOUND_OF_REASON, VISITS)
@@ -213,27 +226,29 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
                 return ""
             if bound is not None:
                 return unknown_space.THROUGH_UNKNOWN_SPACE
-            yield
+            yield  # a pause: a slow step follows
         return unknown_space.MAYBE_THROUGH_UNKNOWN_SPACE
 
-    def _goal_in_words(self, request: PoseRequest, goal: Pose, possible: World) -> str:
-        """Return why no path can end at a pose; empty if the body has room there.
+    def _goal_in_words(
+        self, request: PoseRequest, goal: Pose, free_grid: GridMap, free_world: World
+    ) -> str:
+        """Return why no path can end at a goal; empty if the body has room there.
 
-        `possible` is the world whose unknown cells are free.
+        `free_grid` is the map of the request with unknown cells free, and `free_world`
+        the body on it.
         """
         grid = request.grid
         cell = grid.world_to_cell(*goal[:2])
         if not grid.contains(cell):
             return unknown_space.OUTSIDE
-        world = self._world(grid)
-        if len(self._at(grid, goal, world)):
+        if self._state_at(grid, goal, self._world(grid)) is not None:
             return ""
-        if len(self._at(with_unknown_free(grid), goal, possible)):
-            return self._place(request, cell)
+        if self._state_at(free_grid, goal, free_world) is not None:
+            return self._place_in_words(request, cell)
         return unknown_space.OCCUPIED
 
-    def _place(self, request: PoseRequest, cell: Cell) -> str:
-        """Return how a pose lies in whose cell the body touches unknown space."""
+    def _place_in_words(self, request: PoseRequest, cell: Cell) -> str:
+        """Return how a cell lies in which the body touches unknown space."""
         x, y = cell
         unknown = request.grid.unknown
         if unknown is not None and unknown[y, x]:
@@ -251,49 +266,59 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         grid: GridMap,
         reach: tuple[float, float] = paths.REACH,
     ) -> NDArray[np.float64]:
-        """Return a path from the pose nearest to a robot on, (N, 3).
+        """Return the rest of a path, from the pose nearest to the robot on, (N, 3).
 
-        It is empty if the robot is too far from it, or the body has no room along it.
+        It is empty if the robot is too far from the path, or if the body has no room
+        along the rest.
+
+        Parameters
+        ----------
+        path : (M, 3) or empty
+            Metres and radians, in the map frame.
+        robot : (x, y, yaw)
+            Likewise.
+        grid : GridMap
+        reach : (float, float)
+            Cells and radians by which the robot may be beside the path.
         """
         poses: NDArray[np.float64] = np.asarray(path, dtype=np.float64).reshape(-1, 3)
         first = paths.nearest_pose(poses, robot, grid, reach)
-        if first < 0 or not paths.is_free(poses[first:], grid, self.points):
+        is_too_far = first < 0
+        if is_too_far or not paths.is_free(poses[first:], grid, self.points):
             return poses[:0]
         return poses[first:]
 
     def _keep_or_switch(self, request: PoseRequest, plan: PosePlan) -> PosePlan:
-        """Return the rest of the path under way if it hardly costs more than a plan.
+        """Return the plan along the rest of the path under way, or the new plan.
 
-        Or return that plan.
+        The rest is taken if it ends where the new plan does, or at a goal, and hardly
+        costs more; also if the new plan has no path.
         """
         grid = request.grid
-        has_plan = plan.poses.size > 0
-        rest = self.rest_of(
-            request.under_way,
-            request.start,
-            grid,
-            paths.REACH if has_plan else BESIDE_PATH,
-        )
+        has_path = plan.poses.size > 0
+        reach = paths.REACH if has_path else BESIDE_PATH
+        rest = self.rest_of(request.under_way, request.start, grid, reach)
         if not len(rest):
             return plan
         ends = np.array([*plan.poses[-1:], *request.goals])
-        if paths.nearest_pose(ends, rest[-1], grid, SAME_END) < 0:
+        is_other_end = paths.nearest_pose(ends, rest[-1], grid, SAME_END) < 0
+        if is_other_end:
             return plan
-        cost = paths.cost_of_poses(rest, grid)
-        least_cost = 0.0  # without a plan nothing is proved
+        rest_cost = paths.cost_of_poses(rest, grid)  # in cells, as all costs here
+        least_cost = 0.0  # without a new path nothing is proved
         ratio = 1.0
-        if has_plan:
+        if has_path:
             new_cost = paths.cost_of_poses(plan.poses, grid)
-            if not request.keeps(cost, new_cost):
+            if not request.keeps(rest_cost, new_cost):
                 return plan
             if new_cost:
-                ratio = cost / new_cost
+                ratio = rest_cost / new_cost
             # The costs of poses are nearly those of primitives: their ratio counts.
             cost_of_plan = (plan.cost or 0.0) / (grid.seconds_per_cell or 1.0)
-            cost = ratio * cost_of_plan
+            rest_cost = ratio * cost_of_plan
             least_cost = cost_of_plan / plan.bound
         cells = paths.cells_of(paths.in_cells(rest, grid))
-        costs = np.linspace(0, cost, len(rest))
+        costs = np.linspace(0, rest_cost, len(rest))
         return replace(
             paths.PosePath(rest, cells, costs, least_cost).plan(0, grid),
             extra_cost=ratio - 1,
@@ -301,7 +326,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
             rollout_ms=plan.rollout_ms,
         )
 
-    def _check(self, grid: GridMap) -> None:
+    def _check_resolution(self, grid: GridMap) -> None:
         """Raise a ValueError if the robot learned cells of another size."""
         learned = self.motions.resolution
         resolution = grid.resolution
@@ -312,30 +337,42 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
                 f" train-robot with --resolution {resolution:g}"
             )
 
-    def _at(self, grid: GridMap, pose: Pose, world: World) -> NDArray[np.int64]:
-        """Return the state (1, 3) of a pose; (0, 3) if the body has no room.
+    def _state_at(self, grid: GridMap, pose: Pose, world: World) -> State | None:
+        """Return the state of a pose (metres and radians) on a map; None without room.
 
-        Of the two nearest headings, it is the nearer one with room.
+        Of the two headings nearest to the yaw, it has the nearer one with room for the
+        body.
         """
         x, y, yaw = pose
-        turn = np.abs(turn_between(self.motions.angles, yaw - grid.origin[2]))
+        turn = np.abs(turn_between(self.motions.angles, yaw - grid.origin[2]))  # (16,)
         nearest_headings = np.argsort(turn, kind="stable")[:2]
-        column, line = grid.world_to_cell(x, y)
-        states = np.array([(column, line, heading) for heading in nearest_headings])
-        count = standing(states, world)
-        return states[: min(count, 1)]
+        column, row = grid.world_to_cell(x, y)
+        states = np.array([(column, row, heading) for heading in nearest_headings])
+        count = standing(states, world)  # moves those with room to the front
+        return tuple(states[0].tolist()) if count else None
 
-    def _around(
+    def _states_at(
+        self, grid: GridMap, poses: Iterable[Pose], world: World
+    ) -> NDArray[np.int64]:
+        """Return the states (N, 3) of those poses in which the body has room."""
+        states = [self._state_at(grid, pose, world) for pose in poses]
+        with_room = [state for state in states if state is not None]
+        return np.array(with_room, dtype=np.int64).reshape(-1, 3)
+
+    def _states_around_goal(
         self, request: PoseRequest, start: State, world: World
     ) -> NDArray[np.int64]:
-        """Return the states (N, 3) within the goal's tolerance where a path may end."""
+        """Return the states (N, 3) within the goal's tolerance in which a path may end.
+
+        It is the start alone if that lies there. The body has room in all of them.
+        """
         grid = request.grid
         metres, radians = request.tolerance
         x, y, yaw = request.goals[0]
         goal_column, goal_row = grid.world_to_cell(x, y)
         radius = metres * ROUNDING / grid.resolution  # cells
         turn = np.abs(turn_between(self.motions.angles, yaw - grid.origin[2]))
-        may_end = turn <= max(radians * ROUNDING, turn.min())  # (16,)
+        may_end = turn <= max(radians * ROUNDING, turn.min())  # (16,): by heading
         start_column, start_row, start_heading = start
         start_distance = math.hypot(start_column - goal_column, start_row - goal_row)
         if may_end[start_heading] and start_distance <= radius:
@@ -356,13 +393,15 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
     def _least_distance_of_ends(
         self, may_end: NDArray[np.bool_], radius: float
     ) -> NDArray[np.float64]:
-        """Return how far from a goal a path may end at least, by the heading: (16,).
+        """Return beyond which distance from a goal paths end, by heading: (16,), cells.
 
-        A path ends where it first may: states further inside the radius are reached
-        through such an end, if all primitives that lead there begin with a heading in
-        which a path may end. Nowhere, in a heading in which no path may end.
+        A path ends as soon as it may. If all primitives that lead to a heading begin in
+        headings in which a path may end, then no path gets further inside the radius
+        (cells) than the longest of these primitives is. `may_end` (16,) tells in which
+        headings a path may end.
         """
         motions = self.motions
+        # -1: at any distance, also 0. With the radius itself: nowhere.
         least_distance = np.where(may_end, -1.0, radius)
         for heading in np.flatnonzero(may_end):
             leads_there = motions.end == heading
@@ -372,7 +411,11 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         return least_distance
 
     def _from_last_path(self, request: PoseRequest) -> PosePlan | None:
-        """Return the rest of a path that was planned before, with the start on it."""
+        """Return the rest of a path that was planned before, if the start lies on it.
+
+        The path led to the same goals on the same map, and the bound that is proved of
+        its rest is no greater than the bound of the request. Else return None.
+        """
         for field in self.fields.kept:
             path = field.path
             goals, tolerance, _ = field.key
@@ -391,7 +434,10 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         return None
 
     def _world(self, grid: GridMap) -> World:
-        """Return a map for kernels, from the last one where that is quicker."""
+        """Return the body on a map, made from the last world where that is quicker.
+
+        It becomes the last one.
+        """
         older_world = None
         changed = None
         if self._map is not None:
@@ -405,7 +451,11 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
 def _with_expected_cost(
     plan: PosePlan, expected: GridMap, planned: GridMap
 ) -> PosePlan:
-    """Return a plan with the cost on the map of expected times, not that of its map."""
+    """Return a plan with the cost that it has on the map of expected times.
+
+    Its cost was computed from primitives on the map on which it was `planned`. It is
+    multiplied by the ratio of both costs of its poses, which are nearly the same.
+    """
     expected_cost = paths.cost_of_poses(plan.poses, expected)
     expected_seconds = expected_cost * (expected.seconds_per_cell or 1.0)
     planned_cost = paths.cost_of_poses(plan.poses, planned)
@@ -416,7 +466,16 @@ def _with_expected_cost(
 def _reason_of_places(places: Sequence[str], grid: GridMap, has_start: bool) -> str:
     """Return why there is no path, if the places of the goals tell.
 
-    It is empty if a search has to tell whether a path leads through unknown space.
+    It is empty if a search has to tell whether a path leads through unknown space, or
+    for one goal if there is nothing to add to the status.
+
+    Parameters
+    ----------
+    places : sequence of str
+        Why no path can end at each goal, empty if the body has room there.
+    grid : GridMap
+    has_start : bool
+        Whether the body has room at the start, at least if unknown cells are free.
     """
     if len(places) == 1:
         place = places[0]

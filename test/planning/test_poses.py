@@ -73,6 +73,11 @@ def plan(
     return last_step(planner.steps(PoseRequest(grid, start, goals, **how)))
 
 
+def state_at(planner: PosePlanner, grid: GridMap, pose: Pose) -> Any:
+    """The state of a pose, or None where the body has no room."""
+    return planner._state_at(grid, pose, planner._world(grid))
+
+
 def last_field(planner: PosePlanner) -> pose_field.PoseField:
     return planner.fields.kept[-1]
 
@@ -120,7 +125,7 @@ def test_plans_cost_the_least_within_their_bound_also_after_repairs(
     body = planner(motion)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            pose_field, "LOST", 0
+            pose_field, "KEPT_SHARE", 0
         )  # it is repaired, however much is taken back
         if guided:
             patch.setattr(pose_field, "UNGUIDED", 16)
@@ -286,7 +291,7 @@ def test_what_was_far_from_obstacles_is_looked_at_again_when_one_comes(
     unguided: int, monkeypatch: Any
 ) -> None:
     monkeypatch.setattr(pose_field, "UNGUIDED", unguided)
-    monkeypatch.setattr(pose_field, "LOST", 0)
+    monkeypatch.setattr(pose_field, "KEPT_SHARE", 0)
     occupancy = np.zeros((160, 260), np.bool_)
     occupancy[[50, 90], 60:160] = True  # a lane, which a block closes on its left
     grid = GridMap(occupancy, CELL)
@@ -384,9 +389,7 @@ def test_a_concave_body_or_one_beside_its_origin_takes_the_cheapest_free_path(
     )
     body = planner(motion, FORMS[form])
     states = random.integers((width, height, 16), size=(60, 3)).tolist()
-    free = [
-        s for s in states if len(body._at(grid, pose_of(grid, s), body._world(grid)))
-    ]
+    free = [state for state in states if state_at(body, grid, pose_of(grid, state))]
     shape = shapely.Polygon(read_footprint(FORMS[form])).buffer(
         -1e-6, join_style="mitre"
     )
@@ -397,10 +400,10 @@ def test_a_concave_body_or_one_beside_its_origin_takes_the_cheapest_free_path(
         grid,
         motions,
         swept,
-        tuple(body._at(grid, pose_of(grid, goal), body._world(grid))[0]),
+        state_at(body, grid, pose_of(grid, goal)),
     )
     for start in free[1:4]:
-        own = tuple(body._at(grid, pose_of(grid, start), body._world(grid))[0])
+        own = state_at(body, grid, pose_of(grid, start))
         found = plan(
             planner(motion, FORMS[form]),
             grid,
@@ -541,7 +544,7 @@ def test_an_occupied_goal_moves_to_where_the_way_costs_the_least(
             assert found.cost == pytest.approx(least, rel=1e-5)
         elif not found.poses.size and found.status is not PlanStatus.START_OCCUPIED:
             # Without room in its own heading, it starts in the next one.
-            ((_, _, own),) = body._at(grid, start, body._world(grid))
+            _, _, own = state_at(body, grid, start)
             assert least == math.inf or own != turned
 
 
