@@ -174,7 +174,8 @@ class Experience:
         speeds = speeds_of(poses, window)
         usual_speed = float(np.median(speeds)) if len(speeds) else 0.0
         if usual_speed > self.nominal_speed * LARGEST_USUAL_SPEED:
-            return Learned(0, 0.0, self._too_fast(usual_speed), is_possible=False)
+            reason = self._wrong_speed(usual_speed, "at", "greater")
+            return Learned(0, 0.0, reason, is_possible=False)
         limits = Limits(
             window=window,
             speed=self.learned_speed,
@@ -187,7 +188,8 @@ class Experience:
             return Learned(0, 0.0, self._why_nothing(poses, count))
         fastest = float(speeds.max(initial=0))
         if fastest < self.nominal_speed / MAX_SLOWNESS:
-            return Learned(0, 0.0, self._too_slow(fastest), is_possible=False)
+            reason = self._wrong_speed(fastest, "at most at", "less")
+            return Learned(0, 0.0, reason, is_possible=False)
         self._learn(partial(Evidence.add, visits=visits))
         return Learned(places, visits.total_seconds)
 
@@ -211,22 +213,21 @@ class Experience:
             )
         fastest = float((np.hypot(dx, dy) / elapsed).max())
         if fastest > self.max_speed:
-            return self._too_fast(fastest)
+            return self._wrong_speed(fastest, "at", "greater")
         from_start_x, from_start_y = (poses.position - poses.position[0]).T
         extent = float(np.hypot(from_start_x, from_start_y).max())
         return f"the robot comes no farther than {extent:.2g} m; give a longer drive"
 
-    def _too_fast(self, speed: float) -> str:
-        """Return why a drive at `speed`, metres per second, teaches nothing."""
-        nominal = f"{self.nominal_speed:g}"
-        remedy = f"give metres and seconds, or a nominal_speed greater than {nominal}"
-        return f"the robot moves at {speed:.3g} m/s; {remedy} m/s"
+    def _wrong_speed(self, speed: float, words: str, nominal: str) -> str:
+        """Return why a drive at `speed`, metres per second, teaches nothing.
 
-    def _too_slow(self, speed: float) -> str:
-        """Return why a drive never faster than `speed`, metres per second, is none."""
-        nominal = f"{self.nominal_speed:g}"
-        remedy = f"give metres and seconds, or a nominal_speed less than {nominal}"
-        return f"the robot moves at most at {speed:.3g} m/s; {remedy} m/s"
+        `words` stand before the speed. The nominal speed should be greater or less:
+        `nominal`.
+        """
+        return (
+            f"the robot moves {words} {speed:.3g} m/s; give metres and seconds, or a "
+            f"nominal_speed {nominal} than {self.nominal_speed:g} m/s"
+        )
 
     def record_failure(self, position: Sequence[float]) -> None:
         """Learn that the robot failed at a place, as if it had waited for `max_pause`.

@@ -411,36 +411,29 @@ def _relax(equations: Equations, residual: Float64, solution: Float64) -> None:
     count = diagonal.size
     # Subtract the left sides.
     for place in range(count):
-        residual[place, 0] -= diagonal[place] * solution[place, 0]
-        residual[place, 1] -= diagonal[place] * solution[place, 1]
-        for link in range(first_link[place], first_link[place + 1]):
-            neighbour = neighbours[link]
-            residual[place, 0] += strengths[link] * solution[neighbour, 0]
-            residual[place, 1] += strengths[link] * solution[neighbour, 1]
+        for system in range(2):
+            residual[place, system] -= diagonal[place] * solution[place, system]
+            for link in range(first_link[place], first_link[place + 1]):
+                neighbour = neighbours[link]
+                residual[place, system] += strengths[link] * solution[neighbour, system]
     is_solved = False
     while not is_solved:
         is_solved = True
         for place in range(count):
-            # One residual for each of the two systems.
-            residual_0 = residual[place, 0]
-            residual_1 = residual[place, 1]
-            square = residual_0 * residual_0 + residual_1 * residual_1
+            square = residual[place, 0] ** 2 + residual[place, 1] ** 2
             is_off = square > equations.tolerance[place]
             if not is_off:
                 continue
             is_solved = False
-            # The change of the solution that makes these residuals 0, and a little
-            # more, with which fewer rounds are needed.
-            change_0 = OVER_RELAXATION * residual_0 / diagonal[place]
-            change_1 = OVER_RELAXATION * residual_1 / diagonal[place]
-            solution[place, 0] += change_0
-            solution[place, 1] += change_1
-            residual[place, 0] -= change_0 * diagonal[place]
-            residual[place, 1] -= change_1 * diagonal[place]
-            for link in range(first_link[place], first_link[place + 1]):
-                neighbour = neighbours[link]
-                residual[neighbour, 0] += strengths[link] * change_0
-                residual[neighbour, 1] += strengths[link] * change_1
+            for system in range(2):
+                # The change of the solution that makes this residual 0, and a little
+                # more, with which fewer rounds are needed.
+                change = OVER_RELAXATION * residual[place, system] / diagonal[place]
+                solution[place, system] += change
+                residual[place, system] -= change * diagonal[place]
+                for link in range(first_link[place], first_link[place + 1]):
+                    neighbour = neighbours[link]
+                    residual[neighbour, system] += strengths[link] * change
 
 
 def cells_of(position: Float64, grid: GridMap) -> tuple[Int64, NDArray[np.bool_]]:

@@ -70,24 +70,51 @@ def test_a_prior_survives_as_arrays() -> None:
     )
 
 
-def test_what_was_foretold_of_places_stays_with_them_after_a_merge() -> None:
-    other, nothing, elsewhere = (Experience(0.5) for _ in range(3))
-    elsewhere.record(*straight((2, 8), (12, 8), 2))
+def test_what_was_predicted_of_places_stays_with_them_after_a_merge() -> None:
+    hall = GridMap(np.zeros((40, 60), dtype=bool), 0.25)
+    prior = some_prior()
+
+    def with_prior() -> Experience:
+        experience = Experience(0.5)
+        experience.prior = prior
+        experience.apply(hall)
+        experience.record(*straight((2, 2), (12, 2), 2))
+        return experience
+
+    def without_prior() -> Experience:
+        experience = Experience(0.5)
+        experience.record(*straight((2, 8), (12, 8), 4))
+        return experience
+
+    nothing = Experience(0.5)
+    nothing.merge(with_prior())
+    assert nothing.to_bytes() == with_prior().to_bytes()
+    # Both know the same, whichever takes the other's places.
+    one = without_prior()
+    one.merge(with_prior())
+    other = with_prior()
+    other.merge(without_prior())
+    np.testing.assert_allclose(one.slowness(hall), other.slowness(hall), rtol=1e-3)
+
+
+def test_a_merge_keeps_its_own_prior_and_counts_each_level_but_once() -> None:
+    hall = GridMap(np.zeros((40, 60), dtype=bool), 0.25)
+    other = Experience(0.5)
     other.prior = some_prior()
-    other.apply(GridMap(np.zeros((40, 60), dtype=bool), 0.25))
+    other.apply(hall)
     other.record(*straight((2, 2), (12, 2), 2))
-    for one in (nothing, elsewhere):
-        one.merge(other)
-    assert nothing.to_bytes() == other.to_bytes()
-    predicted = other.evidence.places.predicted
-    assert (predicted != other.prior.level).all()
-    merged = elsewhere.evidence.places.predicted[-len(predicted) :]
-    assert (merged == predicted).all()
+    higher = some_prior()._replace(level=np.float32(2.0))
     own = Experience(0.5)
-    own.prior = some_prior()._replace(level=np.float32(0.25))
-    own.merge(other)  # its own prior stays, and each level counts but once
-    level = own.evidence.places.predicted - predicted
-    assert level == pytest.approx(0.25 - float(some_prior().level), abs=1e-9)
+    own.prior = higher
+    own.merge(other)
+    other.prior = higher
+    assert own.to_bytes() == other.to_bytes()
+    # As if the prior had had this level when the places were predicted.
+    always = Experience(0.5)
+    always.prior = higher
+    always.apply(hall)
+    always.record(*straight((2, 2), (12, 2), 2))
+    np.testing.assert_allclose(own.slowness(hall), always.slowness(hall), rtol=1e-3)
 
 
 def test_places_unlike_all_known_ones_are_foretold_as_the_least_unlike() -> None:
