@@ -96,26 +96,16 @@ class GoalHandle(Protocol):
         """End the goal as canceled; a client has asked for that."""
 
 
-class AskOtherPlanner(Protocol):
-    """Asks another planner, through the server of an action."""
-
-    def __call__(
-        self,
-        server: OtherPlanners,
-        handle: GoalHandle,
-        given_up: GivenUp,
-        is_preempted_there: Callable[[], bool],
-    ) -> Awaitable[GoalAnswer | Outcome]:
-        """Return the answer to a goal, or an outcome; as `OtherPlanners.ask`."""
-
-
 class NavigationServer(NamedTuple):
     """The functions of a node that answer Nav2's requests."""
 
     refusal: GivenUp  # returns the outcome if goals are rejected now
     # Returns the path of a query and its outcome; the second argument gives it up.
     plan: Callable[[PathQuery, GivenUp], Awaitable[tuple[Path, Outcome]]]
-    ask_other: AskOtherPlanner
+    # Awaits what `OtherPlanners.ask` returns, and reports an outcome.
+    await_other: Callable[
+        [Awaitable[GoalAnswer | Outcome]], Awaitable[GoalAnswer | Outcome]
+    ]
     is_own: Callable[[str], bool]  # whether a planner_id is this planner's
     on_is_path_valid: Callable[[Any, Any], Awaitable[Any]]
 
@@ -225,9 +215,15 @@ class PathAction:
                 and self._is_for_other(newest)
             )
 
-        return await self._server.ask_other(
-            others, handle, given_up, is_preempted_there
+        goal = handle.request
+        asking = others.ask(
+            goal.planner_id,
+            goal,
+            handle.goal_id,
+            given_up=lambda: self._server.refusal() or given_up(),
+            is_preempted_there=is_preempted_there,
         )
+        return await self._server.await_other(asking)
 
 
 def set_state_of_other(handle: GoalHandle, status: int) -> None:

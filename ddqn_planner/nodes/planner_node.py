@@ -1,7 +1,7 @@
 """The planner node: plans on the map from the robot's pose to the goal pose."""
 
 import math
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Awaitable, Coroutine, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -30,11 +30,10 @@ from ddqn_planner.nodes.display import FieldDisplay
 from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.model_source import ModelSource, read_model
-from ddqn_planner.nodes.nav2 import GoalHandle, NavigationServer, serve_nav2
+from ddqn_planner.nodes.nav2 import NavigationServer, serve_nav2
 from ddqn_planner.nodes.other_planners import (
     GivenUp,
     GoalAnswer,
-    OtherPlanners,
     check_prefix,
 )
 from ddqn_planner.nodes.outcome import (
@@ -148,7 +147,7 @@ class PlannerNode(ManagedNode):
         navigation = NavigationServer(
             refusal=lambda: self._refusal,
             plan=self._plan_for_action,
-            ask_other=self._ask_other_planner,
+            await_other=self._await_other_planner,
             is_own=lambda planner_id: planner_id in ("", self._settings.planner_id),
             on_is_path_valid=self._on_is_path_valid,
         )
@@ -367,29 +366,17 @@ class PlannerNode(ManagedNode):
         self._diagnostics.log(outcome)
         return path_message(*poses), outcome
 
-    async def _ask_other_planner(
-        self,
-        server: OtherPlanners,
-        handle: GoalHandle,
-        given_up: GivenUp,
-        is_preempted_there: Callable[[], bool],
+    async def _await_other_planner(
+        self, asking: Awaitable[GoalAnswer | Outcome]
     ) -> GoalAnswer | Outcome:
         """Return another planner's answer to a goal, or an outcome without an answer.
 
-        The outcome is noted in the diagnostics. The parameters are as of
-        `OtherPlanners.ask`.
+        The outcome is reported in the log and in the diagnostics.
         """
-        goal = handle.request
         answer: GoalAnswer | Outcome
         try:
             with self.answering():
-                answer = await server.ask(
-                    goal.planner_id,
-                    goal,
-                    handle.goal_id,
-                    given_up=lambda: self._refusal or given_up(),
-                    is_preempted_there=is_preempted_there,
-                )
+                answer = await asking
         except Exception as error:  # the node must survive
             answer = Outcome(
                 "FAILED", f"the other planner could not be asked ({error!r})"

@@ -121,6 +121,8 @@ def test_a_request_has_a_goal_and_names_the_planner_or_none() -> None:
 class Handle:
     """What rclpy's handle of a goal has, with the transitions that it allows."""
 
+    goal_id = None
+
     def __init__(self, goals: int | None = None, use_start: bool = True) -> None:
         start, goal = (PoseStamped() for _ in range(2))
         named = {"goal": goal} if goals is None else {"goals": [goal] * goals}
@@ -175,9 +177,13 @@ class Server:
         self.tasks: list[PathQuery] = []
         self.planned, self.refusal = Future(), None
         server = NavigationServer(
-            lambda: self.refusal, self.plan, ask_other, is_own, on_is_path_valid=None
+            refusal=lambda: self.refusal,
+            plan=self.plan,
+            await_other=lambda asking: asking,
+            is_own=is_own,
+            on_is_path_valid=None,
         )
-        others = None if ask_other is None else SimpleNamespace()
+        others = None if ask_other is None else SimpleNamespace(ask=ask_other)
         self.action = PathAction(kind, server, others)
 
     async def plan(
@@ -352,7 +358,7 @@ class Other:
         self.answer, self.is_preempted = Future(), bool
 
     async def ask(
-        self, server: Any, handle: Any, given_up: GivenUp, is_preempted_there: Any
+        self, *_: Any, given_up: GivenUp, is_preempted_there: Callable[[], bool]
     ) -> Any:
         self.is_preempted = is_preempted_there
 
