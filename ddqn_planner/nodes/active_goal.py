@@ -24,7 +24,7 @@ UNCHANGED = Outcome("UNCHANGED", "the active goal needs no new plan")
 
 
 class Situation(NamedTuple):
-    """The map and the place of the robot, on which a plan to the active goal depends."""
+    """The map and the robot's place, on which a plan to the active goal depends."""
 
     grid: GridMap
     map_header: Header | None
@@ -139,7 +139,7 @@ def with_current_path(request: Request, last: Outcome, frame: str) -> Request:
     ----------
     request : Request
     last : Outcome
-        With the path that the robot follows; its map and its model may have been others.
+        With the path that the robot follows, perhaps of another map or model.
     frame : str
         The frame of the request's map.
 

@@ -73,7 +73,7 @@ class ExpectedTimes:
             )
 
     def use(self, experience: Experience | None) -> None:
-        """Plan by the experience of the file that the parameter names now; None: none."""
+        """Plan by the experience of the parameter's new file; None without a file."""
         self._experience_of_file = experience
         self._use_file()
 
@@ -116,6 +116,10 @@ class ExpectedTimes:
         return True
 
     def _load_file(self) -> Experience | None:
+        """Return the experience of the parameter's file; None without a file.
+
+        An experience that `use` received for the file is returned once.
+        """
         file: str = self._node.value("experience")
         if not file:
             return None

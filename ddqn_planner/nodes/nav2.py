@@ -30,13 +30,13 @@ RESULT_TIMEOUT = 10
 CANCELED = Outcome("CANCELED", "the goal was canceled")
 PREEMPTED = Outcome("PREEMPTED", "a newer goal of the same action came")
 
-# Nav2's name of a status, where it is another name. Statuses that Nav2 does not know are
-# UNKNOWN.
+# Nav2's name of a status, where it is another name. Statuses that Nav2 does not know
+# are UNKNOWN.
 ERROR_NAMES = {
     PlanStatus.NO_PATH.name: "NO_VALID_PATH",
     PlanStatus.ROLLOUT_TRAPPED.name: "NO_VALID_PATH",
-    # A pose that is unknown, malformed, or in a frame without TF. After UNKNOWN, behavior
-    # trees clear costmaps, which is no help here.
+    # A pose that is unknown, malformed, or in a frame without TF. After UNKNOWN,
+    # behavior trees clear costmaps, which is no help here.
     "NO_START": "TF_ERROR",
     "INVALID_START": "TF_ERROR",
     "INVALID_GOAL": "TF_ERROR",
@@ -190,6 +190,7 @@ class PathAction:
         return result
 
     def _query(self, goal: PathGoal) -> PathQuery:
+        """Return the query that a goal of the action asks, in any release of Nav2."""
         start = goal.start if goal.use_start else None
         if self._has_goals:
             return PathQuery(start, goal_poses(goal.goals), goal.planner_id)
@@ -240,7 +241,7 @@ def set_state_of_other(handle: GoalHandle, status: int) -> None:
 
 
 def goal_poses(goals: Sequence[PoseStamped] | GoalList) -> list[PoseStamped]:
-    """Return the poses of goals; poses of a list without a frame have the list's header."""
+    """Return the poses of goals; a pose without a frame has the header of its list."""
     if isinstance(goals, Sequence):
         return [*goals]
     poses = []

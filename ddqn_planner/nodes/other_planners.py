@@ -110,6 +110,7 @@ class OtherPlanners:
         self._connect()
 
     def _connect(self) -> None:
+        """Make a client of the server, for which there may be an older client."""
         self._client = ActionClient(
             self._node,
             self._action_type,

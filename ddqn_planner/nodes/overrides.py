@@ -53,7 +53,7 @@ def _node_name(full_name: str) -> str:
 
 
 def nearest(name: str, names: Iterable[str]) -> str:
-    """Return which of some names is most like another name; empty if none is like it."""
+    """Return which of `names` is most like a name; empty if none is like it."""
     names_by_lower = {candidate.casefold(): candidate for candidate in names}
     similar = difflib.get_close_matches(name.casefold(), names_by_lower, 1, SIMILAR)
     return names_by_lower[similar[0]] if similar else ""
@@ -90,7 +90,7 @@ def unread_names(
 def unread_qualities(
     names: Iterable[str], declared_names: Collection[str], node: str
 ) -> list[str]:
-    """Return a sentence about each ``qos_overrides`` parameter that a node does not have.
+    """Return a sentence about each ``qos_overrides`` parameter that a node lacks.
 
     The node has such parameters for its subscriptions. Parameters for topics of which
     ROS itself reads the quality of service are left out.
@@ -248,7 +248,7 @@ def _parameters(part: object, prefix: str = "") -> Iterator[str]:
 
 
 def wrong_argument(arguments: Sequence[str]) -> str:
-    """Return why ROS cannot read an argument, with a remedy; empty if it can read all."""
+    """Return why ROS cannot read an argument, with a remedy; empty if it reads all."""
     for option in _options(arguments):
         value = option.value
         problem = _wrong_file(value) if option.is_file else _wrong_rule(value)

@@ -46,6 +46,10 @@ def parameters_from_messages(
 def _with_declared_types(
     parameters: Sequence[Parameter], declared: Parameters
 ) -> list[Parameter]:
+    """Return parameters with values of declared types; those of ROS as they are.
+
+    A ValueError names all values that a declared parameter cannot have.
+    """
     values = {
         parameter.name: parameter.value
         for parameter in parameters
@@ -61,6 +65,7 @@ def _with_declared_types(
 
 
 def _check_names(names: Sequence[str]) -> None:
+    """Raise a ValueError if a name is empty, or comes twice in one request."""
     if not all(names):
         raise ValueError("a parameter has no name; give one")
     repeated = {name for name in names if names.count(name) > 1}
@@ -70,6 +75,7 @@ def _check_names(names: Sequence[str]) -> None:
 
 
 def _check_writable(names: Sequence[str], declared: Parameters) -> None:
+    """Raise a ValueError if one of the parameters may only be set at the start."""
     for name in names:
         if name in declared and declared[name].read_only:
             start = f"set it at the start, with -p {name}:=VALUE or in a file"
@@ -77,6 +83,7 @@ def _check_writable(names: Sequence[str], declared: Parameters) -> None:
 
 
 def _from_message(message: ParameterMessage) -> Parameter:
+    """Return a parameter as rclpy has it; ValueError if its type is unknown."""
     try:
         parameter: Parameter = Parameter.from_parameter_msg(message)
     except ValueError as error:

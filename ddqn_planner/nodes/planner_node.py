@@ -74,7 +74,7 @@ class LoggedPlan(NamedTuple):
 # The executor's one thread holds all state. Workers load the model, inflate maps and
 # compute Q fields. A request that waits for a worker is a coroutine.
 class PlannerNode(ManagedNode):
-    """Plans from the robot's pose to the active goal: ``goal_pose``, or ``goal_poses``."""
+    """Plans from the robot's pose to the active ``goal_pose`` or ``goal_poses``."""
 
     _checks_first_parameters = True  # in the constructor of `BaseNode`
 
@@ -108,7 +108,7 @@ class PlannerNode(ManagedNode):
         self.activate()
 
     def configure(self) -> None:
-        """Listen to the map and to where the robot is, and create what answers requests."""
+        """Listen to the map and the robot's pose, and create services and actions."""
         super().configure()
         self._display = FieldDisplay(self, self._display_worker)
         self._plan_publisher = self.create_publisher(Path, "plan", LATCHED)
@@ -165,7 +165,8 @@ class PlannerNode(ManagedNode):
         super().deactivate()
         self._refusal = NOT_ACTIVE
         self._active_goal = ActiveGoal([], 0.0)
-        # The last outcome of an action with a path, whose rest the next action may keep.
+        # The last outcome of an action with a path: the next action may keep the rest
+        # of the path.
         self._path_of_action: Outcome | None = None
         # The last outcome with or without a path: an older path is not improved.
         self._newest_outcome: Outcome | None = None
@@ -288,6 +289,7 @@ class PlannerNode(ManagedNode):
         self._replan.trigger()
 
     def _on_goals(self, message: PoseStamped | PoseArray) -> None:
+        """Plan to the goals of a message, or report why it is refused."""
         poses = message.poses if isinstance(message, PoseArray) else [message.pose]
         if not poses:
             self._diagnostics.refuse(
@@ -308,6 +310,7 @@ class PlannerNode(ManagedNode):
     async def _on_get_plan(
         self, request: GetPlan.Request, response: GetPlan.Response
     ) -> GetPlan.Response:
+        """Answer ``~/get_plan``; a start without a frame means the robot's pose."""
         start = request.start if request.start.header.frame_id else None
         query = PathQuery(start, [request.goal], tolerance=request.tolerance)
         outcome = await self._answer(query.goals, self._requests.plan(query))
@@ -328,7 +331,7 @@ class PlannerNode(ManagedNode):
             await self._plan_for_active_goal()
 
     async def _plan_for_active_goal(self) -> None:
-        """Plan for the active goal, publish the path if it is news, and log the outcome.
+        """Plan for the active goal, publish a path that is news, and log the outcome.
 
         Nothing is published or logged if the goal needs no new plan.
         """
@@ -339,6 +342,7 @@ class PlannerNode(ManagedNode):
             return
         self._publish(outcome, active)
         self._improve_later(outcome)
+        # The same kind of plan again is logged once.
         plan = LoggedPlan(goals, outcome.goal, outcome.status, outcome.plan.method)
         if self._logged_plan != plan:
             self._logged_plan = plan
@@ -544,8 +548,10 @@ def path_poses(outcome: Outcome) -> PathPoses:
     """Return the poses of an outcome's path; none if it has no path."""
     plan = outcome.plan
     if isinstance(plan, PosePlan):
-        return PathPoses(plan.poses[:, :2], plan.poses[:, 2], outcome.header)
-    spacing = math.inf
+        points = plan.poses[:, :2]  # (N, 2) metres
+        yaws = plan.poses[:, 2]  # (N,) radians
+        return PathPoses(points, yaws, outcome.header)
+    spacing = math.inf  # metres between poses at most
     if outcome.is_dense and outcome.request is not None:
         spacing = outcome.request.grid.resolution
     points, yaws = along(outcome.path.points, spacing)

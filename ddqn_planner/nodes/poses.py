@@ -1,4 +1,4 @@
-"""Where the robot is, and poses in the map's frame, by TF where tf2_ros is installed."""
+"""The robot's pose, and poses in the map's frame, by TF if tf2_ros is installed."""
 
 import importlib.util
 import math
@@ -52,7 +52,7 @@ TYPES = {
 
 
 def has_tf() -> bool:
-    """Return whether tf2_ros is installed, without importing it; PyPI does not have it."""
+    """Return whether tf2_ros is installed, which PyPI lacks, without its import."""
     return importlib.util.find_spec("tf2_ros") is not None
 
 
@@ -71,7 +71,7 @@ def check_source(parameter: str, value: str, other_values: str) -> None:
 class CheckedTransforms:
     """Gives transforms to a buffer of tf2, with quaternions of norm 1, or refuses them.
 
-    Some releases of tf2 refuse quaternions of another norm, others use them as they are.
+    Some releases of tf2 refuse quaternions of another norm, others use them as sent.
     """
 
     def __init__(self, buffer: Any, node: BaseNode) -> None:
@@ -494,6 +494,7 @@ class Poses(Frames):
         return self._last_pose
 
     def _pose_by_tf(self) -> PoseStamped:
+        """Return the pose of ``robot_frame`` in the map's frame; see `robot`."""
         try:
             return self.origin_of(self._settings().robot_frame, self._map_frame())
         except ValueError as error:
@@ -503,6 +504,7 @@ class Poses(Frames):
             raise RequestError("NO_START", reason, self.listening_since) from None
 
     def _pose_by_odometry(self) -> PoseStamped:
+        """Return the last pose of odometry, unless it is too old; see `robot`."""
         topic = self._subscription.topic_name
         if self._last_pose is None:
             problem = f"nothing came on {topic} in the map's frame"

@@ -33,7 +33,9 @@ REMEDIES = {
 REMEDIES_OF_BODY = {
     **REMEDIES,
     PlanStatus.START_OCCUPIED: "set the start where the robot's body has room",
-    PlanStatus.GOAL_OCCUPIED: f"set the goal where the robot's body has room{TOLERANCE}",
+    PlanStatus.GOAL_OCCUPIED: (
+        f"set the goal where the robot's body has room{TOLERANCE}"
+    ),
 }
 
 

@@ -199,7 +199,8 @@ class Requests:
         assert isinstance(outcome.plan, PosePlan)
         assert planner is not None
         assert goal is not None
-        # A bound of 1: no path costs less. The outcome's path is kept if it is so cheap.
+        # A bound of 1: no path costs less. The outcome's path is kept if it costs no
+        # more.
         request = replace(outcome.request, bound=1.0, under_way=outcome.plan.poses)
         plan = await self._plan(planner, request)
         # Reasons of paths name neither the start, here the goal, nor the robot_radius.
@@ -221,7 +222,7 @@ class Requests:
         return Legs(request, plans)
 
     async def _plan(self, planner: Planner, request: Request) -> Plan:
-        """Plan in steps by the worker: between two steps, other requests have a turn."""
+        """Plan in steps by the worker: other requests have a turn between steps."""
         # A generator: its last value is the plan, the values before are None.
         steps = planner.steps(request)
         try:
@@ -276,6 +277,7 @@ class Requests:
     async def _goals_in_map(
         self, inputs: PlanInputs, names: Sequence[str], goals: Sequence[PoseStamped]
     ) -> list[MapPose]:
+        """Return goals in the map; errors call each goal by one of the names."""
         map_poses = []
         for name, goal in zip(names, goals, strict=True):
             map_pose = await self.in_map(inputs, name, goal)

@@ -48,8 +48,8 @@ def _problems_of(subscription: Subscription, node: Node) -> Iterator[str]:
     if effect and len(received_names) > 1:
         names = ", ".join(sorted(received_names))
         yield (
-            f"{topic} has {len(received_names)} publishers ({names}), so {effect}; let one "
-            "publish, or remap the others"
+            f"{topic} has {len(received_names)} publishers ({names}), so {effect}; "
+            "let one publish, or remap the others"
         )
     for name, misfits in misfits_by_publisher:
         for policy, offered, requested in misfits:
