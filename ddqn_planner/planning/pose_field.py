@@ -17,6 +17,7 @@ from ddqn_planner.planning.pose_space import Aim, Search
 from ddqn_planner.planning.pose_world import (
     SHIFT,
     TILE,
+    UNSEEN,
     State,
     World,
     occupied_for_body,
@@ -93,7 +94,7 @@ class PoseField(Field[Search]):
     def _goals_alone(self) -> Search:
         """Return what is known before any growth."""
         world = self.world
-        tiles = world.tile.size
+        tiles = world.nearness.size
         states = tiles << pose_space.TILE_BITS
         search = Search(
             distance=_untouched(states, np.float32),
@@ -104,7 +105,7 @@ class PoseField(Field[Search]):
             world=world,
         )
         x, y, heading = self.goals.T
-        numbers = pose_space.number_of(x, y, heading, world)
+        numbers = pose_space.number_of_state(x, y, heading, world)
         search.mark[numbers] = wavefront.OPEN
         search.touched[numbers >> pose_space.TILE_BITS] = True
         return search
@@ -112,7 +113,7 @@ class PoseField(Field[Search]):
     @property
     def nbytes(self) -> int:
         """Memory, bytes, if all states of the map are reached: most never are."""
-        return 5 * self.world.tile.size << pose_space.TILE_BITS
+        return 5 * self.world.nearness.size << pose_space.TILE_BITS
 
     def reach(self, start: State, bound: float, limit: int) -> float | None:
         """Grow until the cost from a start is known within a bound, or to be none.
@@ -151,7 +152,7 @@ class PoseField(Field[Search]):
     def _aim_at(self, start: State, bound: float) -> None:
         """Begin the first round toward a start, unless the field aims at it already."""
         aim = self.known.aim
-        number = int(pose_space.number_of(*start, self.world))
+        number = int(pose_space.number_of_state(*start, self.world))
         if number == aim.number:
             return
         x, y, _ = start
@@ -169,7 +170,7 @@ class PoseField(Field[Search]):
         heap = make_heap((len(tiles) << pose_space.TILE_BITS) + HEAP)
         search = self.known._replace(aim=aim, heap=heap)
         self._known = search
-        self._least_cost = pose_space.order(search, tiles)
+        self._least_cost = pose_space.queue_open_states(search, tiles)
 
     def _is_enough(self, bound: float) -> bool:
         """Return whether a bound is proved, or that no path leads from the start."""
@@ -230,7 +231,7 @@ class PoseField(Field[Search]):
             search.mark.size, np.uint8
         )  # its own: of states from the start
         queue = np.empty(UNGUIDED, np.int64)
-        count = pose_space.leads_to(search.aim.number, mark, queue, self.world)
+        count = pose_space.count_reachable(search.aim.number, mark, queue, self.world)
         return bool(count == queue.size)
 
     def _with_look_at_map(self, aim: Aim, shift: int) -> Aim:
@@ -243,8 +244,10 @@ class PoseField(Field[Search]):
         tile_side = 1 << shift  # cells
         rows = math.ceil(world.height / tile_side)
         columns = math.ceil(world.width / tile_side)
-        # (R, C): whether the body may pass a tile, 0 as long as nobody asked.
-        room = world.room if shift == SHIFT else np.zeros((rows, columns), np.uint8)
+        # (R, C): whether the body may pass a tile, UNSEEN as long as nobody asked.
+        passability = np.full((rows, columns), UNSEEN, np.uint8)
+        if shift == SHIFT:  # tiles of this size are kept from look to look
+            passability = world.passability
         remaining = np.empty((rows + 1, columns + 1), np.float32)  # cells
         aim_with_look = aim._replace(remaining=remaining, shift=shift)
         goal_x, goal_y = self.goals[:, :2].T >> shift  # tiles
@@ -254,7 +257,7 @@ class PoseField(Field[Search]):
         # The 4 corners of the start's tile; and each opens its 8 neighbours once.
         heap = make_heap(4 + 8 * remaining.size)
         search = self.known._replace(aim=aim_with_look, heap=heap)
-        pose_space.look(search, room, is_goal, box)  # writes `remaining`
+        pose_space.write_remaining(search, passability, is_goal, box)
         return aim_with_look
 
     def rollout(self, start: State, bound: float) -> PosePath:
@@ -326,13 +329,13 @@ class PoseField(Field[Search]):
         if unsupported_cost < math.inf:
             pose_space.take_back(search, tiles, unsupported_cost)
         if has_freed_cell:  # states near the cells are visited again
-            mark = search.mark.reshape(self.world.tile.size, -1)
+            mark = search.mark.reshape(self.world.nearness.size, -1)
             mark[near_tiles] = np.minimum(mark[near_tiles], wavefront.OPEN)
         return search
 
     def _tiles_near(self, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return from which tiles (R, C) primitives may sweep some cells (N, 2)."""
-        is_near = np.zeros(self.world.tile.shape, np.bool_)
+        is_near = np.zeros(self.world.nearness.shape, np.bool_)
         reach = self.world.body.reach // TILE + 1  # tiles
         columns, rows = (cells // TILE).T.tolist()
         for x, y in set(zip(columns, rows, strict=True)):

@@ -31,7 +31,7 @@ from ddqn_planner.planning.pose_world import (
     World,
     body_of,
     differences,
-    standing,
+    move_free_to_front,
     world_of,
 )
 from ddqn_planner.robot.motions import HEADINGS, turn_between
@@ -348,7 +348,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         nearest_headings = np.argsort(turn, kind="stable")[:2]
         column, row = grid.world_to_cell(x, y)
         states = np.array([(column, row, heading) for heading in nearest_headings])
-        count = standing(states, world)  # moves those with room to the front
+        count = move_free_to_front(states, world)
         return tuple(states[0].tolist()) if count else None
 
     def _states_at(
@@ -388,7 +388,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         states = np.column_stack(
             [goal_column + columns[column], goal_row + rows[row], heading]
         )
-        return states[: standing(states, world)]
+        return states[: move_free_to_front(states, world)]
 
     def _least_distance_of_ends(
         self, may_end: NDArray[np.bool_], radius: float

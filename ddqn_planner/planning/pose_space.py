@@ -66,9 +66,9 @@ class Search(NamedTuple):
 
 
 @inlined
-def number_of(x: Any, y: Any, heading: Any, world: Any) -> Any:
+def number_of_state(x: Any, y: Any, heading: Any, world: Any) -> Any:
     """Return the number of a state: bits of the tile, the cell in it, the heading."""
-    tile_columns = world.tile.shape[1]
+    tile_columns = world.nearness.shape[1]
     tile = (y >> SHIFT) * tile_columns + (x >> SHIFT)
     cell_in_tile = (y & (TILE - 1)) << SHIFT | (x & (TILE - 1))
     return tile << TILE_BITS | cell_in_tile << HEADING_BITS | heading
@@ -76,8 +76,8 @@ def number_of(x: Any, y: Any, heading: Any, world: Any) -> Any:
 
 @inlined
 def state_of(number: int, world: Any) -> State:
-    """Return x, y and heading of the state of a number, see `number_of`."""
-    tile_columns = world.tile.shape[1]
+    """Return x, y and heading of the state of a number, see `number_of_state`."""
+    tile_columns = world.nearness.shape[1]
     tile = number >> TILE_BITS
     tile_row = tile // tile_columns
     tile_column = tile - tile_row * tile_columns
@@ -97,7 +97,7 @@ def end_of(x: int, y: int, primitive: int, world: Any) -> Any:
     end_y = y + world.body.offset[primitive, 1]
     if not is_inside(end_x, end_y, world):
         return OUTSIDE
-    return number_of(end_x, end_y, world.body.end[primitive], world)
+    return number_of_state(end_x, end_y, world.body.end[primitive], world)
 
 
 # The growth toward a start
@@ -128,7 +128,7 @@ def remaining_cost(x: int, y: int, aim: Any) -> float:
 
 
 @in_place
-def order(search: Search, tiles: NDArray[np.int64]) -> float:
+def queue_open_states(search: Search, tiles: NDArray[np.int64]) -> float:
     """Open and queue all states in some tiles (K,) that are open or wait.
 
     Return a lower bound of the cost that may still be found for the start of the aim.
@@ -166,7 +166,7 @@ def _expand_pose(number: int, distance: Any, mark: Any, heap: Any, search: Any) 
         begin_y = y - body.offset[primitive, 1]
         if not is_inside(begin_x, begin_y, world):
             continue
-        previous = number_of(begin_x, begin_y, body.start[primitive], world)
+        previous = number_of_state(begin_x, begin_y, body.start[primitive], world)
         # First judged by the least cost of the primitive: whether the body has room for
         # it, and what it costs on the map, takes longer to tell.
         is_reached = mark[previous] != UNREACHED
@@ -288,7 +288,7 @@ def follow(search: Search, start: int, limit: int, rows: NDArray[np.float64]) ->
 
 
 @in_place
-def leads_to(
+def count_reachable(
     start: int, mark: NDArray[np.uint8], queue: NDArray[np.int64], world: World
 ) -> int:
     """Return to how many states primitives lead from a start, which counts too.
@@ -477,7 +477,7 @@ def _push_start(search: Any, box: Any) -> None:
 
 
 @in_place
-def look(
+def write_remaining(
     search: Search,
     passability: NDArray[np.uint8],
     is_goal: NDArray[np.bool_],

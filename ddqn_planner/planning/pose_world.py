@@ -27,7 +27,7 @@ LAST_BIT: Final = np.uint64(63)
 ONE: Final = np.uint64(1)
 FULL: Final = np.uint64(2**64 - 1)  # a word of occupied cells
 
-# What is known of a tile in `World.tile` and `World.room`: at first nothing.
+# What is known of a tile in `World.nearness` and `World.passability`: at first nothing.
 UNSEEN: Final = 0
 IS_FAR, IS_NEAR = 1, 2
 PASSABLE, IMPASSABLE = 1, 2
@@ -85,9 +85,9 @@ class World(NamedTuple):
     occupied_bits: NDArray[np.uint64]
     # (tile rows, tile columns): IS_NEAR if the body can reach an occupied cell from the
     # tile, IS_FAR if not, UNSEEN until a kernel looks.
-    tile: NDArray[np.uint8]
+    nearness: NDArray[np.uint8]
     # Likewise: PASSABLE if the origin may pass a cell of the tile, else IMPASSABLE.
-    room: NDArray[np.uint8]
+    passability: NDArray[np.uint8]
     height: int
     width: int
     layers: Layers
@@ -291,14 +291,14 @@ def world_of(
     # The tiles from which a body may reach the cells are unseen again.
     near_rows = _tiles_near(first_row, last_row)
     near_columns = _tiles_near(first_column, last_column)
-    tile = older.tile.copy()
-    tile[near_rows, near_columns] = UNSEEN
-    room = older.room.copy()
-    room[near_rows, near_columns] = UNSEEN
+    nearness = older.nearness.copy()
+    nearness[near_rows, near_columns] = UNSEEN
+    passability = older.passability.copy()
+    passability[near_rows, near_columns] = UNSEEN
     return older._replace(
         occupied_bits=occupied_bits,
-        tile=tile,
-        room=room,
+        nearness=nearness,
+        passability=passability,
         layers=_layers_for_body(grid),
     )
 
@@ -318,8 +318,8 @@ def _new_world(grid: GridMap, body: Body) -> World:
     return World(
         body,
         occupied_bits,
-        tile=np.full(tiles, UNSEEN, np.uint8),
-        room=np.full(tiles, UNSEEN, np.uint8),
+        nearness=np.full(tiles, UNSEEN, np.uint8),
+        passability=np.full(tiles, UNSEEN, np.uint8),
         height=grid.height,
         width=grid.width,
         layers=_layers_for_body(grid),
@@ -394,18 +394,18 @@ def is_inside(x: int, y: int, world: Any) -> bool:
 def is_far(x: int, y: int, world: Any) -> bool:
     """Return whether the body reaches no occupied cell from any cell of a tile.
 
-    The tile is that of cell (x, y). What was found is kept in `world.tile`.
+    The tile is that of cell (x, y). What was found is kept in `world.nearness`.
     """
     row = y >> SHIFT
     column = x >> SHIFT
-    if world.tile[row, column] == UNSEEN:
+    if world.nearness[row, column] == UNSEEN:
         middle_x = (column << SHIFT) + TILE // 2
         middle_y = (row << SHIFT) + TILE // 2
         if touches(middle_x, middle_y, world.body.reach_mask, world):
-            world.tile[row, column] = IS_NEAR
+            world.nearness[row, column] = IS_NEAR
         else:
-            world.tile[row, column] = IS_FAR
-    return bool(world.tile[row, column] == IS_FAR)
+            world.nearness[row, column] = IS_FAR
+    return bool(world.nearness[row, column] == IS_FAR)
 
 
 @inlined
@@ -460,7 +460,7 @@ def has_room(x: int, y: int, mask: int, world: Any) -> bool:
 
 
 @in_place
-def standing(states: NDArray[np.int64], world: World) -> int:
+def move_free_to_front(states: NDArray[np.int64], world: World) -> int:
     """Move the states at which the body has room to the front; return how many.
 
     `states` (N, 3) are x, y and heading. Their order does not change.
