@@ -5,7 +5,8 @@ from xml.etree import ElementTree
 from setuptools import find_packages, setup
 
 PACKAGE = "ddqn_planner"
-# `colcon build --symlink-install` runs a link to this file, in a folder without the others.
+# `colcon build --symlink-install` runs a link to this file, in a folder without the
+# others.
 ROOT = Path(__file__).resolve().parent
 
 setup(
@@ -75,7 +76,8 @@ setup(
             "pytest>=7.4",
             "pytest-cov>=4.1",
             "pytest-xdist>=3.5",
-            "setuptools<80",  # with a newer one, colcon's --symlink-install makes copies
+            # With a newer one, colcon's --symlink-install makes copies.
+            "setuptools<80",
             "shapely>=2.0",
         ],
         "lint": ["mypy>=1.10", "ruff>=0.9", "types-PyYAML", "types-tqdm"],

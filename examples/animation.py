@@ -30,7 +30,7 @@ LAST_FRAMES = 40  # for which the complete path is shown
 def save_film(
     path: str, grid: GridMap, plan: Plan, value: NDArray[Any], steps: int = 40
 ) -> None:
-    """Save a GIF: the cells appear from the best value to the worst, then the path grows."""
+    """Save a GIF: cells appear from the best value to the worst, then the path."""
     height, width = np.array(value.shape) / max(value.shape) * 6
     figure = plt.figure(figsize=(width, height))
     axes = figure.add_axes((0, 0, 1, 1))

@@ -1,4 +1,4 @@
-"""Films how bodies drive: a long robot through a narrow door, a car that turns in three points.
+"""Films a long robot in a narrow door, and a car that turns in three points.
 
 python examples/body_film.py robots.gif
 """
@@ -29,7 +29,10 @@ Pose = tuple[float, float, float]
 
 
 def door() -> tuple[GridMap, Pose, Pose]:
-    """Return a wall with a door 10 cm wider than the robot; it starts and ends across."""
+    """Return a wall with a door 10 cm wider than the robot.
+
+    The robot starts and ends across the door.
+    """
     occupancy = np.zeros((70, 110), np.bool_)
     occupancy[[0, -1]] = occupancy[:, [0, -1]] = True
     occupancy[:, 53:57] = True
@@ -38,7 +41,10 @@ def door() -> tuple[GridMap, Pose, Pose]:
 
 
 def lane() -> tuple[GridMap, Pose, Pose]:
-    """Return a lane that is too narrow for a car's turning circle; it must turn round."""
+    """Return a lane in which a car has to turn round.
+
+    The lane is narrower than the car's turning circle.
+    """
     occupancy = np.zeros((70, 110), np.bool_)
     occupancy[:12] = occupancy[58:] = True
     occupancy[:, [0, -1]] = True

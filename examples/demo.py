@@ -1,4 +1,4 @@
-"""Starts the map server and the planner, asks for a path over ROS, and shows it, on two maps."""
+"""Starts the map server and the planner, and shows a path on each of two maps."""
 
 import sys
 import time
@@ -18,7 +18,8 @@ sys.path.insert(0, str(FilePath(__file__).resolve().parents[1] / "experiments"))
 from client import Client, cells_of, plan_request, wait_for
 from processes import claim_ros_domain, run_script, running_node
 
-# A map, the shipped model that plans on it, its move rule, and the picture's title and file.
+# A map, the shipped model that plans on it, its move rule, and the picture's title and
+# file.
 Case = tuple[str, str, MoveRule, str, str]
 CASES: tuple[Case, ...] = (
     ("dilemma", "dilemma", MoveRule.CORNER_CUTTING, "The paper's network", "demo.png"),
@@ -27,7 +28,7 @@ CASES: tuple[Case, ...] = (
 
 
 def show_path(client: Client, case: Case, children: Sequence[Popen[bytes]]) -> None:
-    """Ask for a path as `ros2 topic pub` would; print it and its length, and draw it."""
+    """Ask for a path as `ros2 topic pub` would; print and draw the path."""
     began, (map_name, _, rule, title, picture) = time.monotonic(), case
     plans = client.subscribe(Path, "plan", LATCHED)
     fields = client.subscribe(OccupancyGrid, "planner/value", LATCHED)
@@ -40,13 +41,15 @@ def show_path(client: Client, case: Case, children: Sequence[Popen[bytes]]) -> N
     client.publish_ends(plan_request(grid, start, goal))
     plan = wait_for("plan", lambda: plans.find(lambda plan: plan.poses), children)
     print(
-        f"the first plan came {time.monotonic() - began:.1f} s after the nodes were started"
+        f"the first plan came {time.monotonic() - began:.1f} s "
+        "after the nodes were started"
     )
     cells = cells_of(grid, plan)
     if grid.width <= MAX_TEXT_WIDTH:
         print(draw_text(grid, cells))
     print(
-        f"{grid.width} x {grid.height} cells, path of {len(cells)} from {start} to {goal}"
+        f"{grid.width} x {grid.height} cells, "
+        f"path of {len(cells)} from {start} to {goal}"
     )
     length = path_length(cells)
     optimum = shortest_distances(grid, goal, rule)[start[::-1]]
@@ -60,7 +63,10 @@ def show_path(client: Client, case: Case, children: Sequence[Popen[bytes]]) -> N
 
 
 def main(_: Sequence[str]) -> int:
-    """Show a path on each map; no process is left behind, also when this one is interrupted."""
+    """Show a path on each map.
+
+    No process is left behind, also when this one is interrupted.
+    """
     with claim_ros_domain():
         for case in CASES:
             with (

@@ -1,4 +1,7 @@
-"""A robot learns by driving where it is slow, with the real nodes: in 40 missions, or so many."""
+"""A robot learns by driving where it is slow, with the real nodes.
+
+The number of missions is an argument, 40 by default.
+"""
 
 import math
 import sys
@@ -36,7 +39,7 @@ MEAN_OF = 8  # missions that a point of the curve sums up
 
 @dataclass
 class Mission:
-    """The routes of a mission with their true seconds, and the slowness: true, and learned."""
+    """A mission's routes, their true seconds, and the true and learned slowness."""
 
     routes: Routes
     seconds: dict[str, float]
@@ -97,7 +100,8 @@ class Driver:
         self.wait(
             "odometry at the goal", self.odometry, lambda at: _is_at(at.pose, stamped)
         )
-        # Other drives end on the way: one that is long, or if the trainer hears the goal late.
+        # Other drives end on the way: one that is long, or if the trainer hears the
+        # goal late.
         self.wait("drive", self.drives, lambda path: _is_at(path.poses[-1], stamped, 2))
         measured = self.now() - began
         time.sleep(0.3)  # the planner loads it
@@ -119,7 +123,10 @@ def _is_at(stamped: Any, goal: PoseStamped, factor: float = 1) -> bool:
 
 
 def save_pictures(world: World, missions: Sequence[Mission]) -> None:
-    """Save a GIF with a frame per mission, the best of the last ones as a picture, and a curve."""
+    """Save a GIF with a frame per mission, a picture and a curve.
+
+    The picture shows the best of the last missions.
+    """
     width = min(MEAN_OF, len(missions))
     best = min(
         missions[-width:],
@@ -135,7 +142,8 @@ def save_pictures(world: World, missions: Sequence[Mission]) -> None:
             ),
         }
         figure: Any = draw_slowness(world.grid, world.stations, panels, (8.4, 4.7))
-        title = f"mission {number}: {mission.ratio('learned'):.2f} of the best possible time"
+        ratio = mission.ratio("learned")
+        title = f"mission {number}: {ratio:.2f} of the best possible time"
         figure.suptitle(title, fontsize=11)
         frames.append(frame_of(figure))
         if mission is best:
@@ -184,8 +192,9 @@ def main(arguments: Sequence[str]) -> int:
                     mission.ratio(name) for name in ("learned", "shortest")
                 )
                 print(
-                    f"mission {number:2d}: drove {mission.measured:5.1f} s; its route takes "
-                    f"{learned:.2f} of the best possible time, the shortest {shortest:.2f}",
+                    f"mission {number:2d}: drove {mission.measured:5.1f} s; "
+                    f"its route takes {learned:.2f} of the best possible time, "
+                    f"the shortest {shortest:.2f}",
                     flush=True,
                 )
     save_pictures(world, missions)

@@ -1,4 +1,7 @@
-"""A robot learns to leave the dead end of the paper's map: a film of 50,000 steps, or so many."""
+"""A robot learns to leave the dead end of the paper's map: a film.
+
+The number of steps is an argument, 50,000 by default.
+"""
 
 import sys
 from collections.abc import Sequence
@@ -29,7 +32,7 @@ def draw(
     curve: Sequence[tuple[int, float]],
     steps: int,
 ) -> tuple[Image.Image, float]:
-    """Draw what the robot did last and what it knows now; return the share of solved starts."""
+    """Draw the last episode and the policy; return the share of solved starts."""
     grid, field = scenario.grid, planner.q_field(scenario.grid, scenario.goal)
     ratios = length_ratios(field, grid, scenario.move_rule)
     solved = np.where(np.isnan(ratios), np.nan, np.isfinite(ratios))

@@ -1,4 +1,4 @@
-"""A simulated robot that follows the last `plan`, in a world whose slowness nobody tells."""
+"""A simulated robot follows the last `plan` in a world of unknown slowness."""
 
 import math
 import sys
@@ -23,18 +23,23 @@ from driving_worlds import NOISE, SPEED, World, generated_world
 
 WORLD, SEED, SPEED_UP = "office-mixture", 9, 40.0
 STEP = 0.2  # simulated seconds from one pose to the next
-MORNING = 3000.0  # when the simulated time begins, seconds: ten minutes later the first crowd goes
+MORNING = 3000.0
+"""Seconds at which the simulated time begins: the first crowd goes 10 minutes later."""
 JOIN_DISTANCE = (
     2.0  # metres from which the robot drives to the nearest point of a new path
 )
-SIGHT = 0.005  # metres between the points at which a straight line is looked at for obstacles
+SIGHT = 0.005
+"""Metres between the points of a straight line that are tried for obstacles."""
 PATIENCE = (
     60.0  # simulated seconds that the robot stands before it asks for a path again
 )
 
 
 class Robot:
-    """A robot that follows paths from point to point; the seed is that of its speed's noise."""
+    """A robot that follows paths from point to point.
+
+    The seed is that of the noise of its speed.
+    """
 
     def __init__(self, world: World, seed: int) -> None:
         self.world = world
@@ -98,7 +103,10 @@ class Robot:
 
 
 class RobotNode(Node):
-    """The robot's topics: `plan` in, `odom` and where tf2_ros is installed a transform out."""
+    """The robot's topics: `plan` in, `odom` out.
+
+    Where tf2_ros is installed, a transform goes out, too.
+    """
 
     def __init__(self) -> None:
         super().__init__("robot")

@@ -1,4 +1,7 @@
-"""The model for any map: the paper's goals on their unseen map, and what each idea contributes."""
+"""The model for any map: the paper's goals, and what each idea contributes.
+
+The model has never seen the paper's map.
+"""
 
 from dataclasses import replace
 from typing import Any, Final
@@ -57,7 +60,10 @@ def trainings(settings: Settings) -> list[Training]:
 
 
 def report(settings: Settings) -> str:
-    """Return the shipped model's results on the paper's goals, and the table of the ablation."""
+    """Return the shipped model's results and the table of the ablation.
+
+    The results are those of the paper's goals.
+    """
     zero_shot = table(
         "the shipped model, which never saw these maps | ", _zero_shot(settings)
     )
@@ -104,11 +110,15 @@ def _zero_shot(settings: Settings) -> list[list[str]]:
 
 
 def move_errors(planner: Planner) -> tuple[int, float]:
-    """Count the moves classified wrongly, and return the mean relative error of their costs."""
+    """Count the wrongly classified moves; measure the mean error of the costs.
+
+    The error is relative to the true cost.
+    """
     network = planner.network
     assert isinstance(network, AnyMapQNetwork)
     wrong, errors = 0, []
-    # All 256 3x3 patches with a free centre under both rules; for the costs, each with random ones.
+    # All 256 3x3 patches with a free centre under both rules; for the costs, each with
+    # random ones.
     patches = OCCUPIED * (np.arange(2**9)[:, None] >> np.arange(9) & 1)
     patch_B9 = patches[patches[:, 4] == 0].astype(np.int8)
     random = np.random.default_rng(0).integers(UNKNOWN, OCCUPIED, patch_B9.shape)
@@ -127,7 +137,11 @@ def move_errors(planner: Planner) -> tuple[int, float]:
 
 
 def _held_out(planner: Planner, with_costs: bool) -> tuple[int, int, float]:
-    """Return solved starts, starts and mean ratio of rollouts without masking, on held-out maps."""
+    """Measure rollouts without action masking on held-out maps.
+
+    Return the number of solved starts, the number of starts and the mean ratio of
+    lengths.
+    """
     random = np.random.default_rng(0)
     count, starts, ratios = 0, 0, []
     for kind in HELD_OUT:

@@ -1,4 +1,7 @@
-"""A bare rclpy service that returns a ready path of so many poses: the planner node's yardstick."""
+"""A bare rclpy service that returns a ready path: the planner's yardstick.
+
+The argument is the number of poses of the path.
+"""
 
 import sys
 from contextlib import suppress

@@ -1,7 +1,8 @@
-"""Measures plans for robots with a body and a heading: collisions, costs, times and memory.
+"""Measures plans for bodies with a heading: collisions, costs, times, memory.
 
-``--figure collisions`` has each plan checked by an oracle of its own: the body's polygon, every
-2 cm and 2 degrees, against each occupied cell (Shapely). ``--maps`` adds ROS maps from a folder.
+``--figure collisions`` has each plan checked by an oracle of its own: the body's
+polygon, every 2 cm and 2 degrees, against each occupied cell (Shapely). ``--maps`` adds
+ROS maps from a folder.
 """
 
 import argparse
@@ -9,12 +10,13 @@ import gc
 import math
 import os
 import time
-from collections import defaultdict, deque
+from collections import defaultdict
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cache
-from itertools import pairwise, product
+from itertools import islice, pairwise, product
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import shapely
@@ -39,7 +41,8 @@ FOOTPRINTS: Final = {
     "car": "[[0.7, 0.3], [-0.2, 0.3], [-0.2, -0.3], [0.7, -0.3]]",
     "disc": "0.25",
     "triangle": "[[0.5, 0.0], [-0.3, 0.35], [-0.3, -0.35]]",
-    "corner": "[[0.5, 0.3], [0.1, 0.3], [0.1, 0.1], [-0.3, 0.1], [-0.3, -0.3], [0.5, -0.3]]",
+    "corner": "[[0.5, 0.3], [0.1, 0.3], [0.1, 0.1], [-0.3, 0.1], [-0.3, -0.3], "
+    "[0.5, -0.3]]",
     "long": "[[0.7, 0.2], [-0.5, 0.2], [-0.5, -0.2], [0.7, -0.2]]",
 }
 RADII: Final = {
@@ -47,31 +50,37 @@ RADII: Final = {
     Motion.ACKERMANN: 0.8,
     Motion.OMNIDIRECTIONAL: 0.4,
 }
-FAR, AHEAD = (50.0, 60.0), 2.0  # metres of a request, and to the box on its path
-METRES, RADIANS = 0.02, math.radians(2)  # between two poses that the oracle looks at
-SHRUNK = 1e-6  # metres, so that what only touches does not count
+SHORTEST_REQUEST: Final = 50.0  # metres from start to goal
+LONGEST_REQUEST: Final = 60.0
+BOX_AHEAD: Final = 2.0  # metres on the path to the box that is put on it
+ORACLE_METRES: Final = 0.02  # between two poses that the oracle tries
+ORACLE_RADIANS: Final = math.radians(2)
+SHRUNK: Final = 1e-6  # metres, so that a body that only touches does not collide
 
 Pose = tuple[float, float, float]
 
 
 def robot(footprint: str, motion: Motion | str) -> Planner:
-    """Return the planner of a body that knows its swept cells exactly, without a training."""
+    """Return the planner of a body that knows its swept cells exactly.
+
+    It needs no training.
+    """
     corners = read_footprint(footprint)
     motions = make_motions(motion, RADII[Motion(motion)], CELL)
     network = RobotNetwork.untrained(corners, motions)
     network.tensors["weight"] = network.swept_by_unit.astype(np.float32)
     network.tensors["threshold"] = np.full(network.sizes["units"], 0.5, np.float32)
-    about = (
-        "robot",
-        network.sizes,
-        MoveRule.ROBOT_SAFE,
-        1.0,
-        "",
-        0,
-        0,
-        package_version(),
+    metadata = ModelMetadata(
+        network="robot",
+        sizes=network.sizes,
+        move_rule=MoveRule.ROBOT_SAFE,
+        gamma=1.0,
+        map_fingerprint="",
+        steps=0,
+        seed=0,
+        package_version=package_version(),
     )
-    return Planner(network, ModelMetadata(*about))
+    return Planner(network, metadata)
 
 
 class Oracle:
@@ -87,27 +96,46 @@ class Oracle:
         self.corners = np.array(self.body.exterior.coords)
 
     def collisions(self, poses: NDArray[np.float64]) -> int:
-        """Return how many poses touch an occupied cell, of those every 2 cm and 2 degrees."""
-        x, y, yaw = np.column_stack([poses[:, :2], np.unwrap(poses[:, 2])]).T
-        steps = np.hypot(np.diff(x), np.diff(y)) / METRES
-        count = np.ceil(np.maximum(steps, np.abs(np.diff(yaw)) / RADIANS)).astype(int)
-        share = [np.linspace(0, 1, n, endpoint=False) for n in np.maximum(count, 1)]
-        at = np.concatenate([i + one for i, one in enumerate(share)] + [[len(x) - 1.0]])
-        x, y, yaw = (np.interp(at, np.arange(len(x)), axis) for axis in (x, y, yaw))
+        """Return how many poses of a path touch an occupied cell.
+
+        Poses are tried every 2 cm and every 2 degrees between those of `poses` (N, 3):
+        x, y in metres and the yaw in radians.
+        """
+        x, y, _ = poses.T
+        yaw = np.unwrap(poses[:, 2])
+        metres = np.hypot(np.diff(x), np.diff(y))
+        radians = np.abs(np.diff(yaw))
+        steps = np.maximum(metres / ORACLE_METRES, radians / ORACLE_RADIANS)
+        steps_between = np.maximum(np.ceil(steps), 1).astype(int)  # (N - 1,)
+
+        # (M,): the index in `poses` of each tried pose, with its share of the way on.
+        pieces = [
+            index + np.linspace(0, 1, count, endpoint=False)
+            for index, count in enumerate(steps_between)
+        ]
+        tried = np.concatenate([*pieces, [len(x) - 1.0]])
+        index = np.arange(len(x))
+        x, y, yaw = (np.interp(tried, index, column) for column in (x, y, yaw))
+
         cos, sin = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
-        u, v = self.corners.T
-        outline = np.stack(
-            [cos * u - sin * v + x[:, None], sin * u + cos * v + y[:, None]], -1
-        )
-        touched, _ = self.cells.query(shapely.polygons(outline), predicate="intersects")
-        return len(np.unique(touched))
+        ahead, left = self.corners.T  # metres from the origin of the body
+        outline_x = cos * ahead - sin * left + x[:, None]  # (M, corners)
+        outline_y = sin * ahead + cos * left + y[:, None]
+        outlines = shapely.polygons(np.stack([outline_x, outline_y], axis=-1))
+        touching, _ = self.cells.query(outlines, predicate="intersects")
+        return len(np.unique(touching))
 
 
 def inner_radius(corners: NDArray[np.float64]) -> float:
-    """Return the radius of the circle around the origin that fits into a polygon, metres."""
+    """Return the radius of the largest circle around the origin in a polygon, m.
+
+    `corners` (N, 2) are the polygon's, in metres.
+    """
     sides = np.roll(corners, -1, axis=0) - corners
-    share = np.clip(-(corners * sides).sum(axis=1) / (sides**2).sum(axis=1), 0, 1)
-    return float(np.hypot(*(corners + share[:, None] * sides).T).min())
+    # The point of each side that is nearest to the origin, as a share of the side.
+    share = -(corners * sides).sum(axis=1) / (sides**2).sum(axis=1)
+    points = corners + np.clip(share, 0, 1)[:, None] * sides
+    return float(np.hypot(*points.T).min())
 
 
 def requests(
@@ -116,48 +144,61 @@ def requests(
     """Yield starts and goals whose surroundings are free within a radius, in metres."""
     from scipy.ndimage import distance_transform_edt
 
-    free = (
-        distance_transform_edt(np.pad(~grid.occupancy, 1))[1:-1, 1:-1] * grid.resolution
-    )
-    rows, columns = np.nonzero(free > radius)
+    distance = distance_transform_edt(np.pad(~grid.occupancy, 1))[1:-1, 1:-1]
+    rows, columns = np.nonzero(distance * grid.resolution > radius)
     while len(rows):
         poses = []
-        for place in random.integers(len(rows), size=2):
-            x, y = grid.cell_to_world((int(columns[place]), int(rows[place])))
-            over, up, turn = random.uniform(-0.5, 0.5, 3)
-            poses.append((x + over * CELL, y + up * CELL, turn * 2 * math.pi))
+        for number in random.integers(len(rows), size=2):
+            x, y = grid.cell_to_world((int(columns[number]), int(rows[number])))
+            offset_x, offset_y, turns = random.uniform(-0.5, 0.5, 3)
+            yaw = turns * 2 * math.pi
+            poses.append((x + offset_x * CELL, y + offset_y * CELL, yaw))
         yield poses[0], poses[1]
 
 
-def worlds(maps: Path | None, random: np.random.Generator) -> dict[str, GridMap]:
-    """Return maps whose halls and doors are wide enough for a robot: generated, and from ROS."""
-    found = {}
+def map_files(folder: Path | None) -> list[Path]:
+    """Return the ROS maps of a folder, sorted; none without a folder."""
+    if folder is None:
+        return []
+    return sorted(folder.glob("*.yaml"))
+
+
+def worlds(folder: Path | None, random: np.random.Generator) -> dict[str, GridMap]:
+    """Return maps whose halls and doors are wide enough for a robot, by their names.
+
+    Some maps are generated, the others are the ROS maps of the folder.
+    """
+    maps = {}
     for kind in KINDS:
         cells = generate_map(kind, (14, 14), random)
-        found[kind] = GridMap(np.kron(cells, np.ones((20, 20), np.bool_)), CELL)
-    for path in sorted(maps.glob("*.yaml")) if maps else ():
-        found[path.stem] = load_map(path)
-    return found
+        maps[kind] = GridMap(np.kron(cells, np.ones((20, 20), np.bool_)), CELL)
+    for path in map_files(folder):
+        maps[path.stem] = load_map(path)
+    return maps
 
 
 @cache
 def ways(motions: Motions) -> list[dict[Cell, float]]:
-    """Return the cells that the origin passes on each primitive, and their shares of its length."""
-    found = []
+    """Return the cells that the origin passes on each primitive.
+
+    With each cell, an offset from the first one, comes its share of the primitive's
+    length. The cells are in the order of the way.
+    """
+    cells_of_primitives = []
     for poses in motions.poses:
-        at = np.linspace(0, len(poses) - 1, 1001)
-        way = np.column_stack(
-            [np.interp(at, range(len(poses)), poses[:, i]) for i in (0, 1)]
-        )
-        length = np.hypot(*np.diff(way, axis=0).T) + 1e-12
-        cells = np.floor((way[1:] + way[:-1]) / 2 + 0.5).astype(np.int64)
-        shares: dict[Cell, float] = defaultdict(float)
-        for (x, y), share in zip(
-            cells.tolist(), (length / length.sum()).tolist(), strict=True
-        ):
-            shares[x, y] += share
-        found.append(shares)
-    return found
+        index = np.linspace(0, len(poses) - 1, 1001)
+        x = np.interp(index, range(len(poses)), poses[:, 0])
+        y = np.interp(index, range(len(poses)), poses[:, 1])
+        points = np.column_stack([x, y])
+        lengths = np.hypot(*np.diff(points, axis=0).T) + 1e-12
+        middles = (points[1:] + points[:-1]) / 2
+        cells = np.floor(middles + 0.5).astype(np.int64)
+        length_shares = (lengths / lengths.sum()).tolist()
+        share_of_cell: dict[Cell, float] = defaultdict(float)
+        for (x, y), share in zip(cells.tolist(), length_shares, strict=True):
+            share_of_cell[x, y] += share
+        cells_of_primitives.append(share_of_cell)
+    return cells_of_primitives
 
 
 def least_costs(
@@ -166,168 +207,261 @@ def least_costs(
     swept: NDArray[np.bool_],
     *goals: tuple[int, int, int],
 ) -> NDArray[np.float64]:
-    """Return (H, W, 16): the least cost from every pose to a goal, in cells, by Dijkstra."""
-    height, width = grid.occupancy.shape
-    reach, multiplier = swept.shape[-1] // 2, grid.cost_multiplier
-    occupied = np.pad(grid.occupancy, reach, constant_values=True)
-    edges = []
-    for number, way in enumerate(ways(motions)):
-        hit = np.zeros((height, width), np.bool_)
-        for y, x in np.argwhere(swept[number]):
-            hit |= occupied[y : y + height, x : x + width]
-        for over, up in way:  # an origin outside of the body may leave the map
-            hit[max(height - up, 0) :] = hit[:, max(width - over, 0) :] = True
-            hit[: max(-up, 0)] = hit[:, : max(-over, 0)] = True
-        y, x = np.nonzero(~hit)
-        factor = np.zeros(len(x))
-        for (over, up), share in way.items():
-            factor += share * multiplier[y + up, x + over]
-        allowed = np.ones(len(x), np.bool_)
-        for here, after in pairwise(way):
-            if grid.forbidden is not None:
-                action = MOVES.tolist().index([after[0] - here[0], after[1] - here[1]])
-                allowed &= (grid.forbidden[y + here[1], x + here[0]] >> action & 1) == 0
-        over, up = motions.offset[number]
-        before = (y * width + x) * 16 + motions.start[number]
-        after = ((y + up) * width + x + over) * 16 + motions.end[number]
-        edges.append(
-            np.column_stack([before, after, motions.cost[number] * factor])[allowed]
-        )
-    before, after, cost = np.concatenate(edges).T
-    size = grid.occupancy.size * 16
-    graph = coo_matrix(
-        (cost, (after.astype(int), before.astype(int))), (size, size)
-    ).tocsr()
-    numbers = [(y * width + x) * 16 + heading for x, y, heading in goals]
+    """Return the least cost from every pose to a goal, by Dijkstra.
+
+    `swept` (primitives, side, side) has the cells that the body sweeps on each
+    primitive; its middle is the cell of the origin. A goal is (x, y, heading). The
+    costs are in cells: (H, W, headings), infinite without a path.
+    """
+    edges = [
+        edges_of_primitive(grid, motions, swept, primitive)
+        for primitive in range(len(motions.poses))
+    ]
+    pose, next_pose, cost = np.concatenate(edges).T
+    size = grid.occupancy.size * HEADINGS
+    # Against the drive, as the search begins at the goals.
+    ends = next_pose.astype(int), pose.astype(int)
+    graph = coo_matrix((cost, ends), (size, size)).tocsr()
+    numbers = [(y * grid.width + x) * HEADINGS + heading for x, y, heading in goals]
     costs: NDArray[np.float64] = dijkstra(graph, indices=numbers, min_only=True)
-    return costs.reshape(height, width, 16)
+    return costs.reshape(grid.height, grid.width, HEADINGS)
+
+
+def edges_of_primitive(
+    grid: GridMap, motions: Motions, swept: NDArray[np.bool_], primitive: int
+) -> NDArray[np.float64]:
+    """Return the drives of one primitive on the map, (N, 3).
+
+    The columns are the number of the pose, of the next pose, and the cost in cells.
+    """
+    way = ways(motions)[primitive]
+    y, x = np.nonzero(~is_blocked(grid, swept[primitive], way))
+    factor = np.zeros(len(x))
+    for (dx, dy), share in way.items():
+        factor += share * grid.cost_multiplier[y + dy, x + dx]
+    is_allowed = np.ones(len(x), np.bool_)
+    if grid.forbidden is not None:
+        for (dx, dy), (next_dx, next_dy) in pairwise(way):
+            action = MOVES.tolist().index([next_dx - dx, next_dy - dy])
+            actions = grid.forbidden[y + dy, x + dx]  # a bit for each forbidden one
+            is_allowed &= (actions >> action & 1) == 0
+    dx, dy = motions.offset[primitive]
+    pose = (y * grid.width + x) * HEADINGS + motions.start[primitive]
+    next_cell = (y + dy) * grid.width + x + dx
+    next_pose = next_cell * HEADINGS + motions.end[primitive]
+    cost = motions.cost[primitive] * factor
+    return np.column_stack([pose, next_pose, cost])[is_allowed]
+
+
+def is_blocked(
+    grid: GridMap, swept: NDArray[np.bool_], way: dict[Cell, float]
+) -> NDArray[np.bool_]:
+    """Return where a primitive cannot begin: (H, W).
+
+    The body would touch an occupied cell of the map or its border.
+    """
+    height, width = grid.occupancy.shape
+    reach = swept.shape[-1] // 2
+    occupied = np.pad(grid.occupancy, reach, constant_values=True)
+    blocked = np.zeros((height, width), np.bool_)
+    for y, x in np.argwhere(swept):
+        blocked |= occupied[y : y + height, x : x + width]
+    for dx, dy in way:  # an origin outside of the body may leave the map
+        blocked[max(height - dy, 0) :] = True
+        blocked[: max(-dy, 0)] = True
+        blocked[:, max(width - dx, 0) :] = True
+        blocked[:, : max(-dx, 0)] = True
+    return blocked
 
 
 def narrow(random: np.random.Generator) -> Iterator[tuple[str, NDArray[np.bool_]]]:
-    """Yield doors 10 cm wider than a body of 0.6 m, corridors with a turn, and mazes."""
+    """Yield doors 10 cm wider than a body of 0.6 m, corridors and mazes."""
     for _ in range(3):
         occupancy = np.zeros((100, 110), np.bool_)
-        wall, door = random.integers(35, 75), random.integers(5, 81)
+        wall = random.integers(35, 75)
+        door = random.integers(5, 81)
         occupancy[:, wall : wall + random.integers(1, 9)] = True
         occupancy[door : door + 14] = False
         yield "door", occupancy
         occupancy = np.ones((100, 110), np.bool_)
-        wide, corner = random.integers(14, 24), random.integers(45, 80)
-        occupancy[5 : 5 + wide, 5:corner] = occupancy[5:95, corner - wide : corner] = (
-            False
-        )
+        width = random.integers(14, 24)
+        corner = random.integers(45, 80)
+        occupancy[5 : 5 + width, 5:corner] = False
+        occupancy[5:95, corner - width : corner] = False
         yield "corridor with a turn", occupancy
         maze = generate_map("maze", (5, 5), random)
         yield "maze", np.kron(maze, np.ones((24, 24), np.bool_))
 
 
+@dataclass
+class Optimality:
+    """What plans in one kind of narrow place cost; the ratios are the greatest."""
+
+    requests: int = 0
+    solved: int = 0
+    above_bound: int = 0
+    first_ratio: float = 1.0  # of the cost of the first plan to the least one
+    last_ratio: float = 1.0  # of the plan whose bound is 1
+    bound: float = 1.0  # that was proved of the first plan
+
+
 def optimality(options: argparse.Namespace) -> Iterator[list[Any]]:
-    """Yield a row for each kind of narrow place: what is solved, and costs over the least."""
-    random, planner = np.random.default_rng(options.seed), Planner.load(options.model)
+    """Yield a row for each kind of narrow place.
+
+    A row has the number of solved requests, and their costs over the least ones.
+    """
+    random = np.random.default_rng(options.seed)
+    planner = Planner.load(options.model)
     assert isinstance(planner.network, RobotNetwork)
-    motions, swept = planner.network.motions, planner.network.swept()
-    rows: dict[str, list[Any]] = {}
+    motions = planner.network.motions
+    results: dict[str, Optimality] = {}
     for name, occupancy in narrow(random):
-        grid, row = (
-            GridMap(occupancy, CELL),
-            rows.setdefault(name, [0, 0, 0, 1.0, 1.0, 1.0]),
-        )
-        best = np.full(1, np.inf)
-        while np.isfinite(best).sum() < 1000:
+        grid = GridMap(occupancy, CELL)
+        result = results.setdefault(name, Optimality())
+        least = np.full(1, np.inf)
+        while np.isfinite(least).sum() < 1000:
             y, x = random.choice(np.argwhere(~occupancy)).tolist()
             heading = int(random.integers(HEADINGS))
-            best = least_costs(grid, motions, swept, (x, y, heading))
-        end = *grid.cell_to_world((x, y)), float(motions.angles[heading])
-        reached = np.argwhere(np.isfinite(best) & (best > 0))
-        for y, x, heading in random.choice(reached, options.requests).tolist():
-            start = *grid.cell_to_world((x, y)), float(motions.angles[heading])
-            first, last = (
-                planner.plan_poses(grid, start, end, bound=b) for b in (1.2, 1.0)
-            )
-            ratios = [
-                (plan.cost or np.nan) / best[y, x, heading] for plan in (first, last)
-            ]
-            row[:2] = row[0] + 1, row[1] + bool(first.poses.size and last.poses.size)
-            row[2] += ratios[0] > first.bound * 1.0001
-            row[3:] = np.maximum(row[3:], [*ratios, first.bound]).tolist()
-    for name, row in rows.items():
-        yield [name, *row[:3], *(f"{ratio:.4f}" for ratio in row[3:])]
+            goal = (x, y, heading)
+            least = least_costs(grid, motions, planner.network.swept(), goal)
+        end = pose_at(grid, motions, *goal)
+        starts = np.argwhere(np.isfinite(least) & (least > 0))
+        for y, x, heading in random.choice(starts, options.requests).tolist():
+            start = pose_at(grid, motions, x, y, heading)
+            _compare(planner, grid, start, end, least[y, x, heading], result)
+    for name, result in results.items():
+        ratios = result.first_ratio, result.last_ratio, result.bound
+        counts = result.requests, result.solved, result.above_bound
+        yield [name, *counts, *(f"{ratio:.4f}" for ratio in ratios)]
+
+
+def pose_at(grid: GridMap, motions: Motions, x: int, y: int, heading: int) -> Pose:
+    """Return the pose of a cell's centre with a numbered heading."""
+    return (*grid.cell_to_world((x, y)), float(motions.angles[heading]))
+
+
+def _compare(
+    planner: Planner,
+    grid: GridMap,
+    start: Pose,
+    goal: Pose,
+    least_cost: float,
+    result: Optimality,
+) -> None:
+    """Plan with the bounds 1.2 and 1, and add the plans to the result."""
+    first = planner.plan_poses(grid, start, goal, bound=1.2)
+    last = planner.plan_poses(grid, start, goal, bound=1.0)
+    first_ratio = (first.cost or np.nan) / least_cost
+    last_ratio = (last.cost or np.nan) / least_cost
+    result.requests += 1
+    result.solved += bool(first.poses.size and last.poses.size)
+    result.above_bound += bool(first_ratio > first.bound * 1.0001)
+    # NaN, of a request without a plan, stays.
+    result.first_ratio = float(np.maximum(result.first_ratio, first_ratio))
+    result.last_ratio = float(np.maximum(result.last_ratio, last_ratio))
+    result.bound = max(result.bound, first.bound)
 
 
 def collisions(options: argparse.Namespace) -> Iterator[list[Any]]:
-    """Yield a row for each body and motion: requests, plans, how many of them collide, poses."""
+    """Yield a row of the table of collisions for each body and motion.
+
+    A row has the numbers of requests, plans, colliding plans and poses.
+    """
     random = np.random.default_rng(options.seed)
     maps = worlds(options.maps, random)
     for (name, footprint), motion in product(FOOTPRINTS.items(), Motion):
-        planner, counts = robot(footprint, motion), np.zeros(4, np.int64)
+        planner = robot(footprint, motion)
         radius = inner_radius(read_footprint(footprint))
+        plans = []
+        colliding = 0
         for grid in maps.values():
-            oracle, asked = (
-                Oracle(grid, footprint),
-                requests(grid, radius + CELL, random),
-            )
-            for _, (start, goal) in zip(range(options.requests), asked, strict=False):
+            oracle = Oracle(grid, footprint)
+            drawn = requests(grid, radius + CELL, random)
+            for start, goal in islice(drawn, options.requests):
                 plan = planner.plan_poses(grid, start, goal)
-                collides = bool(plan.poses.size and oracle.collisions(plan.poses))
-                counts += 1, bool(plan.poses.size), collides, len(plan.poses)
-        yield [name, motion.value, *counts.tolist()]
+                plans.append(len(plan.poses))
+                if plan.poses.size:
+                    colliding += oracle.collisions(plan.poses) > 0
+        solved = np.count_nonzero(plans)
+        yield [name, motion.value, len(plans), solved, colliding, sum(plans)]
+
+
+class Speed(NamedTuple):
+    """What one request took: milliseconds of CPU time, if no unit is named."""
+
+    first: float
+    next: float  # from the next poses of the first plan
+    repair: float  # after a change of the map
+    new: float  # with a new field on the changed map
+    bound: float  # that was proved of the first plan
+    megabytes: float
 
 
 def speed(options: argparse.Namespace) -> Iterator[list[Any]]:
     """Yield a row for each map: what a request of 50 to 60 m costs, in CPU time."""
     maps = {f"blocks, {share:.0%}": blocks(share, options.seed) for share in (0.1, 0.2)}
-    for path in sorted(options.maps.glob("*.yaml")) if options.maps else ():
-        if min((grid := load_map(path)).occupancy.shape) * grid.resolution > FAR[1]:
+    for path in map_files(options.maps):
+        grid = load_map(path)
+        if min(grid.occupancy.shape) * grid.resolution > LONGEST_REQUEST:
             maps[path.stem] = grid
     for name, grid in maps.items():
         random = np.random.default_rng(options.seed)
-        figures: list[list[float]] = []
-        asked = requests(grid, 0.55, random)
+        drawn = requests(grid, 0.55, random)
         planner = Planner.load(options.model)
-        deque(warm_up(planner), maxlen=0)  # what is compiled first takes long
-        while len(figures) < options.requests:
-            start, goal = next(asked)
-            if FAR[0] < math.dist(start[:2], goal[:2]) < FAR[1]:
-                figures.append(drive(planner, grid, start, goal, options.bound))
-        found = np.array(figures)
-        middle, worst, ratio = (
-            np.median(found, axis=0),
-            found.max(axis=0),
-            found[:, 2] / found[:, 3],
-        )
-        row = [
-            found[:, 0].mean(),
-            worst[0],
-            *middle[1:4],
-            np.median(ratio),
-            ratio.max(),
-        ]
-        yield [name, *(f"{x:.2f}" for x in (*row, found[:, 4].mean(), worst[5]))]
+        for _ in warm_up(planner):  # what is compiled first takes long
+            pass
+        speeds: list[Speed] = []
+        while len(speeds) < options.requests:
+            start, goal = next(drawn)
+            distance = math.dist(start[:2], goal[:2])
+            if SHORTEST_REQUEST < distance < LONGEST_REQUEST:
+                speeds.append(drive(planner, grid, start, goal, options.bound))
+        yield [name, *(f"{figure:.2f}" for figure in figures_of(speeds))]
+
+
+def figures_of(speeds: list[Speed]) -> list[float]:
+    """Return the figures of a row of the table of speed."""
+    columns = Speed(*np.array(speeds).T)
+    ratio = columns.repair / columns.new
+    return [
+        columns.first.mean(),
+        columns.first.max(),
+        np.median(columns.next),
+        np.median(columns.repair),
+        np.median(columns.new),
+        np.median(ratio),
+        ratio.max(),
+        columns.bound.mean(),
+        columns.megabytes.max(),
+    ]
 
 
 def drive(
     planner: Planner, grid: GridMap, start: Pose, goal: Pose, bound: float
-) -> list[float]:
-    """Return milliseconds: first plan, next, repair, new; then the bound, and the memory in MB."""
-    other = Planner(planner.network, planner.metadata)
-    for one in (planner, other):  # what holds for the map
-        one.plan_poses(grid, start, start)
+) -> Speed:
+    """Measure one request; the robot drives some poses, and the map changes."""
+    other_planner = Planner(planner.network, planner.metadata)
+    # What holds for the map is made before.
+    planner.plan_poses(grid, start, start)
+    other_planner.plan_poses(grid, start, start)
     gc.collect()
-    before = resident()
+    former_memory = resident()
     first, plan = timed(planner, grid, start, goal, bound)
-    memory = resident() - before
+    memory = resident() - former_memory
     if not plan.poses.size:
-        return [first, 0, 1, 1, 1, memory]
-    following = [
-        timed(planner, grid, tuple(pose), goal, bound) for pose in plan.poses[1:12]
+        return Speed(first, 0, 1, 1, 1, memory)
+    times = [
+        timed(planner, grid, tuple(pose), goal, bound)[0] for pose in plan.poses[1:12]
     ]
-    after = float(np.median([milliseconds for milliseconds, _ in following]))
-    way = np.append(0, np.cumsum(np.hypot(*np.diff(plan.poses[:, :2].T))))
-    x, y = grid.world_to_cell(*plan.poses[np.searchsorted(way, AHEAD), :2])
+    # A box of 40 cm on the path.
+    steps = np.hypot(*np.diff(plan.poses[:, :2].T))
+    metres = np.append(0, np.cumsum(steps))
+    box_pose = plan.poses[np.searchsorted(metres, BOX_AHEAD)]
+    x, y = grid.world_to_cell(*box_pose[:2])
     changed = grid.with_patch(np.ones((8, 8), np.bool_), x - 4, y - 4)
     repair, _ = timed(planner, changed, start, goal, bound)
-    new, _ = timed(other, changed, start, goal, bound)
-    return [first, after, repair, new, plan.bound, memory]
+    new, _ = timed(other_planner, changed, start, goal, bound)
+    return Speed(first, float(np.median(times)), repair, new, plan.bound, memory)
 
 
 def timed(
@@ -341,25 +475,26 @@ def timed(
 
 def resident() -> float:
     """Return the memory of this process in MB."""
-    return (
-        int(Path("/proc/self/statm").read_text().split()[1])
-        * os.sysconf("SC_PAGESIZE")
-        / 1e6
-    )
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGESIZE") / 1e6
 
 
 def blocks(share: float, seed: int) -> GridMap:
-    """Return 2000 x 2000 cells, of which rectangles and discs of 2 to 5 m cover a share."""
-    random, occupancy = np.random.default_rng(seed), np.zeros((2000, 2000), np.bool_)
+    """Return a map of rectangles and discs of 2 to 5 m.
+
+    The map has 2000 x 2000 cells; the obstacles cover a share of them.
+    """
+    random = np.random.default_rng(seed)
+    occupancy = np.zeros((2000, 2000), np.bool_)
     rows, columns = np.ogrid[:2000, :2000]
     while occupancy.mean() < share:
-        (x, y), (wide, high) = (
-            random.integers(2000, size=2),
-            random.integers(20, 50, size=2),
-        )
-        box = abs(columns - x) < wide, abs(rows - y) < high
-        disc = (columns - x) ** 2 + (rows - y) ** 2 < wide**2
-        occupancy |= box[0] & box[1] if random.random() < 0.5 else disc
+        x, y = random.integers(2000, size=2)
+        half_width, half_height = random.integers(20, 50, size=2)
+        if random.random() < 0.5:
+            is_in_columns = abs(columns - x) < half_width
+            occupancy |= is_in_columns & (abs(rows - y) < half_height)
+        else:
+            occupancy |= (columns - x) ** 2 + (rows - y) ** 2 < half_width**2
     return GridMap(occupancy, CELL)
 
 
@@ -369,11 +504,13 @@ FIGURES: Final = {
         collisions,
     ),
     "optimality": (
-        "place | requests with a way | solved | above the bound | worst cost | at last | bound",
+        "place | requests with a way | solved | above the bound | worst cost "
+        "| at last | bound",
         optimality,
     ),
     "speed": (
-        "map | first, mean ms | worst | next | repair | new | ratio | worst | bound | MB",
+        "map | first, mean ms | worst | next | repair | new | ratio | worst "
+        "| bound | MB",
         speed,
     ),
 }

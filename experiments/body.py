@@ -1,4 +1,7 @@
-"""Measures what a robot's body costs on a ROS map (a path), with the robot's radius in metres."""
+"""Measures what a robot's body costs on a ROS map.
+
+The arguments are the path of the map and the radius of the robot in metres.
+"""
 
 import sys
 from collections.abc import Sequence

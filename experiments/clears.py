@@ -1,7 +1,9 @@
-"""Counts how often a request right after a clear of the costmap has a path, and how long it waits.
+"""Measures requests right after a clear of the costmap.
 
-It does what Nav2's behavior tree does: a plan fails, the costmap is cleared, and the same request
-comes again at once, before the cleared costmap was published.
+How often has such a request a path, and how long does it wait?
+
+It does what Nav2's behavior tree does: a plan fails, the costmap is cleared, and the
+same request comes again at once, before the cleared costmap was published.
 """
 
 import subprocess

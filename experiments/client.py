@@ -38,8 +38,8 @@ from ddqn_planner.resources import find_map
 SAME_CROSSING = 1e-9  # of a segment: two crossings so near to each other are one
 RULE = MoveRule.ROBOT_SAFE  # of the planner's default model
 TIMEOUT = 120.0  # seconds that anything may take on a loaded machine
-# With Fast DDS each client of a service hears the answers to all clients. One that is slow to read
-# them loses its own from the usual queue of ten.
+# With Fast DDS each client of a service hears the answers to all clients. One that is
+# slow to read them loses its own from the usual queue of ten.
 SERVICE_QUALITY = QoSProfile(depth=1000)
 
 T = TypeVar("T")
@@ -51,7 +51,10 @@ def wait_for(
     children: Iterable[Popen[bytes]] = (),
     timeout: float = TIMEOUT,
 ) -> T:
-    """Return the first answer that is true; RuntimeError if a child ends, else TimeoutError."""
+    """Wait for the first answer that is true, and return it.
+
+    RuntimeError if a child process ends before, TimeoutError if it takes too long.
+    """
     deadline = time.monotonic() + timeout
     while not (found := answer()):
         for child in children:
@@ -64,7 +67,7 @@ def wait_for(
 
 
 class Recorder:
-    """The messages that a topic brought since the last `clear`: all, or the last `keep`."""
+    """The messages of a topic since the last `clear`: all, or the last `keep`."""
 
     def __init__(self, keep: int | None = None) -> None:
         self._arrived = threading.Condition()
@@ -98,7 +101,10 @@ class Recorder:
         predicate: Callable[[Any], Any] = lambda message: True,
         timeout: float = TIMEOUT,
     ) -> Any:
-        """Return the first message for which the predicate holds, or raise TimeoutError."""
+        """Return the first message for which the predicate holds.
+
+        TimeoutError if none comes.
+        """
         with self._arrived:
             found = self._arrived.wait_for(lambda: self.find(predicate), timeout)
             if found is None:
@@ -109,7 +115,7 @@ class Recorder:
 
 
 def ask(service: Any, request: Any, timeout: float = TIMEOUT) -> Any:
-    """Return the answer to a request of rclpy's client of a service, or raise TimeoutError."""
+    """Return the answer to a request to a service, or raise TimeoutError."""
     answers, future = queue.SimpleQueue[Any](), service.call_async(request)
     future.add_done_callback(answers.put)
     try:
@@ -158,20 +164,25 @@ class Client(ExitStack):
         return self._executor.create_task(function, *arguments)
 
     def service(self, service_type: Any, name: str) -> Any:
-        """Return rclpy's client of a service, always the same one, once both sides are ready."""
+        """Return rclpy's client of a service once both sides are ready.
+
+        There is one client for each service.
+        """
         service = self._services.get(name) or self.node.create_client(
             service_type, name, qos_profile=SERVICE_QUALITY
         )
         wait_for(f"service {name}", service.service_is_ready)
         if name not in self._services:
-            # The middleware drops the answer to a client that the node has not discovered yet.
+            # The middleware drops the answer to a client that the node has not
+            # discovered yet.
             self.wait_for_discovery(name.rpartition("/")[0])
             self._services[name] = service
         return service
 
     def wait_for_discovery(self, node: str) -> None:
         """Wait until a node has discovered all that this client has created so far."""
-        # It discovers in the order of creation, so it knows the rest when it answers a new client.
+        # It discovers in the order of creation, so it knows the rest when it answers a
+        # new client.
         probe = self.node.create_client(GetParameters, f"{node}/get_parameters")
         wait_for(f"parameters of {node}", probe.service_is_ready)
         answered = threading.Event()
@@ -186,7 +197,10 @@ class Client(ExitStack):
         self.run(self.node.destroy_client, probe)  # its thread may hold it
 
     def entities(self, node: str) -> set[tuple[str, str, str]]:
-        """Return the kind, name and type of what a node of this namespace has, once discovered."""
+        """Return the topics and services of a node of this namespace.
+
+        Each is a tuple of kind, name and type.
+        """
         namespace = self.node.get_namespace()
         kinds = {
             "publishes": self.node.get_publisher_names_and_types_by_node,
@@ -204,7 +218,10 @@ class Client(ExitStack):
     def call(
         self, kind: Any, name: str, request: Any = None, timeout: float = TIMEOUT
     ) -> Any:
-        """Wait for a service, call it, and return its response; or raise TimeoutError."""
+        """Wait for a service, call it, and return its response.
+
+        TimeoutError if there is none.
+        """
         return ask(self.service(kind, name), request or kind.Request(), timeout)
 
     def publisher(
@@ -251,7 +268,7 @@ class Client(ExitStack):
         return answer.plan
 
     def set_parameters(self, node: str, **values: Any) -> list[Any]:
-        """Set parameters of a node one by one; return a SetParametersResult for each."""
+        """Set parameters of a node; return a SetParametersResult for each."""
         messages = [
             Parameter(name, value=v).to_parameter_msg() for name, v in values.items()
         ]
@@ -266,7 +283,10 @@ class Client(ExitStack):
 
 
 class RobotPoses:
-    """Publishes a robot's poses: `odom` and, where tf2_ros is installed, a transform."""
+    """Publishes a robot's poses as odometry.
+
+    Where tf2_ros is installed, it sends a transform, too.
+    """
 
     def __init__(self, node: Any) -> None:
         self._odometry = node.create_publisher(Odometry, "odom", 100)
@@ -277,7 +297,10 @@ class RobotPoses:
             self._send_transform = TransformBroadcaster(node).sendTransform
 
     def publish(self, header: Header, x: float, y: float, yaw: float = 0.0) -> None:
-        """Publish a pose of `base_link` in the header's frame, in metres and radians."""
+        """Publish a pose of `base_link` in the header's frame.
+
+        The pose is in metres and radians.
+        """
         odometry = Odometry(header=header, child_frame_id="base_link")
         transform = TransformStamped(header=header, child_frame_id="base_link")
         for place in (odometry.pose.pose.position, transform.transform.translation):
@@ -290,7 +313,10 @@ class RobotPoses:
 def pose(
     grid: GridMap, cell: Cell, yaw: float = 0.0, offset: float = 0.0
 ) -> PoseStamped:
-    """Return the pose of a cell's centre in the map frame, or one that is `offset` m beside it."""
+    """Return the pose of a cell's centre, or of a point `offset` m beside it.
+
+    The pose is in the map frame.
+    """
     message = PoseStamped(header=Header(frame_id="map"))
     x, y = grid.cell_to_world(cell)
     message.pose.position.x, message.pose.position.y = x + offset, y - offset
@@ -323,7 +349,7 @@ def cells_of(grid: GridMap, path: Path) -> list[Cell]:
 def map_message(
     values: NDArray[np.int8], grid: GridMap, stamp: int = 0
 ) -> OccupancyGrid:
-    """Return the message of a map in the map frame, stamped with a number of seconds."""
+    """Return a map as a message, stamped with a number of seconds."""
     header = Header(frame_id="map", stamp=Time(sec=stamp))
     return occupancy_message(values, grid.resolution, grid.origin, header)
 
@@ -363,7 +389,10 @@ class MapFixture:
         return [plan_request(self.grid, *cells) for cells in drawn]
 
     def error(self, request: GetPlan.Request, plan: Path) -> str:
-        """Say what is wrong with an answer for a robot that cuts no corners; "" if nothing is."""
+        """Say what is wrong with an answer; "" if nothing is.
+
+        The robot cuts no corners.
+        """
         grid = self.grid
         start, goal = (cell_of(grid, pose) for pose in (request.start, request.goal))
         if not plan.poses:
@@ -377,7 +406,10 @@ class MapFixture:
         points = np.array([point_of(stamped) for stamped in plan.poses])
         for point, pose in ((points[0], request.start), (points[-1], request.goal)):
             if point.tolist() != [*point_of(pose)]:
-                return f"a path from {points[0]} to {points[-1]}, asked was {start} to {goal}"
+                return (
+                    f"a path from {points[0]} to {points[-1]}, "
+                    f"asked was {start} to {goal}"
+                )
         cells = cells_passed(grid, points)
         # A robot on an obstacle may leave it, and what is next to it.
         leaving = 0
@@ -398,7 +430,7 @@ def point_of(stamped: PoseStamped) -> tuple[float, float]:
 
 
 def cells_passed(grid: GridMap, points: NDArray[np.float64]) -> list[Cell]:
-    """Return the cells through which a path leads, also those of which it cuts a corner.
+    """Return the cells of a path, and those of which it cuts a corner.
 
     A cell follows another diagonally only where the path passes their common corner.
     """
@@ -415,7 +447,7 @@ def cells_passed(grid: GridMap, points: NDArray[np.float64]) -> list[Cell]:
 def _points_between_borders(
     begin: NDArray[np.float64], end: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return a point (x, y) of each stretch of a segment that lies in one cell: (N, 2)."""
+    """Return a point (x, y) in each cell that a segment passes: (N, 2)."""
     shares = [0.0, 1.0]  # of the segment where it crosses a border of cells
     for first, last in zip(begin.tolist(), end.tolist(), strict=True):
         low, high = sorted((first, last))
@@ -434,7 +466,10 @@ def _points_between_borders(
 def generated_map(
     kind: str, side: int, resolution: float = 0.05, seed: Any = 0
 ) -> MapFixture:
-    """Return a square map of a kind, always the same one; a generator as a seed moves on."""
+    """Return a square map of a kind.
+
+    It is always the same one, unless the seed is a generator, which moves on.
+    """
     occupancy = generate_map(kind, (side, side), np.random.default_rng(seed))
     return MapFixture(MapFile(OCCUPIED * occupancy, resolution))
 

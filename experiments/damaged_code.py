@@ -1,4 +1,4 @@
-"""Damages all files of compiled code, in each way, and checks the plans and warnings after it."""
+"""Damages all files of compiled code, and checks plans and warnings after it."""
 
 import os
 import shutil
@@ -26,8 +26,12 @@ for _ in warm_up(planner, learns=True):
 occupancy = np.random.default_rng(0).random((40, 50)) < 0.2
 occupancy[30] = True
 for start, goal, tolerance in [((2, 2), (40, 4), 0), ((3, 9), (44, 38), 40)]:
-    for grid in (GridMap(occupancy), GridMap(occupancy, cost=np.ones((40, 50), np.int8))):
-        plan = planner.plan(grid, start, goal, tolerance=tolerance, simplified=bool(tolerance))
+    for cost in (None, np.ones((40, 50), np.int8)):
+        grid = GridMap(occupancy, cost=cost)
+        is_straight = tolerance > 0
+        plan = planner.plan(
+            grid, start, goal, tolerance=tolerance, simplified=is_straight
+        )
         print(plan.status.name, plan.length, plan.cells)
 """
 Damage = Callable[[bytes, np.random.Generator], bytes]
@@ -73,7 +77,10 @@ def plan(folder: Path, python: str) -> subprocess.CompletedProcess[str]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Damage the files with this Python or another; return 1 if a plan or a warning was wrong."""
+    """Damage the files; return 1 if a plan or a warning was wrong.
+
+    The plans are made by this Python or by another.
+    """
     python = arguments[0] if arguments else sys.executable
     random = np.random.default_rng(0)
     rows, n_wrong = [], 0

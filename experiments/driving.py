@@ -1,4 +1,4 @@
-"""Measure how much sooner a robot arrives that remembers how long places took, in many worlds."""
+"""Measures how much sooner a robot arrives that remembers times, in many worlds."""
 
 import argparse
 import itertools
@@ -10,7 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-# Before NumPy is imported. On a busy machine, several threads are ten times as slow as one.
+# Before NumPy is imported. On a busy machine, several threads are ten times as slow as
+# one.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import driving_worlds as worlds
@@ -117,7 +118,7 @@ def moved(options: Options) -> Sections:
 
 
 def priors(options: Options) -> Sections:
-    """Measure missions on a map never driven, without a prior and with one from another map."""
+    """Measure missions on a new map, with a prior from another map and without."""
     rows = []
     for source, hidden in PRIORS[: 1 if options.quick else None]:
         kinds = [f"{name}-{hidden}" for name in (*NEW_MAPS, *options.maps_found)]
@@ -138,7 +139,10 @@ def priors(options: Options) -> Sections:
 
 
 def doors(options: Options) -> Sections:
-    """Count the drives through a door where the robot waits, beside one that is 6 s farther."""
+    """Count the drives through a door where the robot waits.
+
+    Another door is 6 s farther.
+    """
     occupancy = np.zeros((40, 40), dtype=np.bool_)
     occupancy[20] = True
     occupancy[20, 10:13] = occupancy[20, 24:27] = False
@@ -158,7 +162,10 @@ def doors(options: Options) -> Sections:
 
 
 def zones(_: Options) -> Sections:
-    """Measure the slowness that is learned of a zone of 4.0, with poses of several kinds."""
+    """Measure the learned slowness of a zone whose slowness is 4.0.
+
+    The poses are of several kinds.
+    """
     grid, always = GridMap(np.zeros((20, 80), dtype=np.bool_), 0.25), np.ones((20, 80))
     always[:, 32:48] = 4
     path = [(x, 10) for x in range(2, 78)]
@@ -190,7 +197,10 @@ def zones(_: Options) -> Sections:
 
 
 def speed(_: Options) -> Sections:
-    """Measure the CPU time to learn from 1,000 poses on 1000 x 1000 cells, and to plan again."""
+    """Measure the CPU time to learn from 1,000 poses, and to plan again.
+
+    The map has 1000 x 1000 cells.
+    """
     random = np.random.default_rng(0)
     grid = GridMap(generate_map("office", (1000, 1000), random), 0.05)
     world = worlds.make_world(grid, "mixture", random)
@@ -282,7 +292,7 @@ def _every_kind(
 
 
 def _above(results: Sequence[Result], stages: Stages = STAGES) -> list[float]:
-    """Return the mean time above the best possible in each stage reached, in percent."""
+    """Return the mean time above the best possible in each stage, in percent."""
     return [
         100 * float(np.mean([result.ratio(first, end) for result in results]) - 1)
         for first, end in stages

@@ -20,7 +20,8 @@ WINDOW: Final = 0.5  # seconds over which poses are averaged
 MORE_PLACES: Final = 1.1  # times as many as the last time teach the prior anew
 CELL, SQUARE = 0.25, 1.0  # metres: the sides of places
 VISIT_NOISE: Final = 0.1  # variance of the log slowness of a visit
-# Of the parameters of a Gaussian process: the length, and the deviations of signal and noise.
+# Of the parameters of a Gaussian process: the length, and the deviations of signal and
+# noise.
 LIMITS: Final = np.log([0.5, 0.05, 0.05]), np.log([10, 2, 2])
 
 
@@ -73,7 +74,7 @@ class Learner:
         )
 
     def learn(self, squares: Any, metres: Float64, slowness: Float64) -> None:
-        """Learn from the squares of a drive, from the metres in each and its slowness."""
+        """Learn from a drive: the metres in each square, and the square's slowness."""
 
 
 class LastTime(Learner):
@@ -116,7 +117,7 @@ class GaussianProcess(Learner):
         self.squared = ((at[:, None] - at) ** 2).sum(axis=2)
 
     def learn(self, squares: Any, metres: Float64, slowness: Float64) -> None:
-        """Learn from the squares of a drive; after 1, 2, 4, 8, ... drives, fit the parameters."""
+        """Learn from a drive; after 1, 2, 4, 8, ... drives, fit the parameters."""
         self.number[squares] += 1
         self.sum[squares] += np.log(slowness)
         self.drives += 1
@@ -127,7 +128,7 @@ class GaussianProcess(Learner):
         self.slowness = np.exp(self._solve(self.parameters)[1])
 
     def _solve(self, parameters: Float64) -> tuple[float, Float64]:
-        """Return the negative log likelihood, and the mean log slowness of each square."""
+        """Return the negative log likelihood, and each square's mean log slowness."""
         length, signal, noise = np.exp(np.clip(parameters, *LIMITS))
         known = np.flatnonzero(self.number)
         number = self.number[known]
@@ -177,7 +178,7 @@ class MarkovField(Learner):
 
 
 class TaughtExperience(Experience):
-    """What a robot has whose trainer trains the prior, too, as often as `trainer_node` does."""
+    """A learner that trains its prior as often as `trainer_node` does."""
 
     def __init__(self, grid: GridMap) -> None:
         super().__init__(SPEED)

@@ -100,7 +100,10 @@ def draw_map(name: str, random: Random) -> GridMap:
 
 
 def gates(grid: GridMap, random: Random) -> list[tuple[Any, Any]]:
-    """Draw half of all doors, or some narrow places: the rows and columns of each one's cells."""
+    """Draw half of all doors, or some narrow places.
+
+    Return the rows and the columns of the cells of each.
+    """
     found = []  # whether it is no door, a random number, and its cells
     beside = max(round(0.5 / grid.resolution), 1)
     for occupancy in (grid.occupancy, grid.occupancy.T):

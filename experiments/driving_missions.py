@@ -26,7 +26,10 @@ ROBOT_RADIUS: Final = 0.2  # metres, on maps from files
 
 @dataclass(frozen=True)
 class Job:
-    """A world (of a kind, or a map file and what is slow), and who drives in it, and how."""
+    """A world, who drives in it, and how.
+
+    The world is of a kind, or a map file with what is slow.
+    """
 
     kind: str
     seed: int
@@ -42,7 +45,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Result:
-    """The missions of a job: the seconds of the routes, and of the best and the shortest ones."""
+    """The seconds of a job's routes, and of the best and the shortest routes."""
 
     job: Job
     seconds: Float64
@@ -96,7 +99,7 @@ def run(job: Job) -> Result:
 
 
 def run_in(job: Job, world: World, learner: Any) -> Result:
-    """Drive the missions of a job in a world, with a learner that may know something."""
+    """Drive a job's missions in its world, with a learner."""
     grid = world.grid
     missions, noise, faults, moved = (
         np.random.default_rng([job.seed, n]) for n in range(4)
@@ -130,7 +133,8 @@ def run_in(job: Job, world: World, learner: Any) -> Result:
         if job.is_faulty and own >= next_fault:
             seen, next_fault = with_faults(seen, faults), next_fault + FAULT_EVERY
         learner.record(seen.seconds, seen.positions)
-        # Crowds come for all learners at the same mission, however long their drives take.
+        # Crowds come for all learners at the same mission, however long their drives
+        # take.
         clock, own = clock + best, own + measured.duration
     seconds, of_shortest, of_best = np.array(times).T
     return Result(job, seconds, of_best, of_shortest, np.array(forecast))
@@ -145,7 +149,10 @@ def _mark(new: Bool, cells: Sequence[Cell], reach: int) -> None:
 
 
 def with_faults(measured: Drive, random: Random) -> Drive:
-    """Return the drive with a fault: a pause, a teleport, a clock jump or an odometry reset."""
+    """Return the drive with a fault.
+
+    The fault is a pause, a teleport, a jump of the clock or a reset of the odometry.
+    """
     seconds, positions = measured.seconds.copy(), measured.positions.copy()
     at = int(random.integers(len(seconds) // 4, 3 * len(seconds) // 4 + 1))
     fault = int(random.integers(4))

@@ -1,9 +1,10 @@
-"""Worlds in which driving takes longer than the map says, and a robot that drives in them.
+"""Worlds in which driving takes longer than the map says, and their robot.
 
-No constant of the library may be chosen on the worlds of `HELD_OUT`, which are other pairings of a
-map and of what is slow, with other seeds, nor on maps from files. The worlds themselves were made
-with an eye on all of them: noise was made weaker, waits fewer on small maps, and noise no finer
-than 25 cm on maps from files, after first measurements.
+No constant of the library may be chosen on the worlds of `HELD_OUT`, which are other
+pairings of a map and of what is slow, with other seeds, nor on maps from files. The
+worlds themselves were made with an eye on all of them: noise was made weaker, waits
+fewer on small maps, and noise no finer than 25 cm on maps from files, after first
+measurements.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,8 +30,8 @@ RULE: Final = MoveRule.ROBOT_SAFE
 SPEED: Final = 0.5  # metres per second in the open
 STATIONS: Final = 6  # missions lead from one of so many cells to another
 HOUR: Final = 3600.0
-# Standard deviations: of the log time of each 25 cm, for each drive anew; of the log time of a
-# drive; and of a pose, metres.
+# Standard deviations: of the log time of each 25 cm, for each drive anew; of the log
+# time of a drive; and of a pose, metres.
 NOISE, DRIVE_NOISE, POSE_NOISE = 0.3, 0.03, 0.02
 RATE: Final = 10.0  # poses per second
 
@@ -131,7 +132,11 @@ class World:
         }
 
     def moves(self, begin: Any, end: Any, seconds: float) -> Float64:
-        """Return the seconds of both halves of moves between cells (2, N), and waits: (3, N)."""
+        """Return the seconds of moves, and the seconds of their waits: (3, N).
+
+        The seconds of a move are two rows: its half in the left cell, its half in the
+        next.
+        """
         (x, y), (next_x, next_y) = begin, end
         way = np.stack([next_x - x, next_y - y], axis=-1).astype(np.float64)
         length = np.hypot(*way.T)
@@ -207,7 +212,10 @@ def _slow_discs(world: World, random: Random) -> None:
 
 
 def _mixture(world: World, random: Random) -> None:
-    """Draw slow zones, a slipping carpet, two crowds, and a cell between two walls of 20."""
+    """Draw slow zones, a slipping carpet, two crowds and a narrow cell.
+
+    The cell lies between two walls of 20 cells.
+    """
     grid, occupancy = world.grid, world.grid.occupancy
     _slow_discs(world, random)
     world.always = np.maximum(
@@ -259,7 +267,10 @@ def _checkerboard(world: World, random: Random) -> None:
 
 
 def _noise(world: World, random: Random) -> None:
-    """Let the log slowness of squares of 25 cm have the spectrum 1/f, and a deviation of 0.65."""
+    """Let the log slowness have the spectrum 1/f, in squares of 25 cm.
+
+    Its standard deviation is 0.65.
+    """
     size = world.grid.resolution
     squares = [(np.arange(n) + 0.5) * size // 0.25 for n in world.grid.occupancy.shape]
     height, width = (int(of_axis[-1]) + 1 for of_axis in squares)
@@ -275,7 +286,10 @@ def _noise(world: World, random: Random) -> None:
 
 
 def _ramps(world: World, random: Random) -> None:
-    """Let five rectangles of 3 to 6 m be 2.5 to 5 times as slow upward, and normal downward."""
+    """Let five rectangles of 3 to 6 m be slow upward, but not downward.
+
+    Upward they are 2.5 to 5 times as slow.
+    """
     grid = world.grid
     free = np.argwhere(~grid.occupancy)
     world.ramps = np.zeros((*grid.occupancy.shape, 2))
@@ -290,7 +304,10 @@ def _ramps(world: World, random: Random) -> None:
 
 
 def _clearance(world: World, random: Random) -> None:
-    """Let the robot be slow near walls: 2.5 to 4.5 times beside them, less with the distance."""
+    """Let the robot be slow near walls: 2.5 to 4.5 times beside them.
+
+    The factor falls with the distance.
+    """
     padded = np.pad(world.grid.occupancy, 1, constant_values=True)
     cells = scipy.ndimage.distance_transform_edt(~padded)[1:-1, 1:-1] - 0.5
     metres = cells * world.grid.resolution
@@ -314,7 +331,10 @@ HIDDEN: Final[dict[str, Callable[[World, Random], None]]] = {
 
 
 def make_world(grid: GridMap, hidden: str, random: Random) -> World:
-    """Draw what is slow on a map, and stations; all in its largest part that is connected."""
+    """Draw what is slow on a map, and stations.
+
+    All lie in the map's largest connected part.
+    """
     labels = scipy.ndimage.label(~grid.occupancy)[0]
     occupancy = labels != np.bincount(labels[labels > 0]).argmax()
     world = World(

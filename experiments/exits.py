@@ -1,4 +1,4 @@
-"""Stops nodes by SIGINT and SIGTERM at any moment, and measures how long they take to end."""
+"""Stops nodes by SIGINT and SIGTERM at any moment, and measures their ends."""
 
 import os
 import signal
@@ -55,7 +55,7 @@ def catches(process: int, number: signal.Signals) -> bool:
 def stop_node(
     name: str, delay: float, number: signal.Signals, code_folder: Path, n_busy: int
 ) -> Exit:
-    """Start a node, send it a signal some time after its own first line, and wait for its end."""
+    """Start a node, send it a signal after its first line, await its end."""
     words = [
         word for key, value in NODES[name].items() for word in ("-p", f"{key}:={value}")
     ]
@@ -88,7 +88,10 @@ def summary(exits: Sequence[Exit]) -> list[object]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Stop nodes beside some busy processes; return 1 if an exit was slow or had another code."""
+    """Stop nodes beside busy processes.
+
+    Return 1 if an exit was slow or had another code.
+    """
     n_busy = int(arguments[0]) if arguments else 0
     runs = int(arguments[1]) if arguments[1:] else RUNS
     random = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""Kills each node in turn while it works, starts it again, and checks that nothing is broken."""
+"""Kills each node while it works, and checks that nothing is broken."""
 
 import tempfile
 import time
@@ -86,7 +86,10 @@ class Faults(Client):
     def kill(
         self, name: str, tally: Tally, calls: Sequence[tuple[Any, Any]]
     ) -> list[Any]:
-        """Kill a node under calls (service and future); count and return their answers, or None."""
+        """Kill a node under calls, pairs of a service and a future.
+
+        Count the answers and return them, None where there is none.
+        """
         child = self.children.pop(name)
         child.kill()  # as a power cut would
         child.wait()
@@ -112,7 +115,7 @@ class Faults(Client):
         return wait_for(f"answer from {name}", answer, self.children.values())
 
     def trigger(self, name: str) -> str:
-        """Call a Trigger service of the trainer until it succeeds; return its message."""
+        """Call a Trigger service until it succeeds; return its message."""
         name = f"/training/trainer/{name}"
         return str(
             self.ask(Trigger, name, None, lambda it: it.success, START_TIME).message
@@ -121,13 +124,19 @@ class Faults(Client):
     def ask_for_plan(
         self, tally: Tally, request: Any, accept: Any = lambda it: it.plan.poses
     ) -> None:
-        """Ask for a plan until there is one, or an answer is accepted; count it if it is wrong."""
+        """Ask for a plan until one comes, or until an answer is accepted.
+
+        A wrong answer is counted.
+        """
         plan = self.ask(GetPlan, "planner/get_plan", request, accept).plan
         # All goals can be reached: the check refuses an empty path.
         tally["wrong paths"] += bool(self.map.error(request, plan))
 
     def plan_for_active_goal(self, tally: Tally) -> None:
-        """Give the planner a start and an active goal until it plans: it may be a new one."""
+        """Send the planner a start and an active goal until it plans.
+
+        The planner may be a new process that has missed them.
+        """
         self.plans.clear()
 
         def planned() -> Any:
@@ -184,7 +193,10 @@ class Faults(Client):
         tally["restarts"] += intact and np.array_equal(served.data, known)
 
     def kill_trainer(self, tally: Tally) -> None:
-        """Kill the trainer while it saves after each step, soon after a save was seen to begin."""
+        """Kill the trainer while it saves after each step.
+
+        The kill comes soon after a save was seen to begin.
+        """
         save = self.service(Trigger, "/training/trainer/save")
         temporaries = partial(
             self.training_folder.glob, ".*"

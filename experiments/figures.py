@@ -58,7 +58,7 @@ def save_film(path: str, frames: Sequence[Image.Image], milliseconds: int) -> No
 def draw_curves(
     axes: Any, x: Array, curves: Mapping[str, Sequence[Array]], xlabel: str, ylabel: str
 ) -> None:
-    """Draw the median over the seeds of each curve, and a band from the least to the greatest."""
+    """Draw each curve's median over the seeds in a band from least to greatest."""
     lines = zip(curves.items(), COLOURS, STYLES, strict=False)
     for (label, seeds), colour, style in lines:
         if np.isfinite(seeds).any():
@@ -75,7 +75,10 @@ def draw_slowness(
     panels: Mapping[str, tuple[Array, Mapping[str, Sequence[Cell]]]],
     size: tuple[float, float],
 ) -> Any:
-    """Return a figure of slowness (H, W), with routes that `ROUTE_STYLES` names, by its title."""
+    """Return a picture of slowness (H, W) for each title, with its routes.
+
+    The names of the routes are those of `ROUTE_STYLES`.
+    """
     figure, both = plt.subplots(1, len(panels), figsize=size, layout="constrained")
     for axes, (title, (slowness, routes)) in zip(both, panels.items(), strict=True):
         axes.set_facecolor("#e6e6e6")
@@ -104,7 +107,10 @@ def draw_times(
     width: int,
     banded: str,
 ) -> tuple[Any, Any]:
-    """Draw the times over the best of `width` missions each, one name as median and band."""
+    """Draw times over the best, means of `width` missions.
+
+    The curves of several seeds with one name become a median and a band.
+    """
     window, curves = np.ones(width), dict[str, Sequence[Array]]()
     least = [np.convolve(of_world, window, "valid") for of_world in best]
     for name, of_worlds in seconds.items():

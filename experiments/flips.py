@@ -1,4 +1,4 @@
-"""Counts how often the path of a robot flips on noisy costmaps, and what it costs to keep it."""
+"""Measures how often paths flip on noisy costmaps, and what keeping them costs."""
 
 import itertools
 from collections.abc import Sequence
@@ -31,7 +31,8 @@ SIDE, RUNS, REPLANS = (
 )  # cells of a side; runs of a kind; replans of a run at most
 STRIDE = 2  # cells from one replan to the next: at 5 cm, 0.5 m/s and 5 Hz
 SIGHT = 80  # cells: farther away than this nothing flickers
-# The costmap flickers: such shares of the free cells are seen as obstacles, with costs around.
+# The costmap flickers: such shares of the free cells are seen as obstacles, with costs
+# around.
 SEEN_BESIDE_WALLS, SEEN_ELSEWHERE, INFLATION = 0.03, 0.001, 8.0
 AHEAD, APART = (
     60,
@@ -93,7 +94,8 @@ def drive(
     y, x = np.ogrid[: occupancy.shape[0], : occupancy.shape[1]]
     way, path, replans, flips = [robot], np.empty((0, 2), dtype=np.int32), 0, 0
     for number in range(REPLANS):
-        # The noise depends on the time, not on what was drawn for another way of the robot.
+        # The noise depends on the time, not on what was drawn for another way of the
+        # robot.
         noise = np.random.default_rng([seed, number]).random(occupancy.shape) < share
         seen = occupancy | (noise & (np.hypot(x - robot[0], y - robot[1]) <= SIGHT))
         seen[robot[::-1]] = seen[goal[::-1]] = False
@@ -131,7 +133,7 @@ def scenario(kind: str, side: int, random: Random) -> tuple[Occupancy, Cell, Cel
 
 
 def is_flip(rest: NDArray[np.int32], path: NDArray[np.int32]) -> bool:
-    """Return whether the next 3 m of a path lead away from what is left of the last one."""
+    """Return whether a path's next 3 m lead away from the last path's rest."""
     if not len(rest):
         return False
     ahead, _ = cells_along(path)

@@ -1,4 +1,4 @@
-"""Measure greedy rollouts of a model on maps that it never saw, against scipy's Dijkstra."""
+"""Measures a model's greedy rollouts on unseen maps, against scipy's Dijkstra."""
 
 import argparse
 import math
@@ -12,7 +12,8 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Final
 
-# Before NumPy is imported. On a busy machine, several threads are ten times as slow as one.
+# Before NumPy is imported. On a busy machine, several threads are ten times as slow as
+# one.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
@@ -52,7 +53,8 @@ OPTIMAL = 1 + 1e-6  # ratio to the optimum up to which a rollout is optimal
 AGREES = 1e-4  # relative difference from a file's optimum, which is rounded
 SUFFIXES: Final = (".map", ".scen", ".yaml", ".yml")  # of MovingAI and ROS
 COLUMNS: Final = (
-    "maps | requests | success | without action masking | optimal | mean | worst | illegal | "
+    "maps | requests | success | without action masking | optimal | mean | worst "
+    "| illegal | "
     "field ms | Dijkstra ms"
 )
 
@@ -80,7 +82,10 @@ class RequestSettings:
 
 @dataclass(frozen=True, eq=False)
 class BenchmarkMap:
-    """A map with requests (start and goal), and the optima that its file gives for this rule."""
+    """A map with requests (start and goal).
+
+    With it come the optima that its file gives for this move rule.
+    """
 
     set_name: str
     name: str
@@ -92,7 +97,7 @@ class BenchmarkMap:
 def generated_maps(
     kinds: Sequence[str], sizes: Sequence[int], maps: int, settings: RequestSettings
 ) -> Iterator[BenchmarkMap]:
-    """Generate a number of square maps per kind and side (cells), and draw requests on each."""
+    """Generate square maps of each kind and side (cells), with requests."""
     for kind in kinds:
         for size in sizes:
             for number in range(maps):
@@ -107,7 +112,10 @@ def generated_maps(
 def _draw(
     occupancy: Occupancy, goals: int, settings: RequestSettings, random: Random
 ) -> Drawn:
-    """Draw costs and requests for a map; the requests share a number of goals evenly."""
+    """Draw costs and requests for a map.
+
+    Each of the goals has the same number of requests.
+    """
     grid, requests = settings.grid(occupancy, random), []
     parts = np.array_split(range(settings.requests), goals)
     drawn = random_requests(occupancy, settings.move_rule, goals, random)
@@ -121,7 +129,10 @@ def _draw(
 
 
 def find_files(folder: Path) -> list[Path]:
-    """Return the benchmark files of a folder and its subfolders; a ValueError without a map."""
+    """Return the benchmark files of a folder and its subfolders.
+
+    ValueError if there is no map.
+    """
     files = sorted(
         p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file()
     )
@@ -135,7 +146,10 @@ def find_files(folder: Path) -> list[Path]:
 def read_maps(
     files: Sequence[Path], settings: RequestSettings
 ) -> Iterator[BenchmarkMap]:
-    """Read benchmark maps; report on stderr which files cannot be read, and continue."""
+    """Read benchmark maps.
+
+    Files that cannot be read are named on stderr, and left out.
+    """
     suffix_of = {path: path.suffix.lower() for path in files}
     scenarios = {
         p.stem.removesuffix(".map"): p for p in files if suffix_of[p] == ".scen"
@@ -160,13 +174,19 @@ def read_maps(
 def _scenario_map(
     path: Path, scenario: Path, settings: RequestSettings
 ) -> BenchmarkMap:
-    """Read a MovingAI map, with requests of its scenario file: short and long paths alike."""
+    """Read a MovingAI map, and requests of its scenario file.
+
+    Short and long paths are drawn alike.
+    """
     random, rule = settings.random(path.stem), settings.move_rule
     grid = settings.grid(read_map_file(path).grid().occupancy, random)
     try:
         lines = np.loadtxt(scenario, usecols=range(-7, 0), comments="version", ndmin=2)
     except ValueError as error:
-        words = "end each line with width, height, start x and y, goal x and y, optimal length"
+        words = (
+            "end each line with width, height, start x and y, goal x and y, "
+            "optimal length"
+        )
         raise ValueError(f"{scenario}: {error}; {words}") from None
     if not len(lines):
         raise ValueError(f"{scenario}: has no requests; give a file with some")
@@ -191,7 +211,7 @@ def _scenario_map(
 
 @dataclass(frozen=True)
 class Rollout:
-    """The greedy rollout of one request, checked against the map and the exact optimum."""
+    """A request's greedy rollout, checked against the map and the optimum."""
 
     set_name: str
     map_name: str
@@ -210,7 +230,10 @@ class Rollout:
 def measure(
     planner: Planner, maps: Iterable[BenchmarkMap], move_rule: MoveRule
 ) -> Iterator[Rollout]:
-    """Make a rollout for every request of every map; a ValueError if the model has another size."""
+    """Make a rollout for every request of every map.
+
+    ValueError if the model has another size.
+    """
     warm = False
     for drawn in maps:
         grid, requests = drawn.grid, drawn.requests
@@ -251,7 +274,10 @@ def measure(
 def compare_with_dijkstra(
     planner: Planner, grid: GridMap, goal: Cell, move_rule: MoveRule
 ) -> tuple[QField, NDArray[np.float64], float, float]:
-    """Return a goal's Q field and exact distances (H, W), and the times of both, milliseconds."""
+    """Return a goal's Q field, exact distances (H, W), and both times.
+
+    The times are in milliseconds.
+    """
     began = time.perf_counter()
     # A new planner, as one that knows the goal would look the field up.
     field = Planner(planner.network, planner.metadata).q_field(grid, goal, move_rule)
@@ -265,7 +291,10 @@ def compare_with_dijkstra(
 
 
 def illegal_moves(cells: Sequence[Cell], legal: NDArray[np.bool_]) -> int:
-    """Count the steps of a path that are not legal moves; see `legal_moves` for `legal`."""
+    """Count the steps of a path that are not legal moves.
+
+    `legal` is what `legal_moves` returns.
+    """
     array = np.array(cells, dtype=np.int64).reshape(-1, 2)
     x, y = array[:-1].T
     is_action = (np.diff(array, axis=0)[:, None] == MOVES).all(axis=2)
@@ -273,7 +302,10 @@ def illegal_moves(cells: Sequence[Cell], legal: NDArray[np.bool_]) -> int:
 
 
 def markdown(rollouts: Sequence[Rollout]) -> str:
-    """Return the report: a table by set and size, and one by optimum: 0-16, 16-32, and so on."""
+    """Return the report: a table by set and size, and a table by optimum.
+
+    The classes of the optimum are 0-16, 16-32, and so on.
+    """
     by_set: dict[tuple[str, str], list[Rollout]] = {}
     by_optimum: dict[str, list[Rollout]] = {}
     for rollout in rollouts:
@@ -286,12 +318,14 @@ def markdown(rollouts: Sequence[Rollout]) -> str:
     sets = [[*names, *_row(members)] for names, members in by_set.items()]
     optima = [[name, *_row(members)] for name, members in by_optimum.items()]
     text = (
-        "Every request has a path. Without action masking: solved too by a rollout that may choose "
-        "illegal moves, which end it. Optimal, mean, worst: cost of the rollout over that of the "
+        "Every request has a path. Without action masking: solved too by a rollout "
+        "that may choose illegal moves, which end it. "
+        "Optimal, mean, worst: cost of the rollout over that of the "
         "best path. Times are medians; Dijkstra's includes its graph."
     )
     if given := [rollout.agrees for rollout in rollouts if rollout.agrees is not None]:
-        text += f"\nOptima given by files: the oracle agrees with {sum(given)}/{len(given)}."
+        agreement = f"{sum(given)}/{len(given)}"
+        text += f"\nOptima given by files: the oracle agrees with {agreement}."
     tables = (
         table(f"set | size | {COLUMNS}", sets),
         table(f"optimum | {COLUMNS}", optima),
@@ -300,7 +334,10 @@ def markdown(rollouts: Sequence[Rollout]) -> str:
 
 
 def _row(rollouts: Sequence[Rollout]) -> list[object]:
-    """Return counts of requests, ratios of the solved ones (nan if none), and median times."""
+    """Return counts, ratios of lengths, and median times.
+
+    The ratios are those of solved requests, NaN if none is solved.
+    """
     requests = len(rollouts)
     ratios = np.array([rollout.ratio for rollout in rollouts])
     solved = ratios[np.isfinite(ratios)]
@@ -385,8 +422,9 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError(f"{options.data}: none of its files has a request; see above")
     if rollouts:
         print(
-            f"Model {options.model} ({model.network}, {model.steps:,} steps, seed {model.seed}), "
-            f"move rule {rule.value}, costs {options.costs}, requests of seed {options.seed}.\n\n"
+            f"Model {options.model} ({model.network}, {model.steps:,} steps, "
+            f"seed {model.seed}), move rule {rule.value}, costs {options.costs}, "
+            f"requests of seed {options.seed}.\n\n"
             f"{markdown(rollouts)}"
         )
     return code

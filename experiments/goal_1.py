@@ -1,4 +1,7 @@
-"""Goal i (section 5.1, Fig. 7) and the ablation (Fig. 6): from the given start to the given end."""
+"""Goal i (section 5.1, Fig. 7) and the ablation (Fig. 6).
+
+The robot goes from the given start to the given end.
+"""
 
 import time
 from collections.abc import Sequence
@@ -43,7 +46,10 @@ CONVERGENCE = (
 def trainings(
     settings: Settings, variants: Sequence[str] = ("both",)
 ) -> list[Training]:
-    """Return the trainings of both profiles on the paper's map, by the name "profile/variant"."""
+    """Return the trainings of both profiles on the paper's map.
+
+    Their names are "profile/variant".
+    """
     parameters_of = {
         f"{profile}/{name}": replace(parameters, **VARIANTS[name])
         for profile, parameters in PROFILES.items()
@@ -71,7 +77,7 @@ def convergence_row(runs: Sequence[Evaluations]) -> list[str]:
 
 
 def first_kept(run: Evaluations, holds: NDArray[np.bool_]) -> float:
-    """Return the step from which on a condition holds to the end; infinity if it does not."""
+    """Return the step from which on a condition holds; infinity if it never does."""
     first = int(np.flatnonzero(~holds)[-1]) + 1 if not holds.all() else 0
     return float(run["step"][first]) if first < len(holds) else np.inf
 
@@ -110,7 +116,10 @@ def report(settings: Settings) -> str:
 
 
 def timed_plan(planner: Planner) -> tuple[Plan, float]:
-    """Return a planner's plan, and the median of its times with a new field, milliseconds."""
+    """Return a planner's plan, and the median of its times, milliseconds.
+
+    Each time includes a new field.
+    """
     times = []
     for _ in range(TIMES):
         began = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Goal ii (section 5.2, Fig. 8): from every free cell; and what the printed target does."""
+"""Goal ii (section 5.2, Fig. 8): from every free cell; and the printed target."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -49,19 +49,28 @@ COLUMNS = (
     "profile | solved, of 286 | without action masking | of the dilemma's 10 | "
     "mean length / optimum | worst"
 )
-TARGET_COLUMNS = "target | seeds solved from the start | starts solved | over-estimation, last 10 % | worst"
+TARGET_COLUMNS = (
+    "target | seeds solved from the start | starts solved "
+    "| over-estimation, last 10 % | worst"
+)
 # The free cells except start and end: (H, W) bool, the paper's 286.
 STARTS = ~SCENARIO.grid.occupancy
 STARTS[SCENARIO.start[::-1]] = STARTS[SCENARIO.goal[::-1]] = False
 
 
 def count_solved(ratios: Sequence[NDArray[np.float64]], starts: Any) -> str:
-    """Return how many of the starts, an index into `length_ratios`, each seed solves."""
+    """Return how many of the starts each seed solves.
+
+    `starts` is an index into `length_ratios`.
+    """
     return median_and_range([int(np.isfinite(ratio[starts]).sum()) for ratio in ratios])
 
 
 def trained_field(planner: Planner) -> QField:
-    """Return the Q field of a propagation network as the loss trained it: with reward and γ."""
+    """Return a propagation network's Q field as the loss trained it.
+
+    It contains the reward and γ.
+    """
     occupancy = SCENARIO.grid.occupancy
     environment = GridVectorEnvironment([SCENARIO], PROFILES["propagation"])
     network, cells = planner.network, np.arange(occupancy.size)

@@ -1,4 +1,4 @@
-"""Goal iii (section 5.3, Fig. 9): maps with new obstacles, most of them never trained on."""
+"""Goal iii (section 5.3, Fig. 9): new obstacles, most of them never trained on."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -53,13 +53,19 @@ PAPER: Final = replace(
 EVALUATION_INTERVAL = 1_000
 SUPERVISED_UPDATES, SUPERVISED_BATCH, SUPERVISED_LEARNING_RATE = 10_000, 128, 0.003
 KEPT = "kept.safetensors"
-COLUMNS = "new obstacles | planner | training maps solved | test maps solved | mean length / optimum"
+COLUMNS = (
+    "new obstacles | planner | training maps solved | test maps solved "
+    "| mean length / optimum"
+)
 
 
 def noisy_maps(
     training: int, test: int, noise: str
 ) -> tuple[list[Scenario], list[Scenario]]:
-    """Draw training and test maps, all different, with new obstacles on or near goal i's path."""
+    """Draw different training and test maps.
+
+    New obstacles lie on goal i's path or near it.
+    """
     path = shortest_path(SCENARIO.grid, SCENARIO.start, SCENARIO.goal, MOVE_RULE)
     random = np.random.default_rng(NOISE_SEED)
     scenarios: dict[str, Scenario] = {}
@@ -80,7 +86,7 @@ def drawn_maps(settings: Settings, noise: str) -> tuple[list[Scenario], list[Sce
 
 
 def networks(settings: Settings) -> dict[str, tuple[str, HyperParameters]]:
-    """Return the folder and the parameters of each network, by its label in the table."""
+    """Return the folder and the parameters of each network by its label."""
     found = {}
     for units in settings.hidden_units:
         label = f"paper, {units} hidden units" if units else "paper"
@@ -101,7 +107,10 @@ def trainings(settings: Settings) -> list[Training]:
 
 
 def train_supervised(training: Training) -> None:
-    """Train a network by cross-entropy on the moves of all shortest paths, unless it was before."""
+    """Train a network by cross-entropy, unless it was trained before.
+
+    The labels are the moves of all shortest paths.
+    """
     # What it fails to learn even then is a limit of the network, not of how it learns.
     path = training.folder / "model.safetensors"
     if path.exists():
@@ -122,7 +131,8 @@ def train_supervised(training: Training) -> None:
         drawn = random.integers(len(cell), size=SUPERVISED_BATCH)
         evaluate_common_windows(network, windows)
         evaluate(network, windows, scenario[drawn], cell[drawn])
-        # -log of the probability that softmax(Q) gives to the best moves, and its gradient by Q
+        # -log of the probability that softmax(Q) gives to the best moves, and its
+        # gradient by Q
         best_BA = best_SCA[scenario[drawn], cell[drawn]]
         gradient.q[:] = softmax(network.q, axis=1)
         gradient.q[:] -= softmax(np.where(best_BA, network.q, -np.inf), axis=1)
@@ -134,7 +144,10 @@ def train_supervised(training: Training) -> None:
 
 
 def best_moves(scenario: Scenario) -> NDArray[np.bool_]:
-    """Return the moves that begin a shortest path: (C, 8) bool, none where there is no path."""
+    """Return the first moves of shortest paths: (C, 8) bool.
+
+    A cell without a path has none.
+    """
     occupancy = scenario.grid.occupancy
     distance = shortest_distances(scenario.grid, scenario.goal, MOVE_RULE).ravel()
     onward_AC = (
@@ -147,7 +160,10 @@ def best_moves(scenario: Scenario) -> NDArray[np.bool_]:
 
 
 def fixed_path(maps: Sequence[Scenario]) -> tuple[Cell, ...]:
-    """Return the cheapest path if a cell costs 1, and 1 more for each map where it is occupied."""
+    """Return the cheapest path by the number of maps that occupy its cells.
+
+    A cell costs 1, and 1 more for each map in which it is occupied.
+    """
     occupied = sum(scenario.grid.occupancy.astype(np.float32) for scenario in maps)
     grid = SCENARIO.grid.with_layers(slowness=np.float32(1) + occupied)
     return search(SCENARIO.start, SCENARIO.goal, grid, MOVE_RULE)
@@ -193,7 +209,7 @@ def report(settings: Settings) -> str:
 
 
 def _draw(settings: Settings) -> str:
-    """Draw the first three test maps of each noise, with the paths of the first seed."""
+    """Draw the first seed's paths on the first three test maps of each noise."""
     count = len(settings.noise)
     figure, panels = plt.subplots(
         count, 3, figsize=(12, 4.2 * count), layout="constrained", squeeze=False

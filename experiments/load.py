@@ -1,4 +1,4 @@
-"""Asks one planner node from many processes while its map changes, and checks every answer."""
+"""Asks one planner from many processes on changing maps; checks each answer."""
 
 import itertools
 import math
@@ -42,7 +42,10 @@ def three_maps() -> list[ros.MapFixture]:
 
 
 def ask(seed: int, count: int, shared: SimpleNamespace) -> None:
-    """Ask; for each answer put its milliseconds, how many poses it has, and what is wrong."""
+    """Ask for plans, and put a result of each answer into the queue.
+
+    A result has milliseconds, the number of poses, and what is wrong.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # it ends with its parent
     random, maps = np.random.default_rng(seed), three_maps()
     asked = [fixture.requests(GOALS_PER_MAP, random) for fixture in maps]
@@ -72,10 +75,14 @@ def ask(seed: int, count: int, shared: SimpleNamespace) -> None:
 
 
 def load_requests(planner: int, requests: int, clients: int) -> bool:
-    """Ask a planner (a process with no other map yet) while maps change; return if it failed."""
+    """Ask a planner while maps change; return whether it failed.
+
+    No other map was sent to the planner's process before.
+    """
     context, maps = multiprocessing.get_context("spawn"), three_maps()
     number = len(maps)
-    # Of the last map: its number where the planner is known to have it, and where it was published.
+    # Of the last map: its number where the planner is known to have it, and where it
+    # was published.
     confirmed, published = context.Value("i", number), context.Value("i", number)
     shared = SimpleNamespace(confirmed=confirmed, published=published)
     shared.ready, shared.answers = context.Barrier(clients + 1), context.Queue()
@@ -113,15 +120,19 @@ def load_requests(planner: int, requests: int, clients: int) -> bool:
         f"{number - len(maps)} changes of the map",
         f"  paths {np.count_nonzero(poses)}, empty answers {poses.count(0)}",
         f"  latency median {median:.1f} ms, 99 % {slow:.1f} ms",
-        f"  planner's resident memory {first_memory:.0f} MB after {WARM_UP:.0%} of them, "
-        f"{last_memory:.0f} MB at the end: {last_memory / first_memory - 1:+.1%}",
+        f"  planner's resident memory {first_memory:.0f} MB after {WARM_UP:.0%} "
+        f"of them, {last_memory:.0f} MB at the end: "
+        f"{last_memory / first_memory - 1:+.1%}",
         sep="\n",
     )
     return report("  lost or wrong answers", len(errors), "", 0)
 
 
 def load_goals(goals: int) -> bool:
-    """Send goals at 200 Hz; return whether a plan for an older goal followed a newer one's."""
+    """Send goals at 200 Hz.
+
+    Return whether a plan for an older goal followed a plan for a newer one.
+    """
     office, random = ros.shipped_maps()["office"], np.random.default_rng(0)
     grid, message = office.grid, office.message(2**20)
     # All free cells are joined.
@@ -174,7 +185,10 @@ class BurstClients(ros.Client):
         self.wait_for_discovery(service.rpartition("/")[0])
 
     def burst(self, requests: Sequence[Any]) -> list[Any]:
-        """Send all requests, the clients in turn; return the answers, None where it is lost."""
+        """Send all requests, the clients in turn.
+
+        Return the answers, None where an answer is lost.
+        """
         asked = zip(itertools.cycle(self._clients), requests, strict=False)
         pending = [(client, client.call_async(request)) for client, request in asked]
         with suppress(TimeoutError):
@@ -219,7 +233,10 @@ class GoalBursts(ros.Client):
 def burst_requests(
     grid: GridMap, goals: Sequence[Cell], count: int, seed: int = 0
 ) -> list[GetPlan.Request]:
-    """Return requests from random free cells within `REACH` of the goals, which take turns."""
+    """Return requests from random free cells within `REACH` of their goals.
+
+    The goals take turns.
+    """
     random, requests = np.random.default_rng(seed), list[GetPlan.Request]()
     while len(requests) < count:
         goal = goals[len(requests) % len(goals)]
@@ -232,7 +249,10 @@ def burst_requests(
 def load_bursts(
     sizes: Sequence[int] = SIZES, counts: Sequence[int] = COUNTS, bursts: int = BURSTS
 ) -> Iterator[bool]:
-    """Send bursts to a running planner; yield whether a request of some has no right answer."""
+    """Send bursts of requests to a running planner.
+
+    Yield for each size of burst whether an answer is lost or wrong.
+    """
     for size in sizes:
         fixture = ros.generated_map("rooms", size, resolution=0.5)
         free = fixture.grid.free_cells()
@@ -251,7 +271,11 @@ def load_bursts(
         def wrong(
             asking: BurstClients, asked: Sequence[Any], fixture: Any = fixture
         ) -> int:
-            """Send a burst; count the answers that are lost, or no path where there is one."""
+            """Send a burst of requests.
+
+            Count the lost answers, and the answers without a path where there is a
+            path.
+            """
             answers = zip(asked, asking.burst(asked), strict=True)
             return sum(
                 not it or bool(fixture.error(request, it.plan))
@@ -260,14 +284,18 @@ def load_bursts(
 
         with BurstClients(1) as one:
             one.publish("map", fixture.message(), LATCHED)
-            # Until it plans on this map, and knows the fields, whose times do not count here.
+            # Until it plans on this map, and knows the fields, whose times do not count
+            # here.
             pairs = [ros.plan_request(fixture.grid, a, b) for a in goals for b in goals]
             while wrong(one, pairs):
                 pass
             for count, clients in itertools.product(counts, BURST_CLIENTS):
                 with BurstClients(clients) as asking:
                     missing = sum(wrong(asking, requests) for requests in sent[count])
-                what = f"{bursts} bursts of {count} from {clients} clients, {size} x {size} cells"
+                what = (
+                    f"{bursts} bursts of {count} from {clients} clients, "
+                    f"{size} x {size} cells"
+                )
                 yield report(f"{what}: lost or wrong", missing, "", 0)
     with suppress(ModuleNotFoundError), GoalBursts() as action:
         for count in counts:
@@ -278,7 +306,10 @@ def load_bursts(
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Load a planner node with requests and with goals; return 1 if anything is lost or wrong."""
+    """Load a planner node with requests and with goals.
+
+    Return 1 if anything is lost or wrong.
+    """
     requests = int(arguments[0]) if arguments else REQUESTS
     with (
         claim_ros_domain(),

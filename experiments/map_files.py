@@ -12,7 +12,10 @@ from ddqn_planner.grid import GridMap, MapFile, MapFileError
 
 
 def save_map(grid: GridMap | MapFile, path: str | Path) -> None:
-    """Write a ROS map: YAML and PGM, and one for directions; `GridMap.obstacles` is left out."""
+    """Write a ROS map: YAML and PGM, and another pair for directions.
+
+    `GridMap.obstacles` is left out.
+    """
     path = as_path(path)
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise MapFileError(

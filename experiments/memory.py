@@ -1,4 +1,4 @@
-"""Measures the memory of the planner node: where it goes, and whether reloads add to it."""
+"""Measures where the planner's memory goes, and whether reloads add to it."""
 
 import subprocess
 import sys
@@ -49,7 +49,10 @@ def measure_layers(fixture: ros.MapFixture) -> None:
 def measure_node(
     name: str, fixture: ros.MapFixture, bound: float, map_file: Path | None = None
 ) -> Iterator[bool]:
-    """Measure the planner node after plans to some goals on a map, from a map server or sent."""
+    """Measure the planner's memory after plans to some goals on a map.
+
+    The map comes from a map server, or is sent.
+    """
     requests = fixture.requests(PLANS, np.random.default_rng(0))
     with ros.Client() as client, processes.running_node("planner_node") as node:
         if map_file is not None:
@@ -72,7 +75,8 @@ def measure_node(
         )
         peak = processes.memory(node.pid, "VmHWM")
         print(
-            f"{name}: MB after {PLANS} plans: {split}; the greatest since the start {peak:.0f}"
+            f"{name}: MB after {PLANS} plans: {split}; "
+            f"the greatest since the start {peak:.0f}"
         )
         yield report(
             f"{name}: planner_node, after any of the plans", greatest, "MB", bound

@@ -1,4 +1,4 @@
-"""Measures the executables: how soon they are of use, how fast they answer, what they take."""
+"""Measures the executables: start, answers, memory, share of a core."""
 
 import gc
 import os
@@ -171,7 +171,8 @@ def measure_requests(client: ros.Client, map_file: Path) -> Iterator[bool]:
             )
             ratios.append(ours / theirs)
             print(
-                f"GetPlan of {poses} poses: first {took:.1f} ms, then {ours:.2f} ms; bare "
+                f"GetPlan of {poses} poses: first {took:.1f} ms, "
+                f"then {ours:.2f} ms; bare "
                 f"service {theirs:.2f} ms"
             )
     name = f"{map_file.stem}, {fixture.grid.width}x{fixture.grid.height}"
@@ -180,7 +181,7 @@ def measure_requests(client: ros.Client, map_file: Path) -> Iterator[bool]:
 
 
 def measure_large_map(client: ros.Client) -> Iterator[bool]:
-    """Measure services while a large field is computed, memory, and paths on new large maps."""
+    """Measure services beside a large field, memory, and new large maps."""
     random, waited = np.random.default_rng(0), []
     fixture = ros.generated_map("office", LARGE, seed=random)
     known, *new = fixture.requests(GOALS + 1, random)
@@ -209,7 +210,8 @@ def measure_large_map(client: ros.Client) -> Iterator[bool]:
             )
             yield report(figure, max(times), "ms", 100)
         print(
-            f"{LARGE}x{LARGE}: GetPlan with a new field, {statistics.median(waited):.0f} ms"
+            f"{LARGE}x{LARGE}: GetPlan with a new field, "
+            f"{statistics.median(waited):.0f} ms"
         )
         peak = processes.memory(planner.pid, "VmHWM")
         yield report(
@@ -237,7 +239,10 @@ def measure_large_map(client: ros.Client) -> Iterator[bool]:
 
 
 def measure_changing_map(client: ros.Client) -> Iterator[bool]:
-    """Measure the planner's share of a core with no goal, and while a few cells change."""
+    """Measure the planner's share of a core.
+
+    It has no goal at first; then a few cells change.
+    """
     random = np.random.default_rng(0)
     fixture = ros.generated_map("office", CHANGING, seed=random)
     grid = fixture.grid
@@ -277,7 +282,10 @@ def measure_changing_map(client: ros.Client) -> Iterator[bool]:
 
 
 def measure_trainer(client: ros.Client) -> Iterator[bool]:
-    """Measure the trainer node while it trains: its services, and how soon a signal ends it."""
+    """Measure the trainer while it trains.
+
+    Measured are its services, and how soon a signal ends it.
+    """
     slowest = dict.fromkeys(("start", "save", "replay", "stop"), 0.0)
 
     def call(name: str, times: int = 1) -> float:
@@ -293,7 +301,8 @@ def measure_trainer(client: ros.Client) -> Iterator[bool]:
             ) as trainer,
         ):
             print(
-                f"trainer: first ~/start, once torch is imported: {call('start'):.0f} ms"
+                "trainer: first ~/start, once torch is imported: "
+                f"{call('start'):.0f} ms"
             )
             time.sleep(10)  # thousands of steps: a checkpoint and curves of some size
             for name in slowest:
@@ -315,11 +324,15 @@ def measure_trainer(client: ros.Client) -> Iterator[bool]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Print each figure beside its bound, on another ROS map (a path) too; 1 if one is missed."""
+    """Print each figure beside its bound.
+
+    Return 1 if a bound is missed. The path of another ROS map is an argument.
+    """
     map_file = find_map(arguments[0] if arguments else "office")
     with processes.claim_ros_domain():
         missed = [*measure_starts()]
-        gc.freeze()  # else this process pauses to look for garbage among what it has imported
+        # Else this process pauses to look for garbage among what it has imported.
+        gc.freeze()
         for measure in (
             partial(measure_requests, map_file=find_map("dilemma")),
             partial(measure_requests, map_file=map_file),

@@ -1,4 +1,4 @@
-"""Measures how far the ends of paths lie from their starts and goals: `python path_ends.py`."""
+"""Measures how far paths end from their starts and goals: `python path_ends.py`."""
 
 import argparse
 from pathlib import Path
@@ -13,7 +13,10 @@ MAP = Path(__file__).resolve().parent.parent / "maps" / "office.yaml"
 
 
 def main() -> None:
-    """Plan between random points of a map, every other path straight, and print the distances."""
+    """Plan between random points of a map, and print the distances.
+
+    Every other path is straight.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--map", default=str(MAP), help="a map file")
     parser.add_argument("--paths", type=int, default=1000)

@@ -1,4 +1,4 @@
-"""The paper's target as it is printed: it selects and evaluates actions with θ alone."""
+"""The target as printed: θ alone selects and evaluates the actions."""
 
 from ddqn_planner.training.double_dqn import NextQ, Q
 from ddqn_planner.training.trainer import Trainer

@@ -11,13 +11,17 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
-# A command after this hears SIGTERM when its parent ends, even if by SIGKILL, which tidies nothing.
+# A command after this hears SIGTERM when its parent ends, even if by SIGKILL, which
+# tidies nothing.
 TIED = "setpriv", "--pdeathsig", "TERM"
 STOP_TIMEOUT = 120.0  # seconds that a process may take to end on a loaded machine
 
 
 def claim_ros_domain() -> socket.socket:
-    """Set a ROS domain of this machine alone, before rclpy is initialised; the socket holds it."""
+    """Choose a ROS domain that is free on this machine.
+
+    Call it before rclpy is initialised; the returned socket holds the domain.
+    """
     for domain in range(1, 101):
         claim = socket.socket()
         with suppress(OSError):
@@ -32,7 +36,10 @@ def claim_ros_domain() -> socket.socket:
 
 
 def executable(name: str) -> str:
-    """Return the path of an executable of the package: pip's, else that of a colcon workspace."""
+    """Return the path of an executable of the package.
+
+    pip's goes before that of a colcon workspace.
+    """
     folder = Path(sysconfig.get_path("scripts"))
     if not (folder / name).exists():
         from ament_index_python.packages import get_package_prefix
@@ -67,14 +74,16 @@ def running(*command: str, **options: Any) -> Iterator[subprocess.Popen[bytes]]:
     try:
         # A signal inside Popen would lose the child that it has just begun.
         with _signals_held_back():
-            # In a session of its own, it does not hear Ctrl-C: the parent does, and tidies up.
+            # In a session of its own, it does not hear Ctrl-C: the parent does, and
+            # tidies up.
             child = subprocess.Popen(
                 [*TIED, *command], start_new_session=True, **options
             )
         yield child
     finally:
         if child is not None:
-            child.terminate()  # not SIGINT: Python may drop that one while it imports modules
+            # Not SIGINT: Python may drop that one while it imports modules.
+            child.terminate()
             try:
                 child.wait(timeout=STOP_TIMEOUT)
             except BaseException:
@@ -111,8 +120,12 @@ def cpu_seconds(process: int) -> float:
 
 
 def run_script(main: Callable[[Sequence[str]], int]) -> NoReturn:
-    """Exit with what `main` returns for the arguments; when a signal ends it, so do its nodes."""
-    # A shell starts what it runs in the background with SIGINT ignored, and so would the nodes be.
+    """Exit with what `main` returns for the command line.
+
+    The nodes end with this process, also when a signal ends it.
+    """
+    # A shell starts what it runs in the background with SIGINT ignored, and so would
+    # the nodes be.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     try:

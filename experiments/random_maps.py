@@ -1,4 +1,4 @@
-"""Random maps of nine kinds and any size, and costs of their cells; a seed fixes them for ever."""
+"""Random maps of nine kinds and any size, and costs; a seed fixes them for ever."""
 
 import itertools
 from collections.abc import Callable
@@ -33,7 +33,7 @@ def _independent(share: float, shape: tuple[int, int], random: Random) -> Occupa
 
 
 def _maze(shape: tuple[int, int], random: Random) -> Occupancy:
-    """Dig a tree of corridors, one cell wide, that reaches every cell of odd x and y."""
+    """Dig a tree of corridors, one cell wide, to every cell of odd x and y."""
     occupancy = np.ones(shape, dtype=np.bool_)
     rows, columns = (shape[0] - 1) // 2, (shape[1] - 1) // 2
     occupancy[1 : 2 * rows : 2, 1 : 2 * columns : 2] = False
@@ -43,7 +43,10 @@ def _maze(shape: tuple[int, int], random: Random) -> Occupancy:
 
 
 def _rooms(shape: tuple[int, int], random: Random) -> Occupancy:
-    """Divide the map into rooms by walls one cell thick, with doors so that all are connected."""
+    """Divide the map into rooms by walls one cell thick.
+
+    Doors connect all rooms.
+    """
     longest = int(
         random.integers(SHORTEST_STEP, np.clip(min(shape) // 3, SHORTEST_STEP, 15) + 1)
     )
@@ -62,8 +65,12 @@ def _rooms(shape: tuple[int, int], random: Random) -> Occupancy:
 
 
 def _corridors(shape: tuple[int, int], random: Random) -> Occupancy:
-    """Dig L-shaped corridors, one to three cells wide, between random points of a solid block."""
-    # One point in each part of the map, and links only between neighbours, keep most of it solid.
+    """Dig L-shaped corridors between random points of a solid block.
+
+    They are one to three cells wide.
+    """
+    # One point in each part of the map, and links only between neighbours, keep most of
+    # it solid.
     spacing = int(random.integers(5, 11))
     rows, columns = (max(2, (side - 2) // spacing) for side in shape)
     y_edges = np.linspace(1, shape[0] - 1, rows + 1).astype(np.int64)
@@ -105,12 +112,13 @@ def _dead_ends(shape: tuple[int, int], random: Random) -> Occupancy:
 
 
 def _office(shape: tuple[int, int], random: Random) -> Occupancy:
-    """Draw the plan of a building: a net of corridors, rooms along them, desks in the rooms."""
+    """Draw a building: a net of corridors, rooms along them, desks in the rooms."""
     along_x = random.random() < 0.5
     height, width = shape if along_x else shape[::-1]
     count = max(1, round(height / random.integers(14, 25)))
     corridors = _corridor_spans(height, count, random)
-    # Two or more corridors need another corridor across them, or they would not be connected.
+    # Two or more corridors need another corridor across them, or they would not be
+    # connected.
     cross_count = max(int(count > 1), round(width / random.integers(30, 61)))
     cross_corridors = _corridor_spans(width, cross_count, random)
     corridor = np.zeros((height, width), dtype=np.bool_)
@@ -144,14 +152,18 @@ def _office(shape: tuple[int, int], random: Random) -> Occupancy:
 def _links(
     rows: int, columns: int, extra: float, random: Random
 ) -> tuple[Integers, Integers, Integers, Integers]:
-    """Link a lattice by a random tree and more; return both ends' rows and columns, as drawn."""
+    """Link the nodes of a lattice by a random tree and by more links.
+
+    Return the rows and columns of both ends of each link, in the order of the draw.
+    """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import minimum_spanning_tree
 
     node = np.arange(rows * columns, dtype=np.int64).reshape(rows, columns)
     first = np.concatenate([node[:, :-1].ravel(), node[:-1].ravel()])
     second = np.concatenate([node[:, 1:].ravel(), node[1:].ravel()])
-    # The links are in random order: the number of a link is its weight and tells it in the tree.
+    # The links are in random order: the number of a link is its weight and tells it in
+    # the tree.
     order = random.permutation(len(first))
     first, second = first[order], second[order]
     numbers = np.arange(1, len(first) + 1)  # scipy reads a weight of 0 as no link
@@ -175,7 +187,10 @@ def _wall_lines(first: int, last: int, longest: int, random: Random) -> Integers
 def _open_doors(
     occupancy: Occupancy, columns: Any, tops: Any, bottoms: Any, random: Random
 ) -> None:
-    """Open a door of one or two cells in walls along columns, between their top and bottom rows."""
+    """Open a door of one or two cells in walls along columns.
+
+    `tops` and `bottoms` are the first and last rows of the walls.
+    """
     first = random.integers(tops + 1, bottoms)
     last = np.minimum(first + random.integers(0, 2, len(first)), bottoms - 1)
     occupancy[first, columns] = occupancy[last, columns] = False
@@ -204,14 +219,15 @@ def _corridor_spans(side: int, count: int, random: Random) -> Spans:
 
 
 def _between(spans: Spans, side: int) -> Spans:
-    """Return the first and last cell of each part of a side that lies between corridors."""
+    """Return the parts of a side between corridors: first and last cells."""
     return [
         (end, first - 1)
         for (_, end), (first, _) in itertools.pairwise([(0, 0), *spans, (side, side)])
     ]
 
 
-# The function that makes each kind of map. All free cells are connected, except in random_*.
+# The function that makes each kind of map. All free cells are connected, except in
+# random_*.
 KINDS: Final[dict[str, Callable[[tuple[int, int], Random], Occupancy]]] = {
     **{
         f"random_{percent}": partial(_independent, percent / 100)
@@ -226,7 +242,10 @@ KINDS: Final[dict[str, Callable[[tuple[int, int], Random], Occupancy]]] = {
 
 
 def generate_map(kind: str, shape: tuple[int, int], random: Random) -> Occupancy:
-    """Make a random map of a kind in `KINDS` in which a path joins at least two free cells."""
+    """Make a random map of a kind in `KINDS`.
+
+    A path joins at least two of its free cells.
+    """
     if kind not in KINDS:
         raise ValueError(
             f"the kind {kind!r} is unknown; give one of {', '.join(KINDS)}"
@@ -237,7 +256,7 @@ def generate_map(kind: str, shape: tuple[int, int], random: Random) -> Occupancy
 
 
 def gradient_costs(occupancy: Occupancy, random: Random) -> NDArray[np.int8]:
-    """Return (H, W) costs that rise linearly over the map in a random direction, from 0 to 99."""
+    """Return costs (H, W) from 0 to 99, rising linearly in a random direction."""
     angle = random.uniform(0, 2 * np.pi)
     y, x = np.ogrid[: occupancy.shape[0], : occupancy.shape[1]]
     distance = np.cos(angle) * x + np.sin(angle) * y
@@ -247,7 +266,10 @@ def gradient_costs(occupancy: Occupancy, random: Random) -> NDArray[np.int8]:
 
 
 def inflated_costs(occupancy: Occupancy, radius: float) -> NDArray[np.int8]:
-    """Return (H, W) costs that fall exponentially around obstacles: 0 beyond `radius` cells."""
+    """Return costs (H, W) that fall exponentially around obstacles.
+
+    Beyond `radius` cells they are 0.
+    """
     distance = np.maximum(clearance(occupancy), 1)  # occupied cells do not matter
     costs = np.where(
         distance <= radius, np.rint(99 ** (1 - (distance - 1) / radius)), 0

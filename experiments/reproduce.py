@@ -1,4 +1,7 @@
-"""Train and measure the paper's experiments with many seeds. Run the same command to resume."""
+"""Trains and measures the paper's experiments with many seeds.
+
+The same command again resumes them.
+"""
 
 import argparse
 import os
@@ -8,7 +11,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final
 
-# Before NumPy is imported. On a busy machine, several threads are ten times as slow as one.
+# Before NumPy is imported. On a busy machine, several threads are ten times as slow as
+# one.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import any_map

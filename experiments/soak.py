@@ -1,4 +1,4 @@
-"""Keeps the nodes at mixed work for minutes, bad input included, and watches their memory."""
+"""Keeps the nodes at mixed work, bad input included, and watches their memory."""
 
 import importlib.util
 import itertools
@@ -42,10 +42,11 @@ SOURCE = (
     "tf" if importlib.util.find_spec("tf2_ros") else "odometry"
 )  # of the robot's poses
 SPEED_UP, SLOWNESS = 4.0, 0.5  # the robot is twice as fast as at nominal speed
-# The planner's transform_tolerance and map_timeout, seconds; silent odometry has 2 seconds.
+# The planner's transform_tolerance and map_timeout, seconds; silent odometry has 2
+# seconds.
 TOLERANCE, MAP_TIMEOUT = 1.0, 1.0
-# Seconds after an event until the nodes must know of it, on a loaded machine; of silence; and
-# until all must be well again.
+# Seconds after an event until the nodes must know of it, on a loaded machine; of
+# silence; and until all must be well again.
 GRACE, SILENCE, RECOVERY = 1.5, 5.0, 60.0
 SILENCES = ("poses stop", "costmap stops", "clock back, then no poses")
 EVENTS = ("clock back", "clock forward", "set elsewhere", *SILENCES)
@@ -104,7 +105,10 @@ class Work:
         )
 
     def settle(self) -> None:
-        """Bring the nodes to the same state: the memory depends on the fields that are kept."""
+        """Bring the nodes to the same state before their memory is read.
+
+        The memory depends on the fields that are kept.
+        """
         self._set("", 65)
         self._client.call(
             Trigger, "planner/reload_model"
@@ -144,7 +148,10 @@ class Work:
 
 
 class DrivenRobot(ros.Client):
-    """Drives the simulated robot between random cells, with its clock, costmap and poses."""
+    """Drives the simulated robot between random cells.
+
+    It publishes the clock, the costmap and the poses.
+    """
 
     def __init__(self) -> None:
         super().__init__(NAMESPACE, "simulated_robot")
@@ -205,7 +212,7 @@ class DrivenRobot(ros.Client):
             self._robot.now += self._draw.uniform(20, 600)
 
     def event(self, kind: str) -> None:
-        """Let something happen; see no plan in a silence, then plans from there and two drives."""
+        """Cause an event; see no plan in a silence, then plans and two drives."""
         self.done[kind] += 1
         ros.wait_for(kind, self.run(self._happen, kind).done)
         if self._silent:
@@ -218,7 +225,10 @@ class DrivenRobot(ros.Client):
             )
 
     def _is_well(self, kind: str, seconds: float) -> bool:
-        """Ask for plans, count stale ones; return whether a right one and two drives came."""
+        """Ask for plans and count stale ones.
+
+        Return whether a right plan and two drives came.
+        """
         until, planned = time.monotonic() + seconds, False
         time.sleep(GRACE + (MAP_TIMEOUT if self._silent else 0))
         self._drives.clear()
@@ -245,7 +255,7 @@ class DrivenRobot(ros.Client):
 def soak(
     children: Mapping[str, Popen[bytes]], work: Work, minutes: float, robot: Any = None
 ) -> dict[str, list[float]]:
-    """Work for some minutes; return the resident memory of each node, MB, as time went by."""
+    """Work for some minutes; return each node's resident memory over time, MB."""
     samples: dict[str, list[float]] = {name: [] for name in children}
     began = next_event = time.monotonic()
     events = itertools.cycle(EVENTS)
@@ -267,7 +277,10 @@ def soak(
 
 
 def growth(samples: Sequence[float]) -> tuple[float, float, float]:
-    """Return the memory after the first fifth, that at the end, and its growth as a share."""
+    """Return the memory after the first fifth, at the end, and its growth.
+
+    The growth is a share of the former.
+    """
     steady = samples[len(samples) // 5 :]
     tenth = max(1, len(steady) // 10)
     first, last = statistics.median(steady[:tenth]), statistics.median(steady[-tenth:])
@@ -275,7 +288,10 @@ def growth(samples: Sequence[float]) -> tuple[float, float, float]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the nodes at work; return 1 if one grows, loses a call, or answers what is stale."""
+    """Keep the nodes at work.
+
+    Return 1 if a node grows, loses a call, or answers what is stale.
+    """
     minutes = float(arguments[0]) if arguments else MINUTES
     quiet = ("--log-level", "fatal")
     apart = (*quiet, "-r", f"__ns:={NAMESPACE}", "-p", "use_sim_time:=true")

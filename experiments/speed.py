@@ -1,4 +1,7 @@
-"""Measures planning and training beside their peers (`make bench`), in CPU time on one thread."""
+"""Measures planning and training beside their peers, in CPU time (`make bench`).
+
+All run on one thread.
+"""
 
 import gc
 import math
@@ -43,7 +46,8 @@ SHORTEST = (
     40  # moves of the shortest path for replans: robot and goal are far from each other
 )
 
-# The kinds of changes, and where on the path: a number of moves from its ends, or 0 for its middle.
+# The kinds of changes, and where on the path: a number of moves from its ends, or 0 for
+# its middle.
 CHANGE_KINDS = {
     "cells near the robot": 10,
     "cells near the goal": -11,
@@ -52,9 +56,9 @@ CHANGE_KINDS = {
     "a wall closes": 0,
     "a wall beside the goal": -3,
 }
-# They cut corners, and cost what the entered cell costs; a diagonal as much as a straight move, or
-# with tcod 1.4 times as much.
-# pyastar2d is not among them: where cells cost differently, it may read memory that it never set.
+# They cut corners, and cost what the entered cell costs; a diagonal as much as a
+# straight move, or with tcod 1.4 times as much. pyastar2d is not among them: where
+# cells cost differently, it may read memory that it never set.
 PEERS = "tcod", "dijkstra3d A*", "dijkstra3d from both ends"
 Change = tuple[
     Occupancy, Occupancy, int, int
@@ -90,7 +94,10 @@ def measure_paper_map() -> Iterator[bool]:
 
 
 def measure_requests(side: int) -> Iterator[bool]:
-    """Compare a request on a new map with A* in C++, and time one to a goal that is known."""
+    """Compare a request on a new map with A* in C++.
+
+    A request to a known goal is timed, too.
+    """
     for kind in MAP_KINDS:
         random, of_requests = np.random.default_rng(0), []
         occupancy = generate_map(kind, (side, side), random)
@@ -181,14 +188,15 @@ def measure_requests_with_costs(side: int) -> Iterator[bool]:
             )
     for peer, of_peer in zip(PEERS, zip(*ratios, strict=True), strict=True):
         typical = statistics.median(of_peer)
-        figure = f"{side}x{side}: long request with costs / {peer}, median {typical:.2f}; worst"
+        request = f"{side}x{side}: long request with costs"
+        figure = f"{request} / {peer}, median {typical:.2f}; worst"
         yield report(figure, max(of_peer), "x", 1.0)
 
 
 def draw_change(
     kind: str, occupancy: Occupancy, path: Sequence[Cell], random: Random
 ) -> Change:
-    """Draw a change of some cells around a place or anywhere, or of a wall across a path."""
+    """Draw a change of cells around a place or anywhere, or a wall across a path."""
     side, at = len(occupancy), CHANGE_KINDS[kind] or len(path) // 2
     (x0, y0), (x, y), (x1, y1) = path[at - 2], path[at], path[at + 2]
     width = height = side if kind == "cells anywhere" else 5
@@ -236,7 +244,7 @@ def replan(
 
 
 def measure_replans(side: int) -> Iterator[bool]:
-    """Compare replans with a new field on the changed map, which must give the same path."""
+    """Compare replans with new fields, which must give the same path."""
     for kind in CHANGE_KINDS:
         ratios = []
         for map_kind in MAP_KINDS:
@@ -256,7 +264,7 @@ def measure_replans(side: int) -> Iterator[bool]:
 
 
 def measure_short_requests(side: int) -> Iterator[bool]:
-    """Compare a request of 15 cells on a new map of random costs with one on a map without."""
+    """Compare a request of 15 cells on a map of random costs with one without."""
     random, times = np.random.default_rng(0), []
     occupancy = random.random((side, side)) < 0.2
     occupancy[3:30, 3:30] = False
@@ -274,7 +282,7 @@ def measure_short_requests(side: int) -> Iterator[bool]:
 
 
 def measure_first_request(side: int) -> Iterator[bool]:
-    """Time the first request on a huge map, to a near goal, and with all patches read first."""
+    """Time first requests on a huge map, to a near goal and after its patches."""
     random = np.random.default_rng(0)
     occupancy = random.random((side, side)) < 0.1
     middle = side // 2
@@ -294,7 +302,10 @@ def measure_first_request(side: int) -> Iterator[bool]:
 
 
 def measure_repairs(sides: tuple[int, int], with_costs: bool) -> Iterator[bool]:
-    """Compare replans near the robot, patches included, on a large map with those on a small."""
+    """Compare replans near the robot on a large map and on a small one.
+
+    Their times include the patches.
+    """
     known: list[list[Any]] = []
     for side in sides:
         random = np.random.default_rng(0)
@@ -320,9 +331,10 @@ def measure_repairs(sides: tuple[int, int], with_costs: bool) -> Iterator[bool]:
     small, large = medians(
         [[timed(repair, it)[0] for it in known] for _ in range(CHANGES)]
     )
-    name = f"{FLIPPED} cells near the robot{', costs' if with_costs else ''}: {small:.2f} ms"
+    costs = ", costs" if with_costs else ""
+    times = f"{small:.2f} ms at {sides[0]}, {large:.2f} at {sides[1]}"
     yield report(
-        f"{name} at {sides[0]}, {large:.2f} at {sides[1]}; ratio",
+        f"{FLIPPED} cells near the robot{costs}: {times}; ratio",
         large / small,
         "x",
         1.5,
@@ -337,7 +349,10 @@ def all_values(grid: GridMap, goal: Cell) -> QField:
 
 
 def measure_whole_fields(side: int, costs: bool, bound: float) -> Iterator[bool]:
-    """Compare the value of every cell with scipy's Dijkstra, graph included, on each kind."""
+    """Compare the value of every cell with scipy's Dijkstra, on each kind.
+
+    The time of scipy's includes the graph.
+    """
     ratios, nbytes, name = [], 0, f"{side}x{side}{', random costs' if costs else ''}"
     rounds = 20 if side < 1000 else 1
     for kind in KINDS:
@@ -366,7 +381,10 @@ def measure_whole_fields(side: int, costs: bool, bound: float) -> Iterator[bool]
 
 
 class PaperFeatures(BaseFeaturesExtractor):
-    """The paper's convolution, for Stable-Baselines3; its Q head is the fully connected layer."""
+    """The paper's convolution, for Stable-Baselines3.
+
+    The Q head of Stable-Baselines3 is the fully connected layer.
+    """
 
     def __init__(self, observation_space: gymnasium.spaces.Box, filters: int) -> None:
         height, width = observation_space.shape
@@ -381,7 +399,10 @@ class PaperFeatures(BaseFeaturesExtractor):
 
 
 def measure_training() -> Iterator[bool]:
-    """Compare our steps with torch and with Stable-Baselines3: same network, an update a step."""
+    """Compare training with torch and with Stable-Baselines3.
+
+    The network is the same, with an update for each step.
+    """
     # ε is at its last value from the start: a random action costs no forward pass.
     p = HyperParameters(epsilon_start=HyperParameters().epsilon_end)
     scenario = paper_scenario()
@@ -426,7 +447,8 @@ def measure_training() -> Iterator[bool]:
 def main() -> int:
     """Print each figure beside its bound; return 1 if one is missed."""
     torch.set_num_threads(1)
-    gc.freeze()  # else this process pauses to look for garbage among what it has imported
+    # Else this process pauses to look for garbage among what it has imported.
+    gc.freeze()
     missed = [*measure_paper_map(), *measure_training()]
     for side in (256, 1024):
         missed += [*measure_requests(side), *measure_requests_with_costs(side)]

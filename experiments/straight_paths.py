@@ -1,4 +1,4 @@
-"""Measures straight paths: length beside Theta* and the any-angle optimum, clearance, time."""
+"""Measures straight paths: Theta*, the any-angle optimum, clearance and time."""
 
 import heapq
 import statistics
@@ -28,7 +28,10 @@ FINER = 15  # a small map has so many cells to a side of one for its true optimu
 
 
 def main(_: Sequence[str]) -> int:
-    """Print lengths (with costs: costs) over those of Theta*, and distances from obstacles."""
+    """Print lengths over those of Theta*, and distances from obstacles.
+
+    On maps with costs it prints costs over costs.
+    """
     for inflation in (0.0, INFLATION):
         rows = []
         for kind in KINDS:
@@ -129,7 +132,10 @@ def measure_straight_paths(side: int, kinds: Sequence[str]) -> Iterator[bool]:
 
 
 def theta_star(grid: GridMap, start: Cell, goal: Cell) -> NDArray[np.int64]:
-    """Return the path of Theta* (Daniel, Nash, Koenig and Felner 2010) by our rule and costs."""
+    """Return the path of Theta* by this package's move rule and costs.
+
+    Daniel, Nash, Koenig and Felner 2010.
+    """
     return _theta_star(*start, *goal, MOVES, grid.layers(RULE))
 
 
@@ -180,8 +186,8 @@ def _theta_star(
 def optimum(occupancy: Occupancy, start: Cell, goal: Cell, finer: int = FINER) -> float:
     """Return the least length of any path of segments between centres of cells.
 
-    With all cells cut into finer ones, these are the points of the plane, nearly: a shortest path
-    turns at corners of obstacles alone.
+    With all cells cut into finer ones, these are the points of the plane, nearly: a
+    shortest path turns at corners of obstacles alone.
     """
     fine = np.kron(occupancy, np.ones((finer, finer), np.bool_))
     ends = [[finer * of + finer // 2 for of in cell] for cell in (start, goal)]

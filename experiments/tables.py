@@ -1,4 +1,4 @@
-"""Tables, statistics over seeds, and where they go: a report, and the pages of the docs."""
+"""Tables, statistics over seeds, and where they go: a report and docs' pages."""
 
 import re
 import shutil
@@ -23,7 +23,10 @@ def table(header: str, rows: Sequence[Sequence[object]]) -> str:
 def write_report(
     out: Path, sections: Mapping[str, str], page: Path | None = None
 ) -> str:
-    """Write ``report.md`` and return it; a page gets the sections that it has marks for."""
+    """Write ``report.md`` and return it.
+
+    A page gets the sections that it has marks for.
+    """
     text = "\n".join(
         f"## {title}\n\n{section}\n" for title, section in sections.items()
     )
@@ -46,7 +49,10 @@ def write_report(
 
 
 def median_and_range(values: Sequence[float], digits: int = 0) -> str:
-    """Return median, least and greatest as "3 (1 to 4)"; infinity is "never", NaN is left out."""
+    """Return median, least and greatest as "3 (1 to 4)".
+
+    Infinity is "never"; NaN is left out.
+    """
     values = [value for value in values if not np.isnan(value)]
     if not values:
         return "none"
@@ -70,7 +76,10 @@ def mean_and_worst(
 def report(
     figure: str, value: float, unit: str, bound: float, at_most: bool = True
 ) -> bool:
-    """Print a figure beside its bound, unless that is infinite; return whether it is missed."""
+    """Print a figure beside its bound; return whether the bound is missed.
+
+    An infinite bound is not printed.
+    """
     missed = value > bound if at_most else value < bound
     sign, verdict = "at most" if at_most else "at least", "MISSED" if missed else "ok"
     beside = "" if bound == float("inf") else f"{sign:8} {bound:6.1f}  {verdict}"

@@ -1,4 +1,4 @@
-"""The paper's network, trained by torch: what the compiled training is compared with."""
+"""The paper's network trained by torch, to compare the compiled training with."""
 
 from typing import Any
 
@@ -41,7 +41,7 @@ class PaperModule(nn.Module):
 
 
 class TorchLearner:
-    """Takes over the training of the paper's network, with autograd and torch's Adam."""
+    """Trains the paper's network with autograd and torch's Adam."""
 
     def __init__(self, trainer: Trainer) -> None:
         self.environment = trainer.environment
@@ -70,7 +70,10 @@ class TorchLearner:
     def q_values(
         self, scenario: NDArray[np.int64], cell: NDArray[np.int64]
     ) -> NDArray[Any]:
-        """Return Q(s, a) of robots in `cell` (B,) on the maps `scenario` (B,): (B, 8)."""
+        """Return Q(s, a) of B robots: (B, 8).
+
+        `cell` (B,) are their cells, `scenario` (B,) the numbers of their maps.
+        """
         with torch.inference_mode():
             answer: Tensor = self._online(self._observe(scenario, cell))
         return answer.numpy()

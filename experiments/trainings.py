@@ -1,4 +1,4 @@
-"""The paper's trainings: two profiles, regular evaluations, many in parallel, a folder for each."""
+"""The paper's trainings: two profiles, many in parallel, a folder for each."""
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
@@ -45,8 +45,8 @@ HIDDEN_UNITS: Final = (
     0,
     128,
 )  # of the paper's network for goal iii; 0 for no hidden layer
-# How far from the path new obstacles lie, in cells, by two readings of section 5.3: the "free
-# positions that make up the optimal path", or their eight neighbours too.
+# How far from the path new obstacles lie, in cells, by two readings of section 5.3: the
+# "free positions that make up the optimal path", or their eight neighbours too.
 NOISE: Final = {"on_path": 0, "near_path": 1}
 PROFILES: Final[dict[str, HyperParameters]] = {
     # Its network, observation and Table 1, our choice where it is silent.
@@ -68,7 +68,10 @@ Evaluations: TypeAlias = NDArray[Any]
 
 @dataclass(frozen=True)
 class Training:
-    """One training of an experiment; ``evaluation_interval`` is in environment steps."""
+    """One training of an experiment.
+
+    ``evaluation_interval`` is in environment steps.
+    """
 
     folder: Path
     parameters: HyperParameters
@@ -174,7 +177,10 @@ def in_parallel(
     backend: str = "loky",
     unit: str = "training",
 ) -> list[Any]:
-    """Return ``job(item)`` for each item, in order; the first exception ends all jobs."""
+    """Return ``job(item)`` for each item, in order.
+
+    The first exception ends all jobs.
+    """
     if backend == "ray":
         from ray.util.joblib import register_ray
 
@@ -182,7 +188,8 @@ def in_parallel(
     elif backend == "dask":
         from distributed import Client
 
-        Client()  # of the scheduler that DASK_SCHEDULER_ADDRESS names, else of this machine
+        # Of the scheduler that DASK_SCHEDULER_ADDRESS names, else of this machine.
+        Client()
     jobs = (joblib.delayed(_in_one_thread)(job, item) for item in items)
     with joblib.parallel_config(backend, n_jobs=-1):
         # Ray's backend has no generator: its bar jumps to the end.
@@ -199,7 +206,10 @@ def _in_one_thread(job: Callable[[Any], Any], item: Any) -> Any:
 
 
 def train(training: Training) -> None:
-    """Train and evaluate, or resume; keep the last network that solved the most scenarios, too."""
+    """Train and evaluate, or resume.
+
+    The last network that solved the most scenarios is saved, too.
+    """
     folder = training.folder
     run = TrainingRun(
         folder,
@@ -235,7 +245,7 @@ def train(training: Training) -> None:
 def evaluate_training(
     trainer: Trainer, optimum: NDArray[np.float32]
 ) -> dict[str, float]:
-    """Return figures of the current network's rollouts from the start of each scenario."""
+    """Return figures of the network's rollouts from each scenario's start."""
     planner = trainer.planner()
     lengths, unmasked = rollouts(planner, trainer.environment)
     # The mean of max_a Q(s, a) - V*(s) over the free cells, where Q is the return.
@@ -262,7 +272,10 @@ def evaluate_training(
 def rollouts(
     planner: Planner, environment: GridVectorEnvironment
 ) -> NDArray[np.float64]:
-    """Return each start's length, NaN if trapped, with and without action masking: (2, S)."""
+    """Return the length from each start, with action masking and without: (2, S).
+
+    It is NaN where the rollout is trapped.
+    """
     if not isinstance(planner.network, PaperQNetwork):
         fields = [
             (planner.q_field(s.grid, s.goal), s.start) for s in environment.scenarios
@@ -272,7 +285,8 @@ def rollouts(
         return np.array(
             [[p.length if p.cells else np.nan for p in each] for each in plans]
         )
-    # All maps at once, and the paths' cells alone: whole fields take 10 to 20 times as long.
+    # All maps at once, and the paths' cells alone: whole fields take 10 to 20 times as
+    # long.
     maps = np.arange(len(environment.start))
     background = environment.background
     of_model = planner.network

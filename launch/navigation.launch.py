@@ -1,6 +1,7 @@
 """Starts the whole of Nav2, with this package's planner in place of its own.
 
-``ros2 launch ddqn_planner navigation.launch.py map:=/path/to/map.yaml``; docs/nav2.md explains it.
+``ros2 launch ddqn_planner navigation.launch.py map:=/path/to/map.yaml``; docs/nav2.md
+explains it.
 """
 
 import os
@@ -82,8 +83,9 @@ MOVED_AWAY = [
 MOVED_TO = "planner_server"
 OUT_OF_THE_WAY = [(name, f"{MOVED_TO}/{name}") for name in MOVED_AWAY]
 
-# Nav2's nodes in the order in which they are activated: package, executable, name, remaps.
-# planner_server runs the global costmap. bt_navigator needs the actions of the planner.
+# Nav2's nodes in the order in which they are activated: package, executable, name,
+# remaps. planner_server runs the global costmap. bt_navigator needs the actions of the
+# planner.
 SERVERS = (
     ("nav2_controller", "controller_server", "controller_server", [NAV_VELOCITY]),
     ("nav2_smoother", "smoother_server", "smoother_server", []),
@@ -117,7 +119,8 @@ PLANNER_REMAPS = [
     # bt_navigator plans for RViz's goals.
     ("goal_pose", f"{PLANNER}/goal_pose"),
 ]
-# The topics of rviz/ddqn_planner.rviz, which RViz does not put into a namespace by itself.
+# The topics of rviz/ddqn_planner.rviz, which RViz does not put into a namespace by
+# itself.
 RVIZ_TOPICS = {
     "/map": "map",
     "/map_updates": "map_updates",
@@ -186,7 +189,10 @@ def sections(document, path=()):
 
 
 def nodes_of(document, namespace):
-    """Return the parameters by the node's full name; a relative name is in the namespace."""
+    """Return the parameters by the node's full name.
+
+    A relative name is in the namespace.
+    """
     nodes = {}
     for path, parameters in sections(document):
         name = "/".join(path)
@@ -207,7 +213,10 @@ def parameters_of(nodes, namespace, name):
 
 
 def raise_parameter(nodes, namespace, node, name, least):
-    """Let a parameter be at least so large; a substitution, which is a string, stays."""
+    """Let a parameter be at least so large.
+
+    A substitution, which is a string, stays.
+    """
     value = parameters_of(nodes, namespace, node).get(name, least)
     if not isinstance(value, str) and not isinstance(least, str):
         nodes.setdefault(f"{namespace}/{node}", {})[name] = max(value, least)
@@ -257,7 +266,10 @@ def nav2_parameters(arguments, namespace):
 
 
 def planner_parameters(nodes, arguments, namespace):
-    """Return what planner_node takes: defaults for Nav2, its section, and the arguments."""
+    """Return planner_node's parameters.
+
+    They are defaults for Nav2, its section of the file, and the arguments.
+    """
     costmap = parameters_of(nodes, f"{namespace}/global_costmap", "global_costmap")
     defaults = {
         "robot_frame": costmap.get("robot_base_frame", "base_link"),
@@ -280,7 +292,10 @@ def is_installed(package):
 
 
 def servers_of(nodes, namespace):
-    """Return the servers to start; of the optional ones those with a package and parameters."""
+    """Return the servers to start.
+
+    An optional one needs its package and its parameters.
+    """
     return [
         server
         for server in SERVERS
@@ -290,7 +305,7 @@ def servers_of(nodes, namespace):
 
 
 def nav2_nodes(arguments, namespace):
-    """Return Nav2's nodes, the planner among them, and the manager that activates them."""
+    """Return Nav2's nodes with the planner, and the manager of their lifecycle."""
     nodes = nav2_parameters(arguments, namespace)
     parameter_file = saved(nodes)
     own = {f"{namespace}/{PLANNER}": planner_parameters(nodes, arguments, namespace)}

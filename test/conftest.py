@@ -11,8 +11,9 @@ import pytest
 # Read by the first import of a message type.
 os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
 
-# Read by the first node. Tests have several nodes in one process, and Fast DDS 2.14 was seen to
-# deadlock when one of them ended while it told the others by a call instead of a message.
+# Read by the first node. Tests have several nodes in one process, and Fast DDS 2.14 was
+# seen to deadlock when one of them ended while it told the others by a call instead of
+# a message.
 os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(
     Path(__file__).with_name("fastdds.xml")
 )
@@ -39,7 +40,9 @@ ANY_WORKER = {"test_cli.py", "test_demo.py", "test_plan_command.py"}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the slow tests last, the longest of them first: so the workers end at the same time."""
+    """Put the slow tests last, the longest of them first: so the workers end at the
+    same time.
+    """
 
     def order(item: pytest.Item) -> tuple[bool, int]:
         slow = item.get_closest_marker("slow")
@@ -63,7 +66,9 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 @pytest.fixture
 def console(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
-    """Run `ddqn-planner` with words and other arguments; return what it writes to out and err."""
+    """Run `ddqn-planner` with words and other arguments; return what it writes to out
+    and err.
+    """
 
     def run(words: str, *others: object, status: int = 0) -> Any:
         assert main([*words.split(), *map(str, others)]) == status
@@ -74,7 +79,9 @@ def console(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
 
 @pytest.fixture
 def plain_folder() -> Iterator[Path]:
-    """A folder of a user who is not root, and may not read everything, for the time of a test."""
+    """A folder of a user who is not root, and may not read everything, for the time of
+    a test.
+    """
     folder = Path(tempfile.mkdtemp())
     user = os.geteuid()
     if user == 0:
@@ -89,7 +96,9 @@ def plain_folder() -> Iterator[Path]:
 
 @pytest.fixture
 def often_switched() -> Iterator[None]:
-    """Let threads take turns 500 times as often: what is not safe fails in most runs."""
+    """Let threads take turns 500 times as often: what is not safe fails in most
+    runs.
+    """
     before = sys.getswitchinterval()
     sys.setswitchinterval(1e-5)
     yield

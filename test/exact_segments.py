@@ -12,7 +12,9 @@ from ddqn_planner.grid import MOVES, Cell
 
 
 def shares(first: Cell, last: Cell) -> dict[Cell, Fraction]:
-    """Return the share of a segment that lies within each cell that it passes, in their order."""
+    """Return the share of a segment that lies within each cell that it passes, in their
+    order.
+    """
     columns, rows = (
         range(min(ends), max(ends) + 1) for ends in zip(first, last, strict=True)
     )

@@ -29,7 +29,9 @@ def random_network(
 
 
 def turning_network(size: int) -> QNetwork:
-    """A network that always goes to -x, or where it cannot, to +x: it turns round for ever."""
+    """A network that always goes to -x, or where it cannot, to +x: it turns round for
+    ever.
+    """
     network = random_network(
         "paper", height=size, width=size, filters=1, hidden_units=0
     )

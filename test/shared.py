@@ -10,8 +10,8 @@ import torch
 from ddqn_planner.grid import GridMap, MoveRule
 from ddqn_planner.training.environment import Scenario, paper_scenario
 
-# A shell starts what it runs in the background with SIGINT ignored; the processes that the tests
-# start would inherit that.
+# A shell starts what it runs in the background with SIGINT ignored; the processes that
+# the tests start would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 torch.set_num_threads(1)
 # A loaded machine is slow, not wrong.

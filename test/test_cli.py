@@ -21,7 +21,8 @@ from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import Trainer
 
 PARAMETERS: Any = fields(HyperParameters)
-PATIENCE = 300  # seconds to wait for what should come at once: a loaded machine is slow, not wrong
+PATIENCE = 300
+"""Seconds to wait for what should come at once: a loaded machine is slow, not wrong."""
 
 
 @pytest.fixture
@@ -48,7 +49,9 @@ sys.meta_path.insert(0, Absent)
 
 @pytest.fixture
 def without(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
-    """Run an executable of the package as if neither ROS nor some libraries were installed."""
+    """Run an executable of the package as if neither ROS nor some libraries were
+    installed.
+    """
 
     def run(
         libraries: Sequence[str], *command: str
@@ -123,7 +126,10 @@ def test_bad_input_ends_in_2(
 
 
 def test_a_trained_model_plans(console: Any, small_map: str, tmp_path: Path) -> None:
-    train = "train --network propagation --steps 1000 --learning-rate 0.003 --target-interval 50"
+    train = (
+        "train --network propagation --steps 1000 --learning-rate 0.003 "
+        "--target-interval 50"
+    )
     assert "of 16 starts" in console(train, small_map, "--out", tmp_path / "run").out
     model = tmp_path / "run" / "model.safetensors"
     assert "length" in console("plan", small_map, "--model", model).out

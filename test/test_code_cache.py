@@ -1,4 +1,6 @@
-"""What becomes of compiled functions when the files of their code are damaged, or none can be."""
+"""What becomes of compiled functions when the files of their code are damaged, or none
+can be.
+"""
 
 import os
 import pickle
@@ -24,14 +26,18 @@ def area(width: float, height: float) -> float:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a folder for compiled code, of a process that has not warned of anything."""
+    """Return a folder for compiled code, of a process that has not warned of
+    anything.
+    """
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "code"))
     monkeypatch.setattr(code_cache, "messages", code_cache.Messages())
     return tmp_path / "code"
 
 
 def compile_area() -> Any:
-    """Return the function's dispatcher as a new process has it, after a call with two kinds."""
+    """Return the function's dispatcher as a new process has it, after a call with two
+    kinds.
+    """
     dispatcher = compiled(area).dispatcher()  # type: ignore[attr-defined]
     assert dispatcher(3, 2) == 6
     assert dispatcher(1.5, 2.0) == 3.0
@@ -61,7 +67,9 @@ def lengthen(path: Path) -> None:
 
 
 def zero_a_block(path: Path) -> None:
-    """As a power cut does: numba alone would run the machine code in such a file, and crash."""
+    """As a power cut does: numba alone would run the machine code in such a file, and
+    crash.
+    """
     content = bytearray(path.read_bytes())
     middle = len(content) // 2
     content[middle : middle + 512] = bytes(len(content[middle : middle + 512]))

@@ -20,7 +20,9 @@ runpy.run_path({PROGRAM!r})
 
 
 def environ(distribution: str, modules: Path | None = None) -> dict[str, str]:
-    """Return an environment in which a ROS is sourced, or none, and modules go before Python's."""
+    """Return an environment in which a ROS is sourced, or none, and modules go before
+    Python's.
+    """
     environment = {
         key: value for key, value in os.environ.items() if key != "ROS_DISTRO"
     }
@@ -102,7 +104,8 @@ def test_an_environment_that_does_not_run_is_made_anew_and_another_one_kept(
     assert not sees_system()
     subprocess.run([folder / "bin" / "python", "-m", "pip", "--version"], check=True)
     kept.touch()
-    # With a ROS that is sourced, none comes from PyPI: rclpy of this very environment, here.
+    # With a ROS that is sourced, none comes from PyPI: rclpy of this very environment,
+    # here.
     pytest.importorskip("rclpy")
     assert make("jazzy") == "figures"
     assert kept.exists()

@@ -1,4 +1,6 @@
-"""What people call files, wherever a file is named: of a home folder, with blanks, or of none."""
+"""What people call files, wherever a file is named: of a home folder, with blanks, or
+of none.
+"""
 
 import os
 import pwd
@@ -82,7 +84,8 @@ def test_without_the_variable_the_home_is_that_of_the_users_list(
 NO_PATHS = {
     "": "path is ''; give a path",
     "  ": "path is '  '; give a path",
-    "~nobody_there/x": "path is '~nobody_there/x', but no home folder of a user 'nobody_there'",
+    "~nobody_there/x": "path is '~nobody_there/x', "
+    "but no home folder of a user 'nobody_there'",
     "~\ud800": "half a character",
     "a\0b": "NUL character",
     "file://": "give a path",

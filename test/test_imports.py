@@ -1,4 +1,6 @@
-"""Which libraries a program loads: a planner must start fast, and on robots without torch."""
+"""Which libraries a program loads: a planner must start fast, and on robots without
+torch.
+"""
 
 import os
 import subprocess
@@ -17,9 +19,10 @@ from ddqn_planner.resources import find_map
 
 planner = Planner.load("any_map")
 costs = np.arange(36).reshape(6, 6)
-for grid in (load_map(find_map("dilemma")), GridMap(np.zeros((6, 6), dtype=bool), cost=costs)):
+dilemma = load_map(find_map("dilemma"))
+for grid in (dilemma, GridMap(np.zeros((6, 6), dtype=bool), cost=costs)):
     assert planner.plan(grid, grid.free_cells()[0], grid.free_cells()[-1]).cells
-assert Planner.load("dilemma").plan(load_map(find_map("dilemma")), (1, 1), (10, 12)).status
+assert Planner.load("dilemma").plan(dilemma, (1, 1), (10, 12)).status
 # numba reads scipy's version, which is light.
 import sys
 assert not {"scipy.ndimage", "scipy.linalg"} & sys.modules.keys()
@@ -143,7 +146,8 @@ from ddqn_planner.warm_up import warm_up
 
 
 def signatures():
-    modules = [module for name, module in sys.modules.items() if name.startswith("ddqn_planner.")]
+    names = [name for name in sys.modules if name.startswith("ddqn_planner.")]
+    modules = [sys.modules[name] for name in names]
     values = [value for module in modules for value in vars(module).values()]
     compiled = {value.dispatcher() for value in values if hasattr(value, "dispatcher")}
     return {(each.py_func.__module__, each.__qualname__, str(kinds))
@@ -173,9 +177,11 @@ def ask(planner):
     occupancy[20] = True
     costs, slowness = np.ones((40, 50), np.int8), np.full((40, 50), 1.5, np.float32)
     experience = Experience(0.5)
-    experience.record(np.arange(20.0), np.column_stack([np.arange(20.0), np.full(20, 1.5)]))
+    x = np.arange(20.0)
+    experience.record(np.arange(20.0), np.column_stack([x, np.full(20, 1.5)]))
     forbidden = np.full((40, 50), 1, np.uint8)
-    for layers in ({}, {"cost": costs}, {"slowness": slowness}, {"forbidden": forbidden}):
+    layers_of_maps = [{}, {"cost": costs}, {"slowness": slowness}]
+    for layers in [*layers_of_maps, {"forbidden": forbidden}]:
         grid = GridMap(occupancy, **layers)
         for simplified in (False, True):
             plan = planner.plan(grid, (2, 2), (40, 4), simplified=simplified)

@@ -87,8 +87,8 @@ print(figures.__file__)
 """
 
 
-# --user and Debian's Python install beside another share folder than the interpreter's, as the
-# last two do.
+# --user and Debian's Python install beside another share folder than the interpreter's,
+# as the last two do.
 @pytest.mark.slow
 @pytest.mark.parametrize("option", [None, "--target", "--prefix"])
 def test_maps_and_models_come_everywhere(
@@ -105,7 +105,8 @@ def test_maps_and_models_come_everywhere(
         [*PIP, "--python", python, "install", "--no-deps", *into, wheel], check=True
     )
     (package,) = folder.glob("**/ddqn_planner/__init__.py")
-    # The libraries of this environment; its editable install of the package is not among them.
+    # The libraries of this environment; its editable install of the package is not
+    # among them.
     path = [str(package.parents[1]), sysconfig.get_path("purelib")]
     environ = {**os.environ, "PYTHONPATH": os.pathsep.join(path)}
 

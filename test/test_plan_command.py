@@ -31,7 +31,8 @@ def test_plan_prints_the_papers_path_by_its_rule(console: Any) -> None:
 
 
 CLEARED = {"start": (5, 0), "start_clearing_radius": 2}
-# Options, and what they are for the library: of the map's values, of the body, of the plan.
+# Options, and what they are for the library: of the map's values, of the body, of the
+# plan.
 ASKED: dict[str, tuple[dict[str, Any], tuple[float, float], dict[str, Any]]] = {
     "": ({}, (0, 0), {}),
     "--occupied-threshold 60": ({"occupied_threshold": 60}, (0, 0), {}),
@@ -142,7 +143,8 @@ def rooms(tmp_path: Path) -> tuple[MapFile, str]:
     return map_file, str(tmp_path / "rooms.yaml")
 
 
-# Options, and what they are for the library: of the map's values, of costs, of ends and of plans.
+# Options, and what they are for the library: of the map's values, of costs, of ends and
+# of plans.
 TURNED, MOVED = {"yaws": (0, 3)}, {"goal": (102, 12)}
 BODY_ASKED: dict[str, tuple[dict[str, Any], float, dict[str, Any], dict[str, Any]]] = {
     "": ({}, 0, {}, {}),
@@ -200,7 +202,10 @@ def test_plan_drives_a_body_as_the_library_and_without_a_collision(
 def test_plan_tells_how_a_body_drives_or_why_it_cannot(
     rooms: Any, console: Any
 ) -> None:
-    words = r"\d\.\d\d m, \d+ poses, at most 1\.000 times the least cost, planned in \d+\.\d ms\n"
+    words = (
+        r"\d\.\d\d m, \d+ poses, at most 1\.000 times the least cost, "
+        r"planned in \d+\.\d ms\n"
+    )
     assert re.fullmatch(words, console("plan --model car", rooms[1]).out)
     for options, reason in (
         ("--start 64 10", "the start is occupied"),
@@ -213,12 +218,12 @@ def test_plan_tells_how_a_body_drives_or_why_it_cannot(
 
 
 REFUSED = {
-    "--model car --robot-radius 0": "--robot-radius is for models without a body, unlike car;",
+    "--model car --robot-radius 0": "--robot-radius is for models without a body,",
     "--model car --move-rule corner_cutting": "--move-rule is for models without",
     "--model car --mode greedy": "--mode is for models without",
-    "--model car --start-clearing-radius 1": "--start-clearing-radius is for models without",
+    "--model car --start-clearing-radius 1": "--start-clearing-radius is for models",
     "--model car --cells": "--cells is for models without",
-    "--yaws 0 0": "--yaws is for models with a body, unlike any_map; leave it out, or give an",
+    "--yaws 0 0": "--yaws is for models with a body, unlike any_map; leave it out,",
     "--yaw-tolerance 0": "--yaw-tolerance is for models with a",
     "--bound 1.2": "--bound is for models with a",
     "--model car --yaws nan 0": "nan); give three finite numbers x, y, yaw",

@@ -1,4 +1,6 @@
-"""Files that are no regular files: nothing waits for them, fills the memory, or replaces them."""
+"""Files that are no regular files: nothing waits for them, fills the memory, or
+replaces them.
+"""
 
 import os
 import subprocess

@@ -197,7 +197,9 @@ def test_no_path_is_sought_from_an_occupied_cell() -> None:
 
 
 def lattice() -> dict[str, Any]:
-    """A lattice with a primitive straight ahead, and turns on the spot to each heading."""
+    """A lattice with a primitive straight ahead, and turns on the spot to each
+    heading.
+    """
     angles = make_motions("ackermann", 0.5, 0.05).angles.tolist()
     about = {"grid_resolution": 0.05, "heading_angles": angles, "num_of_headings": 16}
     ahead = {"start_angle_index": 0, "end_angle_index": 0, "trajectory_length": 0.15}

@@ -25,7 +25,9 @@ def papers_layers(weights: Mapping[str, Tensor], observations: Tensor) -> Tensor
 
 
 def propagation_layers(weights: Mapping[str, Tensor], features: Tensor) -> list[Tensor]:
-    """A propagation network in torch: p(s, a) and, where it learns them, cost multipliers."""
+    """A propagation network in torch: p(s, a) and, where it learns them, cost
+    multipliers.
+    """
     hidden = layer(
         weights, "hidden", layer(weights, "convolution", features).relu()
     ).relu()

@@ -41,7 +41,9 @@ METADATA = ModelMetadata(
 
 
 class PerfectNetwork:
-    """Its Q is minus the cost of the best path through each move, plus a bonus where illegal."""
+    """Its Q is minus the cost of the best path through each move, plus a bonus where
+    illegal.
+    """
 
     def __init__(self, bonus: float = -math.inf) -> None:
         self.bonus = bonus
@@ -145,7 +147,8 @@ def test_a_perfect_network_solves_every_request_at_the_least_cost(
 
 
 def test_detours_loops_and_starts_on_the_goal_count_as_they_should() -> None:
-    # From (0, 0) it goes down, right, right, up; from (1, 0) back to (0, 0) and so round as well.
+    # From (0, 0) it goes down, right, right, up; from (1, 0) back to (0, 0) and so
+    # round as well.
     network = StubbornNetwork([[2, 4, 0], [0, 0, 6]])
     rollouts = rollouts_of(
         network, free_map(((0, 0), (2, 0)), ((1, 0), (1, 1)), ((0, 0), (1, 0)))

@@ -45,8 +45,8 @@ def test_a_map_has_its_shape_and_joined_free_cells(
         assert occupancy[:, [0, -1]].all()
 
 
-# Documented figures depend on these maps. So what was seen once of a kind, such as the loops of
-# corridors, or that a maze is a tree, stays.
+# Documented figures depend on these maps. So what was seen once of a kind, such as the
+# loops of corridors, or that a maze is a tree, stays.
 FINGERPRINTS = {
     "random_10": "430065d97cce6b9e",
     "random_20": "4cad4cc0d2799233",

@@ -214,15 +214,13 @@ def test_a_row_tells_from_when_on_a_path_is_found_and_is_the_shortest() -> None:
     assert convergence_row([always]) == ["1 (0) of 1", "0", "0", "22.97"]
 
 
-def test_moves_count_as_wrong_that_are_legal_and_predicted_to_fail_or_the_other_way() -> (
-    None
-):
+def test_legal_moves_predicted_to_fail_count_as_wrong_and_the_reverse() -> None:
     network = random_network("any_map", filters=2)
     metadata = ModelMetadata(
         "any_map", {"filters": 2}, trainings.MOVE_RULE, 0.95, "", 0, 0, ""
     )
-    # A straight move is legal in half of the 256 patches with a free centre. A diagonal one too
-    # if corners may be cut, else in an eighth.
+    # A straight move is legal in half of the 256 patches with a free centre. A diagonal
+    # one too if corners may be cut, else in an eighth.
     legal = 4 * (128 + 128 + 128 + 32)
     for bias, wrong in ((100.0, 4096 - legal), (-100.0, legal)):
         network.tensors["moves.bias"].fill(bias)
@@ -234,7 +232,8 @@ def test_the_q_that_the_loss_trains_adds_up_the_papers_rewards(paper: Scenario) 
         "propagation", {"filters": 2}, trainings.MOVE_RULE, 0.95, "", 0, 0, ""
     )
     network = random_network("propagation", filters=2)
-    # Told that every move succeeds: its rollouts go straight to the goal, and are trapped by walls.
+    # Told that every move succeeds: its rollouts go straight to the goal, and are
+    # trapped by walls.
     network.tensors["moves.bias"].fill(100.0)
     planner = Planner(network, metadata)
     ratios = length_ratios(

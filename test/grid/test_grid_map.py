@@ -45,9 +45,7 @@ def test_cells_hold_centres(
     assert grid.world_to_cell(*grid.cell_to_world((x, y))) == (x, y)
 
 
-def test_a_cell_owns_its_lower_edges_and_the_origin_turns_the_map_counter_clockwise() -> (
-    None
-):
+def test_a_cell_owns_its_lower_edges_and_the_origin_turns_the_map_to_the_left() -> None:
     grid = GridMap(np.zeros((4, 4)), resolution=0.5, origin=(-1.0, -1.0, 0.0))
     assert grid.world_to_cell(-1.0, -1.0) == (0, 0)
     assert grid.world_to_cell(-0.5, -0.75) == (1, 0)
@@ -184,7 +182,9 @@ def full_grids(draw: st.DrawFn) -> GridMap:
 
 
 def derived(grid: GridMap) -> list[Any]:
-    """All that a map computes and remembers, and a comparison with itself in new arrays."""
+    """All that a map computes and remembers, and a comparison with itself in new
+    arrays.
+    """
     rules = [grid.labels(rule).tolist() for rule in MoveRule]
     given_again = {field.name: getattr(grid, field.name) for field in fields(grid)}
     same = grid.same_cells(GridMap(**given_again))
@@ -330,7 +330,8 @@ def test_inflation_is_exact(
     distance = pairs.min(axis=1, initial=math.inf).reshape(occupancy.shape)
     assert clearance(occupancy) == pytest.approx(distance)
     costs = None if cost is None else np.full(occupancy.shape, cost)
-    # A message has the resolution in single precision: two cells of 0.05 m may be 0.099999999 m.
+    # A message has the resolution in single precision: two cells of 0.05 m may be
+    # 0.099999999 m.
     grid = inflate(
         GridMap(occupancy, float(np.float32(RESOLUTION)), cost=costs), radius, weight
     )
@@ -491,9 +492,7 @@ def test_maps_that_are_patched_or_kept_leave_files_for_others() -> None:
     assert open_files() == before
 
 
-def test_a_patched_map_is_copied_whole_and_shares_nothing_with_what_it_was_made_of() -> (
-    None
-):
+def test_a_patched_map_is_copied_whole_and_shares_nothing_with_its_origin() -> None:
     given, patch = np.zeros((20, 20), dtype=np.bool_), np.ones((2, 2), dtype=np.bool_)
     grid = GridMap(given)
     patched = grid.with_patch(patch, 3, 3)

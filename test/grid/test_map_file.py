@@ -1,4 +1,6 @@
-"""Map files are read as map_server reads them; broken and hostile ones are refused by name."""
+"""Map files are read as map_server reads them; broken and hostile ones are refused by
+name.
+"""
 
 import itertools
 import json
@@ -457,7 +459,8 @@ SAME_MAPS: dict[str, str | bytes] = {
     "tabs in a list": (BEGIN + END).replace(
         "[1.0, -2.0, 0.5]", "[\t1.0,\t-2.0\t,\n\t0.5\t]"
     ),
-    "tabs in JSON": '{\n\t"image": "map.png",\n\t"resolution":0.05,\n\t"origin":[1,-2,0.5],'
+    "tabs in JSON": '{\n\t"image": "map.png",\n\t"resolution":0.05,'
+    '\n\t"origin":[1,-2,0.5],'
     '\n\t"negate":false, "occupied_thresh":0.65,\n\t"free_thresh":0.196}',
     "tabs after dashes": (BEGIN + END).replace(
         "[1.0, -2.0, 0.5]", "\n-\t1.0\t# x\n-\t-2.0\n-\t0.5"

@@ -72,7 +72,8 @@ def test_a_path_joins_ends_of_requests(
 
 @pytest.mark.parametrize("rule", MoveRule)
 def test_requests_are_uniform_over_the_cells_that_have_a_move(rule: MoveRule) -> None:
-    # Three connected cells, one alone, two connected ones; corner cutting connects the first four.
+    # Three connected cells, one alone, two connected ones; corner cutting connects the
+    # first four.
     occupancy = np.array(
         [[0, 0, 0, 1, 1, 1], [1, 1, 1, 0, 1, 1], [1, 1, 1, 1, 1, 0], [1] * 5 + [0]]
     )

@@ -1,4 +1,6 @@
-"""One-way zones on maps whose cells lie elsewhere, beside a search for each cell's zones."""
+"""One-way zones on maps whose cells lie elsewhere, beside a search for each cell's
+zones.
+"""
 
 import math
 

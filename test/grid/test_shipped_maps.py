@@ -1,4 +1,6 @@
-"""The shipped maps. The dilemma has each property of the paper's text; see docs/reproduction.md."""
+"""The shipped maps. The dilemma has each property of the paper's text; see
+docs/reproduction.md.
+"""
 
 import itertools
 import math
@@ -106,7 +108,8 @@ def test_the_shipped_office_is_a_generated_one_of_six_times_the_cells() -> None:
     assert all(map(shipped.grid().is_free, ((15, 15), (550, 330))))
 
 
-# What a lane forbids: all actions that lead against it, for NumPy's rows from the bottom up.
+# What a lane forbids: all actions that lead against it, for NumPy's rows from the
+# bottom up.
 EAST, NORTH, WEST, SOUTH = (
     sum(1 << action for action, move in enumerate(MOVES) if move @ along < 0)
     for along in ((1, 0), (0, 1), (-1, 0), (0, -1))

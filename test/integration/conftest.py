@@ -1,4 +1,6 @@
-"""Real processes of the installed executables, and clients that talk to them over DDS."""
+"""Real processes of the installed executables, and clients that talk to them over
+DDS.
+"""
 
 import importlib.util
 import os
@@ -22,13 +24,16 @@ from processes import claim_ros_domain, executable, running
 from ddqn_planner.model import find_model
 
 TIMEOUT = 120.0
-"""Seconds that anything may take on a loaded machine; how long it does take, `make bench` says."""
+"""Seconds that anything may take on a loaded machine; how long it does take, `make
+bench` says.
+"""
 
 if importlib.util.find_spec("rclpy") is None:
     collect_ignore_glob = ["test_*.py"]
 
 
-# Here, not in a fixture: it must stand before the test modules import rclpy and the messages.
+# Here, not in a fixture: it must stand before the test modules import rclpy and the
+# messages.
 _claim = claim_ros_domain()
 
 
@@ -80,7 +85,9 @@ class NodeProcess:
 
 @pytest.fixture(scope="session")
 def run_node(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Any]:
-    """Return a context manager that runs an executable, stops it by SIGINT and sees it exit."""
+    """Return a context manager that runs an executable, stops it by SIGINT and sees it
+    exit.
+    """
 
     @contextmanager
     def run(
@@ -92,7 +99,9 @@ def run_node(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Any]:
         settings: Sequence[str] = (),
         **modules: str,
     ) -> Iterator[NodeProcess]:
-        """The node finds some modules before installed ones: ``sitecustomize`` runs first."""
+        """The node finds some modules before installed ones: ``sitecustomize`` runs
+        first.
+        """
         folder = tmp_path_factory.mktemp(name)
         for module, text in modules.items():
             (folder / f"{module}.py").write_text(text)
@@ -124,7 +133,9 @@ def run_node(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Any]:
 
 @pytest.fixture(scope="module")
 def make_client() -> Iterator[Callable[[str], Any]]:
-    """Return a function that makes a client in a namespace; all end with the test module."""
+    """Return a function that makes a client in a namespace; all end with the test
+    module.
+    """
     from client import Client
 
     with ExitStack() as clients:
@@ -161,7 +172,9 @@ def planner(run_node: Any, model: Path) -> Iterator[Any]:
 def make_robot(
     make_client: Any, small_values: np.ndarray, model: Path
 ) -> Callable[..., Any]:
-    """Return what makes the user of a planner in a namespace, with a map of some values."""
+    """Return what makes the user of a planner in a namespace, with a map of some
+    values.
+    """
     from integration.robot import Robot
 
     def make(space: str, node: Any = None, values: np.ndarray = small_values) -> Any:
@@ -174,7 +187,9 @@ def make_robot(
 def run_robot(
     run_node: Any, make_robot: Any, small_values: np.ndarray
 ) -> Callable[..., Any]:
-    """Return a context manager that runs a planner in a namespace, and gives its user."""
+    """Return a context manager that runs a planner in a namespace, and gives its
+    user.
+    """
 
     @contextmanager
     def run(
@@ -197,7 +212,8 @@ from ddqn_planner.planning import Planner
 load, outcome.PATIENCE = Planner.load, {patience}
 
 def wait_and_load(path):
-    while os.path.basename(path) == "any_map.safetensors" and not os.path.exists({gate!r}):
+    waits = os.path.basename(path) == "any_map.safetensors"
+    while waits and not os.path.exists({gate!r}):
         print("a model waits", flush=True)
         time.sleep(0.01)
     return load(path)
@@ -213,7 +229,9 @@ def load_gate(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def run_waiting(run_robot: Any, load_gate: Path) -> Callable[..., Any]:
-    """Return a `run_robot` whose planner waits for `load_gate` before it loads any_map."""
+    """Return a `run_robot` whose planner waits for `load_gate` before it loads
+    any_map.
+    """
     waiting = WAITING.format(gate=str(load_gate), patience=TIMEOUT)
     return partial(run_robot, sitecustomize=waiting)
 
@@ -225,7 +243,9 @@ def running_robot(planner: Any, make_robot: Any) -> Any:
 
 @pytest.fixture
 def robot(running_robot: Any) -> Any:
-    """Give the planner its parameters, a map, a start and a goal, whatever was before."""
+    """Give the planner its parameters, a map, a start and a goal, whatever was
+    before.
+    """
     running_robot.begin()
     return running_robot
 

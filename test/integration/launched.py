@@ -1,6 +1,7 @@
 """Runs a launch file on stand-ins of Nav2's packages, and tells what it starts.
 
-With ROS's own `launch` where that is installed, which is not on PyPI; else with stand-ins of it.
+With ROS's own `launch` where that is installed, which is not on PyPI; else with
+stand-ins of it.
 """
 
 import importlib.util
@@ -23,7 +24,8 @@ HAS_LAUNCH = importlib.util.find_spec("launch_ros") is not None
 RECORDER = """#!{python}
 import json, os, sys
 
-files = [word for before, word in zip(sys.argv, sys.argv[1:]) if before == "--params-file"]
+pairs = zip(sys.argv, sys.argv[1:])
+files = [word for before, word in pairs if before == "--params-file"]
 contents = [open(file).read().replace("!!python/tuple", "") for file in files]
 name = os.path.join("{records}", str(os.getpid()) + ".json")
 with open(name, "w") as record:
@@ -38,15 +40,17 @@ from launch_ros.actions import Node
 
 def started(context):
     values = dict(context.launch_configurations)
-    names = {"namespace", "map", "use_sim_time", "params_file", "autostart", "use_respawn"}
-    names |= {"keepout_mask", "speed_mask", "use_composition"}
+    names = {"namespace", "map", "use_sim_time", "params_file", "autostart"}
+    names |= {"use_respawn", "keepout_mask", "speed_mask", "use_composition"}
     parameters = {name: values[name] for name in names if name in values}
     return [Node(package="nav2_bringup", executable="NAME", parameters=[parameters])]
 
 def generate_launch_description():
     return LaunchDescription([OpaqueFunction(function=started)])
 """
-"""A launch file that starts one executable, which writes down the arguments of the file."""
+"""A launch file that starts one executable, which writes down the arguments of the
+file.
+"""
 
 LAUNCH = """
 import sys
@@ -85,7 +89,9 @@ class Workspace:
         self.records.mkdir()
 
     def add(self, package: str, *executables: str) -> Path:
-        """Add a package whose executables write down how they are started; return its share."""
+        """Add a package whose executables write down how they are started; return its
+        share.
+        """
         marker = self.prefix / "share/ament_index/resource_index/packages" / package
         marker.parent.mkdir(parents=True, exist_ok=True)
         marker.touch()
@@ -159,7 +165,9 @@ def _read_record(record: Any) -> tuple[str, Started]:
 
 
 def _together(documents: Iterable[Any]) -> dict[str, Any]:
-    """Return the parameters by the keys of parameter files; later ones go before earlier ones."""
+    """Return the parameters by the keys of parameter files; later ones go before
+    earlier ones.
+    """
     files: dict[str, Any] = {}
     for document in documents:
         for key, section in document.items():
@@ -170,7 +178,9 @@ def _together(documents: Iterable[Any]) -> dict[str, Any]:
 def _parameters_of(
     name: str, namespace: str, files: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return what a node takes of parameter files; its full name goes before a wildcard."""
+    """Return what a node takes of parameter files; its full name goes before a
+    wildcard.
+    """
     full_name = f"{namespace.rstrip('/')}/{name}"
     return {**files.get("/**", {}), **files.get(full_name, {})}
 

@@ -1,4 +1,6 @@
-"""Messages of every kind for the property tests of the nodes: whole ones, and malformed ones."""
+"""Messages of every kind for the property tests of the nodes: whole ones, and malformed
+ones.
+"""
 
 import array
 import math

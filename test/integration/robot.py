@@ -118,7 +118,9 @@ class Robot:
         return self.client.get_plan(start, goal)
 
     def last_plan(self) -> Path:
-        """Return the plan that was published last, which the topic keeps for late subscribers."""
+        """Return the plan that was published last, which the topic keeps for late
+        subscribers.
+        """
         self.get_plan(self.pose(START), self.pose(START))  # what came before it is done
         return self.client.subscribe(Path, "plan", LATCHED).wait()
 
@@ -129,7 +131,9 @@ class Robot:
         grid: GridMap | None = None,
         yaw: float | None = None,
     ) -> Path:
-        """Wait for a plan between two cells, to this yaw, and check all that can be said of it."""
+        """Wait for a plan between two cells, to this yaw, and check all that can be
+        said of it.
+        """
         grid = grid or self.grid
         # A goal that is told as `pose` does, or sent otherwise, or has moved.
         ends = [
@@ -155,7 +159,9 @@ class Robot:
         return path
 
     def wait_for_reason(self, pattern: str, values: Any = None) -> DiagnosticStatus:
-        """Wait until the diagnostics of this node say something, and have such values."""
+        """Wait until the diagnostics of this node say something, and have such
+        values.
+        """
         expected = (values or {}).items()
 
         def says(message: DiagnosticArray) -> bool:
@@ -166,7 +172,9 @@ class Robot:
         return self.diagnostics.wait(says).status[0]
 
     def assert_works(self) -> None:
-        """See that a good request has its plan: the node lives, and has its map and model."""
+        """See that a good request has its plan: the node lives, and has its map and
+        model.
+        """
         path = self.get_plan(self.pose(START), self.pose(GOAL))
         check_path(path, self.grid)
         assert points_of(path)[0] == point_of(self.pose(START))
@@ -180,13 +188,17 @@ class Robot:
         wait_for_map(self.diagnostics, message.header.stamp, self.name)
 
     def stamped_map(self, values: np.ndarray | None = None) -> OccupancyGrid:
-        """Return the message of the map, or of other values, with a stamp of its own."""
+        """Return the message of the map, or of other values, with a stamp of its
+        own.
+        """
         return map_message(
             self.values if values is None else values, self.grid, next(NUMBERS)
         )
 
     def map_with(self, box: Any, value: int) -> OccupancyGrid:
-        """Return the message of the map with another value in some cells, indexed by [y, x]."""
+        """Return the message of the map with another value in some cells, indexed by
+        [y, x].
+        """
         values = self.values.copy()
         values[box] = value
         return self.stamped_map(values)
@@ -205,14 +217,17 @@ class Robot:
         return self.wait_for_reason(reason, {"planned on the map of (s)": stamp})
 
     def begin(self, start: Cell = START, goal: Cell = GOAL, **parameters: Any) -> None:
-        """Reset, send a map, a start and a goal, and wait until there is a plan with all."""
+        """Reset, send a map, a start and a goal, and wait until there is a plan with
+        all.
+        """
         self.reset(**parameters)
         self.clear()
         message, yaw = self.stamped_map(), next(NUMBERS) % 3000 / 1000
         # Else an earlier map may have the plan: no topic waits for another.
         self.set_map(message)
         self.send_start(self.pose(start))
-        self.wait_until_received()  # else it may come after the goal, and have a plan of its own
+        # Else it may come after the goal, and have a plan of its own.
+        self.wait_until_received()
         self.send_goal(self.pose(goal, yaw))
         self.wait_for_path(start, goal, yaw=yaw)
         planned_on = seconds(message.header.stamp)
@@ -281,7 +296,9 @@ def yaw_of(rotation: Quaternion) -> float:
 def check_path(
     path: Path, grid: GridMap, move_rule: MoveRule = MoveRule.ROBOT_SAFE
 ) -> None:
-    """Check that a path turns at cell centres, on legal segments, densely, looking ahead."""
+    """Check that a path turns at cell centres, on legal segments, densely, looking
+    ahead.
+    """
     assert path.header.frame_id == "map"
     assert all(pose.header == path.header for pose in path.poses)
     points = points_of(path)
@@ -322,6 +339,8 @@ def changed(message: Any, field: str, value: Any) -> Any:
 
 
 def constant_model(path: FilePath, size: int, steps: int) -> None:
-    """Write a model that always goes to -x, or where it cannot, to +x: it turns round for ever."""
+    """Write a model that always goes to -x, or where it cannot, to +x: it turns round
+    for ever.
+    """
     planner = turning_planner(size)
     save_model(path, planner.network, replace(planner.metadata, steps=steps))

@@ -1,4 +1,6 @@
-"""When the planner plans for the active goal again, and which of several goals it leads to."""
+"""When the planner plans for the active goal again, and which of several goals it leads
+to.
+"""
 
 import math
 from dataclasses import replace
@@ -231,7 +233,10 @@ def test_goals_none_of_which_can_be_reached_have_an_empty_plan(docks: Robot) -> 
     docks.wait_for_reason(none.format(2) + occupied)
     docks.set_map(docks.map_with(np.s_[:, (5, 25)], 100))
     send_goals(docks, WALL, LEFT, RIGHT)
-    cut_off = "goal 1 is occupied, no path leads to goals 2, 3 .*; set the goal where free cells lead to$"
+    cut_off = (
+        "goal 1 is occupied, no path leads to goals 2, 3 .*; "
+        "set the goal where free cells lead to$"
+    )
     docks.wait_for_reason(none.format(3) + cut_off)
     docks.clear()
     docks.send_map(docks.stamped_map())

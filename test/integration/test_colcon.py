@@ -1,4 +1,6 @@
-"""The package as a colcon workspace builds and runs it, without `ros2`, which is not on PyPI."""
+"""The package as a colcon workspace builds and runs it, without `ros2`, which is not on
+PyPI.
+"""
 
 import os
 import shutil
@@ -56,7 +58,9 @@ def install(source_copy: Path) -> Path:
 
 
 def sourced(install: Path, *command: object) -> list[str]:
-    """Return what runs a command in the workspace's environment, and leaves no shell around it."""
+    """Return what runs a command in the workspace's environment, and leaves no shell
+    around it.
+    """
     # As .sh: colcon writes a local_setup.bash only where colcon-bash is.
     script = '. "$0/local_setup.sh" && exec "$@"'
     return ["sh", "-c", script, str(install), *map(str, command)]
@@ -82,7 +86,8 @@ def test_a_linked_workspace(
     (tmp_path / "src").symlink_to(source_copy.parent)
     install = build(tmp_path, "--symlink-install")
     look = (
-        "from ddqn_planner.resources import find_map; from ddqn_planner.model import find_model\n"
+        "from ddqn_planner.model import find_model\n"
+        "from ddqn_planner.resources import find_map\n"
         "print(find_map('dilemma').resolve(), find_model('any_map').resolve())"
     )
     monkeypatch.delenv(
@@ -101,7 +106,8 @@ def test_a_linked_workspace(
 
 
 def take_compiled(source: Path, package: Path) -> None:
-    """Give a copy of the package the functions that numba has compiled, which takes seconds.
+    """Give a copy of the package the functions that numba has compiled, which takes
+    seconds.
 
     Numba knows them by the times of their files, which the build has rounded.
     """

@@ -148,9 +148,7 @@ def test_a_rounded_pose_is_read_with_the_norm_1_and_others_stay_as_they_are() ->
         assert with_unit_quaternion(sent) is sent
 
 
-def test_a_pose_has_a_cell_also_off_the_map_or_is_refused_by_the_name_of_its_value() -> (
-    None
-):
+def test_a_pose_off_the_map_has_a_cell_and_a_bad_value_is_refused_by_name() -> None:
     grid, stamped = GridMap(np.zeros((2, 2)), 0.5), PoseStamped(header=HEADER)
     at = stamped.pose.position
     for at.x, at.y, cell in ((0.5, 0.99, (1, 1)), (-0.1, 1.0, (-1, 2))):
@@ -329,7 +327,9 @@ def test_a_transform_without_a_rotation_is_named(w: float) -> None:
 
 
 class Buffer:
-    """What `Frames` asks of tf2_ros.Buffer: transforms from odom to map at some seconds."""
+    """What `Frames` asks of tf2_ros.Buffer: transforms from odom to map at some
+    seconds.
+    """
 
     def __init__(self, *seconds: int) -> None:
         self.seconds = seconds

@@ -79,7 +79,8 @@ def test_demo_finds_the_shortest_paths_and_draws_them(
     for name in ("demo.png", "demo_office.png"):
         with Image.open(tmp_path / name) as picture:
             pixels = np.asarray(picture.convert("RGB"))
-        # Occupied cells, the value field and the path: more than a few lines on a ground.
+        # Occupied cells, the value field and the path: more than a few lines on a
+        # ground.
         colours, counts = np.unique(pixels.reshape(-1, 3), axis=0, return_counts=True)
         assert len(colours) > 100
         assert counts.max() < 0.8 * counts.sum()

@@ -78,7 +78,9 @@ def told(words, function):
 Inflation.__call__ = told("a map is inflated", Inflation.__call__)
 display.value_message = told("a value is shown", display.value_message)
 """
-"""What a planner runs first: it says what it computes, and while there is a file it fails."""
+"""What a planner runs first: it says what it computes, and while there is a file it
+fails.
+"""
 
 
 def test_what_nobody_asks_for_is_not_computed_and_what_somebody_sees_is_of_the_goal(

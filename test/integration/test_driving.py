@@ -1,4 +1,6 @@
-"""The trainer that learns from driving, and the planner that follows it: real nodes over DDS."""
+"""The trainer that learns from driving, and the planner that follows it: real nodes
+over DDS.
+"""
 
 from __future__ import annotations
 
@@ -347,7 +349,9 @@ def test_nothing_is_lost_while_the_disk_is_full(site: Site, trainer: Any) -> Non
 def test_a_fleet_teaches_one_trainer_and_each_robot_plans_by_all(
     run_trainer: Any, run_node: Any, make_client: Any, tmp_path: FilePath
 ) -> None:
-    """On a computer without torch; the planners are on others, which do not have its folder."""
+    """On a computer without torch; the planners are on others, which do not have its
+    folder.
+    """
     names, folder = ["one", "two", "three"], tmp_path / "drives"
     missing = "No module named 'torch'"
     torch = f'raise ModuleNotFoundError("{missing}", name="torch")'

@@ -219,7 +219,8 @@ def test_nodes_that_a_release_or_a_robot_lacks_are_left_out(
     velocities = "cmd_vel_smoothed"
     started = launch(workspace)
     assert velocities not in started["velocity_smoother"].remaps
-    # Without a collision monitor the smoothed velocities are those that the robot drives.
+    # Without a collision monitor the smoothed velocities are those that the robot
+    # drives.
     started = launch(
         workspace, params_file=written(tmp_path, {"route_server": {"x": 1}})
     )

@@ -1,4 +1,6 @@
-"""The planner's lifecycle: configure creates, activate enables, deactivate stops, cleanup frees."""
+"""The planner's lifecycle: configure creates, activate enables, deactivate stops,
+cleanup frees.
+"""
 
 import gc
 import re
@@ -42,7 +44,9 @@ def start(robot: Robot) -> None:
 
 
 def wait_for_created(robot: Robot, expected: set[str]) -> None:
-    """Wait until the planner has these of the topics and services of a configured one."""
+    """Wait until the planner has these of the topics and services of a configured
+    one.
+    """
 
     def created() -> bool:
         entities = robot.client.entities("planner")
@@ -259,7 +263,9 @@ SERVICES: dict[str, Any] = {
 
 
 def test_the_lifecycle_is_that_of_rclpys_own_nodes() -> None:
-    """Except for their answer to a transition that the state does not have: it ends a process."""
+    """Except for their answer to a transition that the state does not have: it ends a
+    process.
+    """
     rclpy.init(args=["--ros-args", "-p", "autostart:=false"])
     planner = PlannerNode()
     nodes = [planner, LifecycleNode("example")]

@@ -65,13 +65,15 @@ def publish_costmap(robot: Robot) -> None:
 def test_a_costmap_that_stops_takes_its_path_back_until_it_comes_again(
     robot: Robot,
 ) -> None:
-    # Nobody sets a parameter or asks while it is away, and it is not time to plan again.
+    # Nobody sets a parameter or asks while it is away, and it is not time to plan
+    # again.
     robot.set(map_timeout=0.05, replan_period=3600.0)
     robot.clear()
     robot.send_goal(robot.pose((35, 5)))
     last = (0, 0)
     for _ in range(2):
-        # As a costmap does: on a loaded machine the first may time out before it is planned on.
+        # As a costmap does: on a loaded machine the first may time out before it is
+        # planned on.
         with repeating(robot.client, lambda: publish_costmap(robot)):
             path = robot.plans.wait(
                 lambda path, at=last: path.poses and stamp(path) > at

@@ -1,4 +1,6 @@
-"""Live maps, as of SLAM, beside a map server and its one-way zones: real nodes over DDS."""
+"""Live maps, as of SLAM, beside a map server and its one-way zones: real nodes over
+DDS.
+"""
 
 import signal
 from collections.abc import Callable
@@ -89,7 +91,8 @@ def test_live_maps_beside_a_map_server(
         assert slam.ways() == (True, True)
         with run("map_server_node", yaml_filename=str(maps["free"])) as server:
             space = slam.client.node.get_namespace()
-            named = f"{space}/map has 2 publishers .{space}/client, {space}/map_server.*remap"
+            publishers = f"{space}/client, {space}/map_server"
+            named = f"{space}/map has 2 publishers .{publishers}.*remap"
             planner.wait_for_log(named)
             slam.diagnostics.wait(
                 lambda message: "has 2 publishers" in message.status[0].message

@@ -57,7 +57,9 @@ def maps(client: Any) -> Any:
 
 
 def served_map(client: Any, maps: Any = None) -> OccupancyGrid:
-    """Return the map that is served, once the topic has brought it: those before it may be late."""
+    """Return the map that is served, once the topic has brought it: those before it may
+    be late.
+    """
     served = client.call(GetMap, "map_server/map").map
     return maps.wait(lambda message: message == served) if maps else served
 

@@ -1,6 +1,8 @@
-"""Which map is planned on, whatever of maps, updates, directions and experience comes when.
+"""Which map is planned on, whatever of maps, updates, directions and experience comes
+when.
 
-Here a message of map_msgs is a stand-in with the same fields; PyPI does not have map_msgs.
+Here a message of map_msgs is a stand-in with the same fields; PyPI does not have
+map_msgs.
 """
 
 import array
@@ -63,7 +65,9 @@ def node() -> Iterator[BaseNode]:
 
 
 class Source(MapSource):
-    """A source of maps which has what the test gives it, and says what the planner would know."""
+    """A source of maps which has what the test gives it, and says what the planner
+    would know.
+    """
 
     def __init__(self, node: BaseNode) -> None:
         self.heard, self.diagnostics = 0, PlannerDiagnostics(node)
@@ -84,7 +88,9 @@ class Source(MapSource):
         return self.grid().slowness
 
     def used(self) -> tuple[int, Any]:
-        """The stamp of the map to plan on, and what it forbids: everywhere, or in each column."""
+        """The stamp of the map to plan on, and what it forbids: everywhere, or in each
+        column.
+        """
         if self.missing:
             return NOTHING
         rows = self.grid().forbidden

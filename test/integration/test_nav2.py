@@ -1,4 +1,6 @@
-"""Nav2's actions: what decides in them without Nav2's types, and the real ones where installed."""
+"""Nav2's actions: what decides in them without Nav2's types, and the real ones where
+installed.
+"""
 
 import sys
 from collections.abc import Callable, Coroutine, Iterator
@@ -247,9 +249,7 @@ def test_the_newest_goal_preempts_the_one_under_way() -> None:
     assert second.state == "succeeded"
 
 
-def test_a_goal_is_canceled_before_it_is_planned_meanwhile_or_once_it_is_preempted() -> (
-    None
-):
+def test_a_goal_is_canceled_before_its_plan_meanwhile_or_once_preempted() -> None:
     server, early, first, second = Server(), *(Handle() for _ in range(3))
     server.action.begin(early)
     early.state = "canceling"
@@ -409,9 +409,7 @@ def test_a_newer_goal_preempts_that_of_another_planner_there_or_here() -> None:
         assert first.state == "aborted"
 
 
-def test_goals_are_rejected_while_the_node_is_not_active_and_aborted_when_it_stops() -> (
-    None
-):
+def test_goals_are_rejected_while_the_node_is_inactive_and_aborted_at_its_end() -> None:
     server, handle = Server(), Handle()
     execution = server.begin(handle)
     server.refusal = NOT_ACTIVE
@@ -472,7 +470,9 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
             return future.result()
 
         def plan(dear: slice, threshold: float) -> tuple[bool, str]:
-            """Return whether the path leads above the block, where one way costs a little more."""
+            """Return whether the path leads above the block, where one way costs a
+            little more.
+            """
             node.set_parameters([Parameter("switch_threshold", value=threshold)])
             costs = values.copy()
             costs[dear, 10:20] = 2

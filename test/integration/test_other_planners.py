@@ -1,4 +1,6 @@
-"""Goals of other planners are sent on to their server, and its answer comes back, over DDS."""
+"""Goals of other planners are sent on to their server, and its answer comes back, over
+DDS.
+"""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -263,7 +265,7 @@ def test_a_prefix_names_other_actions_than_the_nodes_own() -> None:
         (
             "a b",
             "/",
-            "give the prefix to which the actions of Nav2's planner_server are remapped",
+            "give the prefix to which the actions of Nav2's planner_server are",
         ),
         ("9", "/", "give the prefix"),
     ):
@@ -286,7 +288,9 @@ def test_a_prefix_names_other_actions_than_the_nodes_own() -> None:
 def planners(
     run_robot: Any, make_client: Any
 ) -> Iterator[tuple[Navigator, Server, list[Any]]]:
-    """A planner node, Nav2's server beside it, as far as goals go, and the goals that it got."""
+    """A planner node, Nav2's server beside it, as far as goals go, and the goals that
+    it got.
+    """
     kinds = pytest.importorskip("nav2_msgs.action", reason="nav2_msgs is not on PyPI")
     asked: list[Any] = []
 

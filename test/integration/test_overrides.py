@@ -168,7 +168,7 @@ SECTIONS: list[tuple[Any, str, str]] = [
     (
         {"planner_node": RADIUS},
         "/planner",
-        "sets nothing of /planner: it is for /planner_node; write planner: instead of plan",
+        "sets nothing of /planner: it is for /planner_node; write planner: instead",
     ),
     (
         {"amcl": CLOCK, "planner_server": NAV2},
@@ -351,9 +351,10 @@ def test_a_planner_tells_what_it_does_not_read_and_takes_what_is_meant(
         client.get_parameter("planner", "mode")
         for warning in (
             "does not read: robot_raduis .the nearest is robot_radius.; --help",
-            "wrong.yaml sets nothing of /told/planner: it is for /planner_node; write told/pl",
-            f"no subscription for {quality.format('mpa').partition(':')[0]} now; the nearest is "
-            f"{quality.format('map').partition(':')[0]}",
+            "wrong.yaml sets nothing of /told/planner: "
+            "it is for /planner_node; write told/pl",
+            f"no subscription for {quality.format('mpa').partition(':')[0]} now; "
+            f"the nearest is {quality.format('map').partition(':')[0]}",
             "tolerance:=3 is not read; give settings after --ros-args",
         ):
             node.wait_for_log(warning)

@@ -1,4 +1,6 @@
-"""The nodes and RViz as docs/nodes.md tells of them; no request for parameters ends a node."""
+"""The nodes and RViz as docs/nodes.md tells of them; no request for parameters ends a
+node.
+"""
 
 import importlib.util
 import json
@@ -228,7 +230,10 @@ SECURITY = {"ROS_SECURITY_ENABLE": "true", "ROS_SECURITY_STRATEGY": "Enforce"}
 SECURITY |= {"ROS_SECURITY_KEYSTORE": "/no/such/keystore"}
 FLIGHTY = {"qos_overrides./map.subscription.durability": "flighty"}
 BY_TF = {"learn_from": "driving", "pose_source": "tf"}
-NEEDS_TF = "is 'tf', which needs tf2_ros, and that is not installed: apt install ros-[a-z]*-tf2"
+NEEDS_TF = (
+    "is 'tf', which needs tf2_ros, and that is not installed: "
+    "apt install ros-[a-z]*-tf2"
+)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,6 @@
-"""Nav2's IsPathValid, with stand-ins that have exactly the fields of each release, and ends."""
+"""Nav2's IsPathValid, with stand-ins that have exactly the fields of each release, and
+ends.
+"""
 
 import math
 from collections.abc import Iterator
@@ -37,7 +39,9 @@ RELEASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "kilted": (KILTED, BEFORE_LYRICAL),
     "lyrical": (LYRICAL, {"success": False, **BEFORE_LYRICAL}),
 }
-"""The fields of a request beside its path, and those of the answer, with their defaults."""
+"""The fields of a request beside its path, and those of the answer, with their
+defaults.
+"""
 
 
 class Asked:

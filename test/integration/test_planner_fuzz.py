@@ -1,4 +1,6 @@
-"""Whatever comes in, the planner node answers, says why, and goes on with what it had."""
+"""Whatever comes in, the planner node answers, says why, and goes on with what it
+had.
+"""
 
 import math
 from collections.abc import Iterator

@@ -1,4 +1,6 @@
-"""The planner as its user sees it: plans, models, parameters, bad input, and what it waits for."""
+"""The planner as its user sees it: plans, models, parameters, bad input, and what it
+waits for.
+"""
 
 import math
 import os
@@ -143,7 +145,8 @@ def test_follows_the_trainer(
         (broken, "cannot be read as safetensors"),
         (
             other,
-            f"{len(sent.data)} bytes with the label 'ddqn_planner model 1 .* save there again",
+            f"{len(sent.data)} bytes with the label 'ddqn_planner model 1 .* "
+            "save there again",
         ),
         (
             bytes_message("experience", path.read_bytes()),
@@ -356,7 +359,8 @@ steps = Planner.steps
 def gated(planner, request):
     for plan in steps(planner, request):
         yield plan
-        while plan is None and not os.path.exists({gate!r}):  # in the thread of the slow step
+        # In the thread of the slow step.
+        while plan is None and not os.path.exists({gate!r}):
             print("a plan waits", flush=True)
             time.sleep(0.01)
 
@@ -379,7 +383,9 @@ def gated(run_robot: Any, tmp_path_factory: Any, model: FilePath) -> Iterator[An
 
 @pytest.fixture
 def slow_robot(gated: Any) -> Iterator[Any]:
-    """Close the gate of a planner that knows the field toward START, its active goal."""
+    """Close the gate of a planner that knows the field toward START, its active
+    goal.
+    """
     gated.begin(START, START)
     gated.gate.unlink()
     gated.node.forget_log()
@@ -440,11 +446,16 @@ def test_says_what_it_waits_for(
             OccupancyGrid, "plant", QoSProfile(depth=1)
         )
         name = client.node.get_fully_qualified_name()
-        unfit = "its durability is volatile, and transient_local is asked for; let it publish so"
-        remedy = "start .* the parameter qos_overrides./plant.subscription.durability:=volatile"
+        unfit = (
+            "its durability is volatile, and transient_local is asked for; "
+            "let it publish so"
+        )
+        parameter = "qos_overrides./plant.subscription.durability:=volatile"
+        remedy = f"start .* the parameter {parameter}"
         heard = f"nothing of {name} is received on /plant"
         robot.wait_for_reason(f"no map was received .*; {heard}: {unfit}, or {remedy}")
-        # A publisher may be discovered before its node, and named as unknown until then.
+        # A publisher may be discovered before its node, and named as unknown until
+        # then.
         assert node.log.count(f"nothing of {name} ") == 1
         assert (
             "New publisher discovered" not in node.log

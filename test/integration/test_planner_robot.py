@@ -56,7 +56,8 @@ def robot(hall_robot: Robot) -> Robot:
 RADIUS = {"robot_radius": 0.6}
 FROM_OBSTACLE = {"start": (5, 0), "start_clearing_radius": 1}
 SAME: list[tuple[dict[str, Any], ...]] = [
-    # Parameters, and what the library is given for them: for the map, its inflation, and the plan.
+    # Parameters, and what the library is given for them: for the map, its inflation,
+    # and the plan.
     ({}, {}, {}, {}),
     ({"occupied_threshold": 60}, {"occupied_threshold": 60}, {}, {}),
     ({"allow_unknown": True}, {"allow_unknown": True}, {}, {}),
@@ -212,7 +213,8 @@ def test_a_goal_moves_within_the_tolerance_of_the_request(robot: Robot) -> None:
 
 def test_the_start_comes_from_odometry(robot: Robot) -> None:
     def wait_until_unknown(refused: str, remedy: str) -> None:
-        other = rf"((?!{refused} refused).)*"  # what was refused of one source is forgotten with it
+        # What was refused of one source is forgotten with the source.
+        other = rf"((?!{refused} refused).)*"
         robot.wait_for_reason(f"^{other}start is unknown; {remedy}{other}$")
 
     robot.send_goal(robot.pose((19, 14)))
@@ -280,14 +282,19 @@ class TransformListener:
 
         self.group = ReentrantCallbackGroup()
         self.tf_sub, self.tf_static_sub = (
-            node.create_subscription(TransformStamped, topic, hear, qos, callback_group=self.group)
+            node.create_subscription(
+                TransformStamped, topic, hear, qos, callback_group=self.group
+            )
             for topic in ("tf", "tf_static")
         )
 """
-"""As much of tf2_ros as the node uses, which is no package of PyPI: one transform, no tree."""
+"""As much of tf2_ros as the node uses, which is no package of PyPI: one transform, no
+tree.
+"""
 
 
-PATIENT = "from ddqn_planner.nodes import outcome; outcome.PATIENCE = 3.0  # on a loaded machine"
+# On a loaded machine the patience of a robot's user is too short.
+PATIENT = "from ddqn_planner.nodes import outcome; outcome.PATIENCE = 3.0"
 
 
 @pytest.fixture(scope="module")
@@ -325,7 +332,8 @@ def test_a_goal_waits_for_the_first_transform_that_is_not_too_old(
         plan.poses == [] for plan in [robot.plans.wait(), *robot.plans.messages()]
     )
     client.publish("tf", transform(robot, (4, 7), age=6.0))
-    late = r"\(the newest is ([6-9]|\d\d)[.\d]* s old, more than transform_tolerance, 0.3 s\); publ"
+    age = r"([6-9]|\d\d)[.\d]* s old, more than transform_tolerance, 0.3 s"
+    late = rf"\(the newest is {age}\); publ"
     robot.wait_for_reason(none + late, {"status": "NO_START"})
     assert all(not plan.poses for plan in robot.plans.messages())
     client.publish("tf", transform(robot, (4, 7)))

@@ -1,4 +1,6 @@
-"""No node uses a private name of rclpy or of a message: those change with any release."""
+"""No node uses a private name of rclpy or of a message: those change with any
+release.
+"""
 
 import ast
 import importlib

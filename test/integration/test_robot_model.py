@@ -43,7 +43,9 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> FilePath:
 
 @pytest.fixture(scope="module")
 def rooms() -> np.ndarray:
-    """(40, 60) int8: two rooms, and a door between them that is twice as wide as the body."""
+    """(40, 60) int8: two rooms, and a door between them that is twice as wide as the
+    body.
+    """
     values = np.zeros((40, 60), dtype=np.int8)
     values[:, 30] = 100
     values[DOOR, 30] = 0
@@ -79,7 +81,9 @@ def array_of(path: Path) -> np.ndarray:
 
 
 def check(path: Path, grid: GridMap, goal: Cell, yaw: float) -> np.ndarray:
-    """Check that no part of the body touches an obstacle, and where the path begins and ends."""
+    """Check that no part of the body touches an obstacle, and where the path begins and
+    ends.
+    """
     poses, (front, back, side) = array_of(path), BODY
     assert ends_at(path, grid, goal, yaw)
     assert np.hypot(*np.diff(poses[:, :2], axis=0).T).max() <= CELL / 2 + 1e-6
@@ -137,7 +141,8 @@ def test_the_nearest_pose_counts_and_services_are_answered(robot: Robot) -> None
     answer = robot.get_plan(at(robot, BEYOND, 0.0), at(robot, START, 3.0))
     check(answer, robot.grid, START, 3.0)
     assert not robot.get_plan(at(robot, (29, 3), 0.0), at(robot, START, 3.0)).poses
-    why = r"the start is occupied \(start: .* in cell \(29, 3\); goal: .* in cell \(10, 10\); .*"
+    cells = r"start: .* in cell \(29, 3\); goal: .* in cell \(10, 10\); .*"
+    why = rf"the start is occupied \({cells}"
     robot.wait_for_reason(f"{why}; set the start where the robot's body has room$")
 
 
@@ -261,7 +266,8 @@ def test_actions_lead_through_poses_and_paths_are_checked(
         assert outcome.plan.extra_cost is not None  # kept
         assert np.array_equal(array_of(again), array_of(first)[9:])
         assert is_valid(path)
-        # In a door as wide as the body is at most, half a cell aside is too much for a new path.
+        # In a door as wide as the body is at most, half a cell aside is too much for a
+        # new path.
         narrow = rooms.copy()
         narrow[:, 28:33] = 100
         narrow[24:29, 28:33] = 0

@@ -1,4 +1,6 @@
-"""The simulated robot of the driving demo: it follows paths, and asks again where it cannot."""
+"""The simulated robot of the driving demo: it follows paths, and asks again where it
+cannot.
+"""
 
 import sys
 from collections.abc import Callable

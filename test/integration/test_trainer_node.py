@@ -98,7 +98,9 @@ def shared_user(
 
 @pytest.fixture
 def user(shared_user: Trainee, tmp_path: FilePath) -> Iterator[Trainee]:
-    """The user of the shared trainer, which has a map, a start, a goal, and does nothing."""
+    """The user of the shared trainer, which has a map, a start, a goal, and does
+    nothing.
+    """
     shared_user.configure(tmp_path / "run", **DEFAULTS)
     shared_user.set_up()
     for recorder in (shared_user.rewards, shared_user.episodes, shared_user.saved):

@@ -1,4 +1,6 @@
-"""What the user of a trainer does and sees, whether it learns in simulation or from driving."""
+"""What the user of a trainer does and sees, whether it learns in simulation or from
+driving.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ def create_fast_timer(node, period, *arguments, **options):
 
 rclpy.node.Node.create_timer = create_fast_timer
 """
-"""What a trainer runs first: the tests wait for many diagnostics, which come ten times a second."""
+"""What a trainer runs first: the tests wait for many diagnostics, which come ten times
+a second.
+"""
 
 
 def trigger(client: Client, service: str, succeeds: bool = True) -> str:

@@ -54,7 +54,8 @@ def any_map() -> PropagationQNetwork:
 def right_network(name: str, move_rule: MoveRule | None = None) -> PropagationQNetwork:
     """A network that is right under the rule that it observes, or under the given one.
 
-    Each logit is 5 less 10 for each occupied cell that the move needs free. The costs are exact.
+    Each logit is 5 less 10 for each occupied cell that the move needs free. The costs
+    are exact.
     """
     network = random_network(name, scale=0, filters=16)
     assert isinstance(network, PropagationQNetwork)
@@ -242,7 +243,8 @@ def test_the_error_of_the_costs_is_the_greatest_one() -> None:
     ] = -0.1  # the learned multiplier is at least 1 all the same
     network.tensors["prices.weight"][3, 0] = -0.2
     certificate = certify(network)
-    # 0.3 too little, where the true one is 1.3: beside an occupied cell, and with costs of 15.
+    # 0.3 too little, where the true one is 1.3: beside an occupied cell, and with costs
+    # of 15.
     error = 0.3 / 1.3
     assert certificate.multiplier_error == pytest.approx(error, abs=1e-4)
     assert certificate.path_error == pytest.approx(
@@ -279,7 +281,8 @@ def test_the_error_of_the_costs_includes_what_is_added_for_other_cells(
     cell: int, sign: int
 ) -> None:
     network = right_network("any_map")
-    # An unknown cell 0 or 8, which is neither end of the action to +x, changes its multiplier.
+    # An unknown cell 0 or 8, which is neither end of the action to +x, changes its
+    # multiplier.
     network.tensors["prices.weight"][0, 18 + cell] = sign * 0.5
     worst = 0.5 if sign > 0 else 0.5 / 1.5
     assert certify(network).multiplier_error == pytest.approx(worst, abs=1e-4)

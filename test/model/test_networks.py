@@ -118,7 +118,9 @@ def test_the_features_tell_obstacles_costs_unknown_cells_and_the_rule_apart() ->
 def answering(
     name: str, success: float, multiplier: float = 1.0
 ) -> PropagationQNetwork:
-    """A network that answers with one p and one cost multiplier for every move and patch."""
+    """A network that answers with one p and one cost multiplier for every move and
+    patch.
+    """
     network = random_network(name, filters=4)
     assert isinstance(network, PropagationQNetwork)
     network.tensors["moves.weight"].fill(0)
@@ -185,7 +187,9 @@ def test_a_move_whose_cost_or_p_is_nan_is_not_possible(tensor: str) -> None:
 
 
 def priced(part: str, place: Any, change: Callable[[Any], Any]) -> Planner:
-    """Return a planner with `any_map`, but for some of its prices' weights or biases."""
+    """Return a planner with `any_map`, but for some of its prices' weights or
+    biases.
+    """
     shipped = Planner.load("any_map")
     tensors = {name: tensor.copy() for name, tensor in shipped.network.tensors.items()}
     tensors[f"prices.{part}"][place] = change(tensors[f"prices.{part}"][place])

@@ -1,4 +1,6 @@
-"""What is proved of a robot's body, beside brute force, and what its model file holds."""
+"""What is proved of a robot's body, beside brute force, and what its model file
+holds.
+"""
 
 from copy import deepcopy
 from dataclasses import replace
@@ -55,7 +57,9 @@ def metadata_of(network: RobotNetwork) -> ModelMetadata:
 
 
 def is_right(network: RobotNetwork) -> bool:
-    """Whether no pattern of a swept cell, and of cells that are not swept, is decided wrongly."""
+    """Whether no pattern of a swept cell, and of cells that are not swept, is decided
+    wrongly.
+    """
     weights, swept = (
         network.of_primitives(network.tensors["weight"]),
         network.swept_by_unit,
@@ -115,7 +119,8 @@ def test_a_damaged_robot_is_refused_or_right(
     )
     certificate = network.certificate()
     assert certificate.proved == (certificate.margin > 0)
-    # A margin that float32 sums may make up for proves nothing, even if they happen to be right.
+    # A margin that float32 sums may make up for proves nothing, even if they happen to
+    # be right.
     assert certificate.proved == is_right(network) or -1e-4 < certificate.margin <= 0
     if not certificate.proved:
         with pytest.raises(ModelFileError, match=r"not proved: .*train-robot"):

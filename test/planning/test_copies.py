@@ -1,4 +1,6 @@
-"""Planners and what they give, pickled and copied; and dropped, without the collector."""
+"""Planners and what they give, pickled and copied; and dropped, without the
+collector.
+"""
 
 import copy
 import gc

@@ -1,4 +1,6 @@
-"""Paths between exact points: an oracle in exact numbers says where the centres stay."""
+"""Paths between exact points: an oracle in exact numbers says where the centres
+stay.
+"""
 
 import math
 from fractions import Fraction
@@ -22,8 +24,8 @@ from ddqn_planner.planning.exact_paths import dense, exact_path
 
 Exact = tuple[Fraction, Fraction]  # cells from the centre of cell (0, 0)
 
-# Multiples of 1/64 in cells of 1/4 m: all numbers are exact, also as floats. A cell owns its lower
-# edges.
+# Multiples of 1/64 in cells of 1/4 m: all numbers are exact, also as floats. A cell
+# owns its lower edges.
 OFFSETS = st.sampled_from([-32, -31, -13, 0, 0, 7, 31]).map(lambda n: Fraction(n, 64))
 RESOLUTION, LEFT, BOTTOM = Fraction(1, 4), Fraction(5, 2), Fraction(-17, 4)
 
@@ -60,7 +62,9 @@ def touches(cell: Cell, first: Exact, last: Exact) -> bool:
 
 
 def is_clear(first: Exact, last: Exact, grid: GridMap) -> bool:
-    """Say whether a piece touches free cells alone, but for those of its ends, and may pass."""
+    """Say whether a piece touches free cells alone, but for those of its ends, and may
+    pass.
+    """
     cells = [
         range(math.floor(min(e)), math.ceil(max(e)) + 1)
         for e in zip(first, last, strict=True)
@@ -89,7 +93,9 @@ def is_clear(first: Exact, last: Exact, grid: GridMap) -> bool:
 def expected_leg(
     path: list[Cell], begin: Exact, end: Exact, grid: GridMap
 ) -> list[list[Exact]]:
-    """Return the shortest ways along a leg's centres that are clear: as few centres as can be."""
+    """Return the shortest ways along a leg's centres that are clear: as few centres as
+    can be.
+    """
     centres = [(Fraction(x), Fraction(y)) for x, y in path]
     middle = centres[1:-1]
     ways = []
@@ -157,9 +163,7 @@ def test_a_path_between_centres_is_the_plans_own(yaw: float) -> None:
         assert exact.length == pytest.approx(path_length(path), abs=1e-6)
 
 
-def test_a_goal_in_the_robots_cell_is_reached_directly_and_one_that_moved_at_its_cells_centre() -> (
-    None
-):
+def test_a_goal_in_the_robots_cell_is_reached_directly_or_at_its_cells_centre() -> None:
     grid, cell = (
         GridMap(np.zeros((4, 4)), 0.5, (1.0, 2.0, 0.5)),
         np.array([(1, 2)], np.int32),

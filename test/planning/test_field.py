@@ -195,7 +195,8 @@ def test_values_keep_their_sense_at_any_distance() -> None:
     optimum = shortest_distances(GridMap(occupancy), (0, 500), MoveRule.ROBOT_SAFE)
     assert optimum[0, 0] > 100_000
     assert -q[:, 0, 0].max() == pytest.approx(optimum[0, 0])
-    # In a corridor each cell but the ends has one best neighbour, and the values tell which.
+    # In a corridor each cell but the ends has one best neighbour, and the values tell
+    # which.
     free = ~occupancy
     free[500, 0] = False
     assert (
@@ -584,7 +585,8 @@ def test_where_rows_are_read_ends_lie_in_the_first_and_the_last_rows(
 def test_where_rows_are_read_several_patches_lie_between_two_requests(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Rows that the costs of a map read for its second patch must be in what the first one changed.
+    # Rows that the costs of a map read for its second patch must be in what the first
+    # one changed.
     height, width, goal = 60, 12, (0, 0)
     random = np.random.default_rng(seed)
     monkeypatch.setattr(cell_space, "MARGIN", 0)
@@ -634,7 +636,9 @@ def test_few_rows_of_a_large_map_are_read(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def new_maps(side: int, kind: str) -> Iterator[GridMap]:
-    """Maps of a side: each with other obstacles, other expected times, or one more patch."""
+    """Maps of a side: each with other obstacles, other expected times, or one more
+    patch.
+    """
     random = np.random.default_rng(0)
     grid = GridMap(
         random.random((side, side)) < 0.1, cost=random.integers(0, 100, (side, side))

@@ -20,7 +20,9 @@ PLACES = st.tuples(*3 * [st.floats(-3, 12)])
 def judged(
     poses: list[tuple[float, float, float]], robot: tuple[float, float], grid: GridMap
 ) -> list[int]:
-    """Return the indices of poses that lie on an occupied cell, from the nearest one on."""
+    """Return the indices of poses that lie on an occupied cell, from the nearest one
+    on.
+    """
     apart = [math.dist(pose[:2], robot) for pose in poses]
     first = apart.index(min(apart))
     cells = [(math.floor(x), math.floor(y)) for x, y, _ in poses]
@@ -103,7 +105,8 @@ def test_only_what_lies_ahead_and_not_too_far_counts() -> None:
 @pytest.mark.parametrize("max_cost", [255, 254, 253, 200, 100, 1, 0])
 def test_costs_count_as_in_nav2(max_cost: int) -> None:
     values = np.array([[0, 1, 40, 80, 98, 99, 100, -1]])
-    # Nav2's costs of these values, the smallest that is published so; unknown cells count as free.
+    # Nav2's costs of these values, the smallest that is published so; unknown cells
+    # count as free.
     costs = [0, 1, 101.9, 205.4, 252, 253, 254, 0]
     grid = grid_from_costmap(values, allow_unknown=True)
     path = line([0.5, 1.5, 2.5, 3.5, 4.5, 5.5, 6.5, 7.5], y=0.5)

@@ -43,7 +43,9 @@ from ddqn_planner.planning.segments import cost_along, legal_segments
 
 
 def cells_with_positions(path: list[Cell]) -> list[tuple[Cell, Fraction]]:
-    """Cells side by side on a path of segments: each that lies nearest to a point of it."""
+    """Cells side by side on a path of segments: each that lies nearest to a point of
+    it.
+    """
     passed = []
     for number, (first, last) in enumerate(pairwise(path)):
         vector = [b - a for a, b in zip(first, last, strict=True)]
@@ -390,9 +392,7 @@ def test_a_simplified_path_across_a_larger_map_costs_no_more(
     check_corners(check_simplified(path, grid, rule), grid, rule)
 
 
-def test_the_better_one_is_taken_of_the_path_pulled_from_its_start_and_from_its_end() -> (
-    None
-):
+def test_the_better_one_of_the_paths_pulled_from_both_ends_is_taken() -> None:
     rule, lengths = MoveRule.ROBOT_SAFE, {}
     for seed in (2, 5, 10):
         grid = GridMap(np.random.default_rng(seed).random((30, 30)) < 0.15)

@@ -1,4 +1,6 @@
-"""Plans against exact oracles: on maps with costs, one-way zones and walls, by any network."""
+"""Plans against exact oracles: on maps with costs, one-way zones and walls, by any
+network.
+"""
 
 import gc
 import json
@@ -53,15 +55,15 @@ def known_field(
 def is_answered_at_once(
     planner: Planner, grid: GridMap, start: Cell, goal: Cell, *how: Any, **more: Any
 ) -> bool:
-    """Whether no step of a request is slow: no field is computed, and nothing is searched for."""
+    """Whether no step of a request is slow: no field is computed, and nothing is
+    searched for.
+    """
     return (
         next(planner.steps(PlanRequest(grid, start, (goal,), *how, **more))) is not None
     )
 
 
-def test_the_unmasked_rollout_is_trapped_by_the_first_illegal_move_that_it_prefers() -> (
-    None
-):
+def test_the_unmasked_rollout_is_trapped_by_the_first_illegal_move() -> None:
     grid = GridMap(np.array([[0, 0, 0], [0, 0, 0]]))
     q = np.zeros((8, 2, 3), dtype=np.float32)
     q[0] = 1.0  # +x
@@ -456,7 +458,9 @@ def test_a_robot_between_two_docks_keeps_to_one_of_them(has_costs: bool) -> None
 
 
 def explored(grid: GridMap, share: float, *slowness: Any) -> GridMap:
-    """Return a map with expected times, and those that a bold plan and a safe one hope for."""
+    """Return a map with expected times, and those that a bold plan and a safe one hope
+    for.
+    """
     expected, bold, safe = (
         replace(grid, slowness=each, seconds_per_cell=0.5) for each in slowness
     )

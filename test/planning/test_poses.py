@@ -1,4 +1,6 @@
-"""Plans for bodies with a heading, against Dijkstra over the same poses and against polygons."""
+"""Plans for bodies with a heading, against Dijkstra over the same poses and against
+polygons.
+"""
 
 import math
 from concurrent.futures import ThreadPoolExecutor
@@ -36,10 +38,11 @@ from ddqn_planner.robot.motions import Motions, make_motions, turn_between
 
 CELL = 0.1
 FORMS = {
-    "U": "[[0.5, 0.3], [0.5, 0.2], [0, 0.2], [0, -0.2], [0.5, -0.2], [0.5, -0.3], [-0.2, -0.3], "
-    "[-0.2, 0.3]]",
-    "plus": "[[0.4, 0.1], [0.1, 0.1], [0.1, 0.4], [-0.1, 0.4], [-0.1, 0.1], [-0.4, 0.1], "
-    "[-0.4, -0.1], [-0.1, -0.1], [-0.1, -0.4], [0.1, -0.4], [0.1, -0.1], [0.4, -0.1]]",
+    "U": "[[0.5, 0.3], [0.5, 0.2], [0, 0.2], [0, -0.2], [0.5, -0.2], [0.5, -0.3], "
+    "[-0.2, -0.3], [-0.2, 0.3]]",
+    "plus": "[[0.4, 0.1], [0.1, 0.1], [0.1, 0.4], [-0.1, 0.4], [-0.1, 0.1], "
+    "[-0.4, 0.1], [-0.4, -0.1], [-0.1, -0.1], [-0.1, -0.4], [0.1, -0.4], "
+    "[0.1, -0.1], [0.4, -0.1]]",
     "origin in a corner": "[[0, 0], [0.4, 0], [0.4, 0.4], [0, 0.4]]",
     "ahead of its origin": "[[0.5, 0.1], [0.9, 0.1], [0.9, -0.1], [0.5, -0.1]]",
     "beside its origin": "[[-0.2, 0.4], [0.2, 0.4], [0.2, 0.7], [-0.2, 0.7]]",
@@ -145,7 +148,8 @@ def test_plans_cost_the_least_within_their_bound_also_after_repairs(
                     x_off, y_off, turned = np.abs(found.poses[[0, -1]] - (start, end)).T
                     turned = np.abs(turn_between(0, turned))
                     assert np.hypot(x_off, y_off).max() <= 0.5001 * CELL
-                # Where the body has no room, the next heading counts; on the last path, that one.
+                # Where the body has no room, the next heading counts; on the last path,
+                # that one.
                 if (
                     found.poses.size
                     and max(x_off.max(), y_off.max(), turned.max()) < 1e-6
@@ -447,7 +451,8 @@ def test_a_primitive_on_which_the_origin_leaves_the_map_is_impossible(
         (motions.start == 0) & (motions.offset == (4, 0)).all(axis=1)
     )[0]
     share = np.linspace(0, 1, 17)
-    # The origin comes two cells nearer to the border than both ends; the body is not there.
+    # The origin comes two cells nearer to the border than both ends; the body is not
+    # there.
     swing = -2 * away * np.sin(math.pi * share)
     bent = np.column_stack([4 * share, swing, np.zeros(17)])
     poses = *motions.poses[:ahead], bent, *motions.poses[ahead + 1 :]

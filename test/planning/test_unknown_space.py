@@ -24,7 +24,9 @@ def planner() -> Planner:
 
 
 def hall(**values: int) -> np.ndarray:
-    """(11, 30) int8: a hall whose middle column and places of start and goal have values."""
+    """(11, 30) int8: a hall whose middle column and places of start and goal have
+    values.
+    """
     hall = np.full((11, 30), FREE, dtype=np.int8)
     hall[:, 15] = values.get("across", FREE)
     hall[4:7, :5] = values.get("start", FREE)
@@ -115,8 +117,8 @@ def test_each_of_several_goals_is_named(planner: Planner) -> None:
     goals = [(3, 5), GOAL, (99, 5), (26, 5)]
     plan = planner.plan_nearest(grid, (10, 5), goals)
     assert plan.reason == (
-        "goal 1 is occupied, goal 2 lies in unknown space, goal 3 lies outside the map, "
-        f"goal 4 lies in unknown space; {REMEDY}"
+        "goal 1 is occupied, goal 2 lies in unknown space, "
+        f"goal 3 lies outside the map, goal 4 lies in unknown space; {REMEDY}"
     )
     through = planner.plan_through(grid, (10, 5), [(12, 5), GOAL])
     assert through.reason == f"goal 2 of 2: the goal lies in unknown space; {REMEDY}"

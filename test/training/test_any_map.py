@@ -10,7 +10,9 @@ from ddqn_planner.training.evaluation import Evaluation, evaluate
 from ddqn_planner.training.trainer import Trainer
 
 BRIEF = 96_000
-"""Environment steps that are enough to learn every move, and the cost multipliers roughly."""
+"""Environment steps that are enough to learn every move, and the cost multipliers
+roughly.
+"""
 
 
 @pytest.fixture(scope="module")

@@ -30,7 +30,9 @@ def step_by_hand(
     cell: Cell,
     action: int,
 ) -> tuple[Cell, float, bool]:
-    """What one move gives: the next cell, the reward, and whether the episode terminates."""
+    """What one move gives: the next cell, the reward, and whether the episode
+    terminates.
+    """
     (x, y), (dx, dy) = cell, MOVES[action].tolist()
     after = (x + dx, y + dy)
     sides = [(x + dx, y), (x, y + dy)]
@@ -166,7 +168,8 @@ def test_a_move_that_succeeds_is_rewarded_for_the_goal_only_beside_it(
     rewarded = {
         (int(c) % 5, int(c) // 5) for _, c in np.argwhere(environment.free_reward[0])
     }
-    # The goal (4, 0) is at the end of its row: the first cells of the next one are far from it.
+    # The goal (4, 0) is at the end of its row: the first cells of the next one are far
+    # from it.
     assert rewarded == {(3, 0), (3, 1), (4, 1)}
 
 

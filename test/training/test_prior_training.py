@@ -25,7 +25,9 @@ def by_clearance(features: np.ndarray) -> np.ndarray:
 
 
 def measured(seed: int, count: int = 600, at: float = 0) -> np.ndarray:
-    """Places of rooms that are slow near walls, with noise, in rows of `Prior.replay`."""
+    """Places of rooms that are slow near walls, with noise, in rows of
+    `Prior.replay`.
+    """
     features = rooms(seed, count)
     slowness = by_clearance(features) + rng(seed).normal(0, 0.3, count)
     rows = np.full((count, 2), at), features, slowness, rng(seed).uniform(1, 4, count)

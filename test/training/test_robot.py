@@ -19,8 +19,8 @@ TINY: Any = (
     None,
 )
 FORK = (
-    "[[0.56, 0.2], [0.56, 0.1], [0.4, 0.1], [0.4, -0.1], [0.56, -0.1], [0.56, -0.2], [0.3, -0.2], "
-    "[0.3, 0.2], [0.56, 0.2]]"
+    "[[0.56, 0.2], [0.56, 0.1], [0.4, 0.1], [0.4, -0.1], [0.56, -0.1], "
+    "[0.56, -0.2], [0.3, -0.2], [0.3, 0.2], [0.56, 0.2]]"
 )
 
 
@@ -31,8 +31,17 @@ def test_the_command_trains_a_robot_that_is_proved(
         tmp_path / "tiny.safetensors",
         TINY,
     )
-    command = f"train-robot --motion {motion} --turning-radius {radius} --resolution {resolution}"
-    given = "--padding", 0.02, "--out", path, "--footprint", footprint
+    command = f"train-robot --motion {motion} --resolution {resolution}"
+    given = (
+        "--turning-radius",
+        radius,
+        "--padding",
+        0.02,
+        "--out",
+        path,
+        "--footprint",
+        footprint,
+    )
     assert re.search(
         "steps|seed", console(command, *given, "--steps", 20_000, status=1).err
     )
@@ -102,13 +111,13 @@ WRONG = {
     "--motion differential --resolution nan": "resolution is nan",
     "--motion differential --lattice x.json": "one of the two",
     "": "neither motion nor lattice is given; give one of the two: motion differential",
-    "--lattice none.json": "none.json: it cannot be read (No such file or directory); give a file",
+    "--lattice none.json": "none.json: it cannot be read (No such file or directory)",
     "--motion differential --padding -0.1": "padding is -0.1",
     "--motion differential --steps 0": "--steps is 0; give a whole number, 1 to",
     "--motion differential --steps -5": "--steps is -5; give a whole number, 1 to",
-    "--motion differential --resolution 1e-9": "resolution is 1e-09; give metres per cell, 0.001",
-    "--motion differential --resolution 1e6": "resolution is 1000000.0; give metres per cell",
-    "--motion differential --turning-radius 1e300": "radius is 1e+300 m; give at most 100 cells",
+    "--motion differential --resolution 1e-9": "resolution is 1e-09; give metres",
+    "--motion differential --resolution 1e6": "resolution is 1000000.0; give metres",
+    "--motion differential --turning-radius 1e300": "radius is 1e+300 m; give at most",
     "--motion differential --padding 1e300": "padding is 1e+300; give 0 to 10 metres",
 }
 

@@ -326,7 +326,8 @@ def field_of(actions: list[list[int]]) -> QField:
 
 
 def test_a_detour_counts_with_its_length_and_a_trapped_rollout_is_left_out() -> None:
-    # (0, 1) goes by (0, 0), (1, 1) and (2, 1) go to each other; nothing joins (4, 0) to the goal.
+    # (0, 1) goes by (0, 0), (1, 1) and (2, 1) go to each other; nothing joins (4, 0) to
+    # the goal.
     field = field_of([[0, 0, 0, 0, 0], [6, 0, 4, 0, 0]])
     detour = 3 / (1 + 2**0.5)
     ratios = [[1, 1, np.nan, np.nan, np.nan], [detour, np.inf, np.inf, np.nan, np.nan]]

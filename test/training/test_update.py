@@ -1,4 +1,6 @@
-"""The replay buffer, and one update of each network beside the same written down from equations."""
+"""The replay buffer, and one update of each network beside the same written down from
+equations.
+"""
 
 import copy
 import math
@@ -80,7 +82,9 @@ def mean_squared_error(
 
 
 def check_update(trainer: Trainer, loss: Tensor, before: dict[str, Tensor]) -> None:
-    """Check Adam's moments, and weights after its first step: w - rate * g / (|g| + ε)."""
+    """Check Adam's moments, and weights after its first step: w - rate * g / (|g| +
+    ε).
+    """
     expected = torch.autograd.grad(loss, list(before.values()))
     rate = trainer.parameters.learning_rate
     scale = max(float(gradient.abs().max()) for gradient in expected)
@@ -165,7 +169,8 @@ def test_weights_whose_gradients_fade_move_as_those_of_torch() -> None:
 def test_an_update_is_the_equations_and_counts_each_reward_once(
     small: Scenario, target: str
 ) -> None:
-    # Q(s, a) = p (r + γ V(s')) + (1 - p) r_o, r = -length * cost multiplier, V = max Q under θ⁻.
+    # Q(s, a) = p (r + γ V(s')) + (1 - p) r_o, r = -length * cost multiplier, V = max Q
+    # under θ⁻.
     cost = np.arange(20, dtype=np.int8).reshape(4, 5)
     walls = small.grid.occupancy
     scenarios = [

@@ -56,7 +56,8 @@ def test_without_discount_values_are_shortest_lengths(
 
 
 def test_with_discount_a_value_is_what_the_rewards_on_the_way_add_up_to() -> None:
-    # A corridor of four cells, the goal at its right end; each move right succeeds half the time.
+    # A corridor of four cells, the goal at its right end; each move right succeeds half
+    # the time.
     tables = np.zeros((2, 8, 4))
     tables[:, 0] = [0.5] * 4, (1.0, 1.0, 10.0, 0.0)
     return_AC = settled(tables, (1, 4), 3, gamma=0.9, collision=-2.0)
