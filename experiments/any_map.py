@@ -9,6 +9,7 @@ from typing import Any, Final
 import goal_1
 import goal_3
 import numpy as np
+from numpy.typing import NDArray
 from printed_target import PrintedTrainer
 from random_maps import generate_map
 from tables import median_and_range, table
@@ -112,28 +113,35 @@ def _zero_shot(settings: Settings) -> list[list[str]]:
 def move_errors(planner: Planner) -> tuple[int, float]:
     """Count the wrongly classified moves; measure the mean error of the costs.
 
-    The error is relative to the true cost.
+    The moves are all of all 256 patches (3 x 3) with a free centre, under both rules.
+    The error is relative to the true cost, in the same patches with random costs.
     """
     network = planner.network
     assert isinstance(network, AnyMapQNetwork)
-    wrong, errors = 0, []
-    # All 256 3x3 patches with a free centre under both rules; for the costs, each with
-    # random ones.
-    patches = OCCUPIED * (np.arange(2**9)[:, None] >> np.arange(9) & 1)
-    patch_B9 = patches[patches[:, 4] == 0].astype(np.int8)
+    bits = np.arange(2**9)[:, None] >> np.arange(9) & 1  # (512, 9): all patches
+    free_centre = bits[bits[:, 4] == 0]
+    patch_B9 = (OCCUPIED * free_centre).astype(np.int8)
     random = np.random.default_rng(0).integers(UNKNOWN, OCCUPIED, patch_B9.shape)
     costs_B9 = np.where(patch_B9 == OCCUPIED, OCCUPIED, random).astype(np.int8)
     # One map of all patches: a centre's neighbours all lie in its own patch.
     cells = costs_B9.reshape(16, 16, 3, 3).swapaxes(1, 2).reshape(48, 48)
     grid = GridMap(cells == OCCUPIED, cost=cells)
+    cost_BA = _of_centres(move_costs(grid.cost_multiplier))
+    wrong = 0
+    errors = []
     for rule in MOVE_RULES:
-        legal_BA = legal_moves(grid.occupancy, rule)[:, 1::3, 1::3].reshape(8, -1).T
-        cost_BA = move_costs(grid.cost_multiplier)[:, 1::3, 1::3].reshape(8, -1).T
-        p_BA = network.success(network.features(patch_B9, rule))
-        learned_BA = network.multiplier(network.features(costs_B9, rule))
-        wrong += int(((p_BA > 0.5) != legal_BA).sum())
-        errors.append(np.abs(learned_BA / (cost_BA / LENGTHS) - 1)[legal_BA])
+        legal_BA = _of_centres(legal_moves(grid.occupancy, rule))
+        success_BA = network.success(network.features(patch_B9, rule))
+        wrong += int(((success_BA > 0.5) != legal_BA).sum())
+        multiplier_BA = network.multiplier(network.features(costs_B9, rule))
+        error_BA = np.abs(multiplier_BA / (cost_BA / LENGTHS) - 1)
+        errors.append(error_BA[legal_BA])
     return wrong, float(np.concatenate(errors).mean())
+
+
+def _of_centres(value_AHW: NDArray[Any]) -> NDArray[Any]:
+    """Return the values of the centres of a map's patches: (B, A)."""
+    return value_AHW[:, 1::3, 1::3].reshape(8, -1).T
 
 
 def _held_out(planner: Planner, with_costs: bool) -> tuple[int, int, float]:

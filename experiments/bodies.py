@@ -382,7 +382,7 @@ def collisions(options: argparse.Namespace) -> Iterator[list[Any]]:
                 plans.append(len(plan.poses))
                 if plan.poses.size:
                     colliding += oracle.collisions(plan.poses) > 0
-        solved = np.count_nonzero(plans)
+        solved = sum(poses > 0 for poses in plans)
         yield [name, motion.value, len(plans), solved, colliding, sum(plans)]
 
 

@@ -5,9 +5,9 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack, suppress
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from subprocess import Popen
 from typing import Any, TypeVar
 
@@ -394,34 +394,41 @@ class MapFixture:
         The robot cuts no corners.
         """
         grid = self.grid
-        start, goal = (cell_of(grid, pose) for pose in (request.start, request.goal))
+        start = cell_of(grid, request.start)
+        goal = cell_of(grid, request.goal)
         if not plan.poses:
-            both_free = grid.is_free(start) and grid.is_free(goal)
-            possible = both_free and grid.reachable([start], RULE)[goal[::-1]]
-            return (
-                f"no path from {start} to {goal}, where there is one"
-                if possible
-                else ""
-            )
+            if self._is_possible(start, goal):
+                return f"no path from {start} to {goal}, where there is one"
+            return ""
         points = np.array([point_of(stamped) for stamped in plan.poses])
-        for point, pose in ((points[0], request.start), (points[-1], request.goal)):
-            if point.tolist() != [*point_of(pose)]:
-                return (
-                    f"a path from {points[0]} to {points[-1]}, "
-                    f"asked was {start} to {goal}"
-                )
-        cells = cells_passed(grid, points)
+        ends = [point_of(request.start), point_of(request.goal)]
+        if not np.array_equal(points[[0, -1]], ends):
+            path = f"a path from {points[0]} to {points[-1]}"
+            return f"{path}, asked was {start} to {goal}"
+        if not self._is_legal(cells_passed(grid, points), start):
+            return f"an illegal segment in {points.tolist()}"
+        return ""
+
+    def _is_possible(self, start: Cell, goal: Cell) -> bool:
+        """Say whether a path joins two free cells."""
+        if not (self.grid.is_free(start) and self.grid.is_free(goal)):
+            return False
+        x, y = goal
+        return bool(self.grid.reachable([start], RULE)[y, x])
+
+    def _is_legal(self, cells: Sequence[Cell], start: Cell) -> bool:
+        """Say whether a robot may pass cells, one after another."""
         # A robot on an obstacle may leave it, and what is next to it.
-        leaving = 0
-        while leaving < len(cells) and not grid.is_free(cells[leaving]):
-            leaving += 1
-        is_right = all(map(grid.is_free, cells[leaving:])) and leaving < len(cells)
-        is_right &= all(
-            np.hypot(*np.subtract(cell, start)) <= 1 for cell in cells[:leaving]
+        leaving = list(takewhile(lambda cell: not self.grid.is_free(cell), cells))
+        free = cells[len(leaving) :]
+        if not free or not all(map(self.grid.is_free, free)):
+            return False
+        if any(math.dist(cell, start) > 1 for cell in leaving):
+            return False
+        return all(
+            self.grid.is_free((next_x, y)) and self.grid.is_free((x, next_y))
+            for (x, y), (next_x, next_y) in pairwise(free)
         )
-        for (x, y), (to_x, to_y) in pairwise(cells[leaving:]):
-            is_right &= grid.is_free((to_x, y)) and grid.is_free((x, to_y))
-        return "" if is_right else f"an illegal segment in {points.tolist()}"
 
 
 def point_of(stamped: PoseStamped) -> tuple[float, float]:

@@ -18,60 +18,65 @@ from ddqn_planner.training.prior_training import prior_of
 
 WINDOW: Final = 0.5  # seconds over which poses are averaged
 MORE_PLACES: Final = 1.1  # times as many as the last time teach the prior anew
-CELL, SQUARE = 0.25, 1.0  # metres: the sides of places
+CELL: Final = 0.25  # metres: the side of a place, as of `Experience`
+SQUARE: Final = 1.0  # metres: the side of a place of the simple learners
 VISIT_NOISE: Final = 0.1  # variance of the log slowness of a visit
-# Of the parameters of a Gaussian process: the length, and the deviations of signal and
-# noise.
+# The parameters of a Gaussian process are logarithms: of the length in metres, and of
+# the standard deviations of signal and noise.
+FIRST_PARAMETERS: Final = np.log([2.0, 0.5, 0.3])
 LIMITS: Final = np.log([0.5, 0.05, 0.05]), np.log([10, 2, 2])
+MAX_FITS: Final = 80  # likelihoods of a fit of the parameters
 
 
 class Learner:
     """Learns nothing of the squares of a map. Others learn their slowness."""
 
     def __init__(self, grid: GridMap, side: float = CELL) -> None:
-        self.side, self.origin = side, np.array(grid.origin[:2])
-        rows, columns = (
-            ((np.arange(cells) + 0.5) * grid.resolution // side).astype(np.int64)
-            for cells in grid.occupancy.shape
-        )
-        self.shape = int(rows[-1]) + 1, int(columns[-1]) + 1
-        self.of_cells, self.count = (
-            rows[:, None] * self.shape[1] + columns,
-            np.prod(self.shape),
-        )
-        self.slowness: Float64 | None = None
+        self.side = side  # metres, of a square
+        self.origin = np.array(grid.origin[:2])
+        height, width = grid.occupancy.shape
+        rows = ((np.arange(height) + 0.5) * grid.resolution // side).astype(np.int64)
+        columns = ((np.arange(width) + 0.5) * grid.resolution // side).astype(np.int64)
+        self.shape = int(rows[-1]) + 1, int(columns[-1]) + 1  # in squares
+        self.count = np.prod(self.shape)
+        # (H, W): the number of the square of each cell
+        self.of_cells = rows[:, None] * self.shape[1] + columns
+        self.slowness: Float64 | None = None  # of each square; None before a drive
 
     def apply(self, grid: GridMap) -> GridMap:
         """Return the map with the slowness of each square."""
         if self.slowness is None:
             return grid
-        of_squares = np.clip(self.slowness, 1, MAX_SLOWNESS).astype(np.float32)
-        times = {
-            "slowness": of_squares[self.of_cells],
-            "seconds_per_cell": grid.resolution / SPEED,
-        }
-        return replace(grid, **times)
+        slowness = np.clip(self.slowness, 1, MAX_SLOWNESS).astype(np.float32)
+        return replace(
+            grid,
+            slowness=slowness[self.of_cells],
+            seconds_per_cell=grid.resolution / SPEED,
+        )
 
     def record(self, seconds: Float64, positions: Float64) -> None:
-        """Learn from the poses of a drive."""
+        """Learn from the poses of a drive.
+
+        `positions` (N, 2) are in metres.
+        """
+        # The mean pose of each window of time.
         window = ((seconds - seconds[0]) // WINDOW).astype(np.int64)
-        number = np.bincount(window)
-        x, y, t = (np.bincount(window, of) / number for of in (*positions.T, seconds))
+        count = np.bincount(window)
+        x = np.bincount(window, positions[:, 0]) / count
+        y = np.bincount(window, positions[:, 1]) / count
+        time = np.bincount(window, seconds) / count
+
+        # A step from one mean pose to the next belongs to the square of its middle.
         middle = np.stack([x[1:] + x[:-1], y[1:] + y[:-1]]) / 2 - self.origin[:, None]
         last = np.array([[self.shape[1] - 1], [self.shape[0] - 1]])
         column, row = (middle // self.side).astype(np.int64).clip(0, last)
-        steps = row * self.shape[1] + column
-        metres, took = (
-            np.bincount(steps, np.hypot(np.diff(x), np.diff(y))),
-            np.bincount(steps, np.diff(t)),
-        )
-        squares = np.unique(steps)
-        driven = np.maximum(metres[squares], self.side / 4)
-        self.learn(
-            squares,
-            driven,
-            np.clip(took[squares] * SPEED / driven, 1 / 3, MAX_SLOWNESS),
-        )
+        square = row * self.shape[1] + column  # of each step
+        squares = np.unique(square)
+        metres = np.bincount(square, np.hypot(np.diff(x), np.diff(y)))[squares]
+        duration = np.bincount(square, np.diff(time))[squares]
+        metres = np.maximum(metres, self.side / 4)
+        slowness = np.clip(duration * SPEED / metres, 1 / 3, MAX_SLOWNESS)
+        self.learn(squares, metres, slowness)
 
     def learn(self, squares: Any, metres: Float64, slowness: Float64) -> None:
         """Learn from a drive: the metres in each square, and the square's slowness."""
@@ -91,15 +96,15 @@ class MeanTime(Learner):
 
     def __init__(self, grid: GridMap) -> None:
         super().__init__(grid, SQUARE)
-        self.metres, self.took = np.zeros((2, self.count))
+        self.metres = np.zeros(self.count)
+        self.slow_metres = np.zeros(self.count)  # metres times slowness
 
     def learn(self, squares: Any, metres: Float64, slowness: Float64) -> None:
         """Learn from the squares of a drive."""
         self.metres[squares] += metres
-        self.took[squares] += metres * slowness
-        self.slowness = np.where(
-            self.metres, self.took / np.maximum(self.metres, 1e-9), 1
-        )
+        self.slow_metres[squares] += metres * slowness
+        mean = self.slow_metres / np.maximum(self.metres, 1e-9)
+        self.slowness = np.where(self.metres, mean, 1)
 
 
 class GaussianProcess(Learner):
@@ -107,43 +112,46 @@ class GaussianProcess(Learner):
 
     def __init__(self, grid: GridMap) -> None:
         super().__init__(grid, SQUARE)
-        self.number, self.sum, self.drives = (
-            np.zeros(self.count),
-            np.zeros(self.count),
-            0,
-        )
-        self.parameters = np.log([2.0, 0.5, 0.3])
-        at = np.indices(self.shape).reshape(2, -1).T * SQUARE
-        self.squared = ((at[:, None] - at) ** 2).sum(axis=2)
+        self.visits = np.zeros(self.count)
+        self.sum_of_log = np.zeros(self.count)  # of the slowness of the visits
+        self.drives = 0
+        self.parameters = FIRST_PARAMETERS
+        position = np.indices(self.shape).reshape(2, -1).T * SQUARE
+        difference = position[:, None] - position
+        self.squared_distance = (difference**2).sum(axis=2)  # (count, count) m²
 
     def learn(self, squares: Any, metres: Float64, slowness: Float64) -> None:
         """Learn from a drive; after 1, 2, 4, 8, ... drives, fit the parameters."""
-        self.number[squares] += 1
-        self.sum[squares] += np.log(slowness)
+        self.visits[squares] += 1
+        self.sum_of_log[squares] += np.log(slowness)
         self.drives += 1
-        if self.drives & (self.drives - 1) == 0:
-            how = {"method": "Nelder-Mead", "options": {"maxfev": 80}}
-            fit = minimize(lambda tried: self._solve(tried)[0], self.parameters, **how)
+        if self.drives & (self.drives - 1) == 0:  # a power of two
+            fit = minimize(
+                lambda parameters: self._solve(parameters)[0],
+                self.parameters,
+                method="Nelder-Mead",
+                options={"maxfev": MAX_FITS},
+            )
             self.parameters = np.clip(fit.x, *LIMITS)
         self.slowness = np.exp(self._solve(self.parameters)[1])
 
     def _solve(self, parameters: Float64) -> tuple[float, Float64]:
         """Return the negative log likelihood, and each square's mean log slowness."""
         length, signal, noise = np.exp(np.clip(parameters, *LIMITS))
-        known = np.flatnonzero(self.number)
-        number = self.number[known]
-        seen = self.sum[known] / number
-        kernel = signal**2 * np.exp(-self.squared[known] / (2 * length**2))
-        among = kernel[:, known] + np.diag(noise**2 / number + 1e-6)
-        factor = scipy.linalg.cho_factor(among, lower=True, check_finite=False)
-        both = scipy.linalg.cho_solve(
-            factor, np.stack([seen, np.ones(len(known))], axis=1)
-        )
-        mean = float(both[:, 0].sum() / both[:, 1].sum())
-        weights = both[:, 0] - mean * both[:, 1]
-        misfit = float((seen - mean) @ weights) / 2 + float(
-            np.log(np.diag(factor[0])).sum()
-        )
+        visited = np.flatnonzero(self.visits)
+        visits = self.visits[visited]
+        mean_log = self.sum_of_log[visited] / visits
+        correlation = np.exp(-self.squared_distance[visited] / (2 * length**2))
+        kernel = signal**2 * correlation  # of visited squares and all squares
+        covariance = kernel[:, visited] + np.diag(noise**2 / visits + 1e-6)
+        factor = scipy.linalg.cho_factor(covariance, lower=True, check_finite=False)
+        sides = np.stack([mean_log, np.ones(len(visited))], axis=1)
+        solved = scipy.linalg.cho_solve(factor, sides)
+        # The mean of the process is the one that is most likely.
+        mean = float(solved[:, 0].sum() / solved[:, 1].sum())
+        weights = solved[:, 0] - mean * solved[:, 1]
+        half_log_determinant = float(np.log(np.diag(factor[0])).sum())
+        misfit = float((mean_log - mean) @ weights) / 2 + half_log_determinant
         return misfit, mean + weights @ kernel
 
 
@@ -152,29 +160,32 @@ class MarkovField(Learner):
 
     def __init__(self, grid: GridMap, tau: float = 0.4, kappa: float = CELL**2) -> None:
         super().__init__(grid)
-        free = np.bincount(self.of_cells.ravel(), ~grid.occupancy.ravel()) > 0
+        free_cells = np.bincount(self.of_cells.ravel(), ~grid.occupancy.ravel())
+        is_free = free_cells > 0
         number = np.arange(self.count).reshape(self.shape)
-        pairs = (number[:, 1:], number[:, :-1]), (number[1:], number[:-1])
-        ends = np.concatenate(
-            [np.stack([of.ravel() for of in pair]) for pair in pairs], axis=1
-        )
-        first, last = ends[:, free[ends].all(axis=0)]
-        links = coo_array(
-            (np.ones(len(first)), (first, last)), (self.count, self.count)
-        ).tocsr()
+        side_by_side = np.stack([number[:, 1:].ravel(), number[:, :-1].ravel()])
+        one_above_the_next = np.stack([number[1:].ravel(), number[:-1].ravel()])
+        pairs = np.concatenate([side_by_side, one_above_the_next], axis=1)
+        first, second = pairs[:, is_free[pairs].all(axis=0)]
+        shape = self.count, self.count
+        links = coo_array((np.ones(len(first)), (first, second)), shape).tocsr()
         links += links.T
         self.prior = tau * (diags_array(links.sum(axis=1) + kappa) - links)
-        self.weight, self.sum, self.mean = np.zeros((3, self.count))
+        self.weight = np.zeros(self.count)
+        self.weighted_log = np.zeros(self.count)
+        self.mean_log = np.zeros(self.count)
 
     def learn(self, squares: Any, metres: Float64, slowness: Float64) -> None:
         """Learn from the squares of a drive."""
         weight = np.minimum(metres / self.side, 1) / VISIT_NOISE
         self.weight[squares] += weight
-        self.sum[squares] += weight * np.log(slowness)
+        self.weighted_log[squares] += weight * np.log(slowness)
         precision = (self.prior + diags_array(self.weight)).tocsr()
         inverse = diags_array(1 / precision.diagonal())
-        self.mean = cg(precision, self.sum, self.mean, rtol=1e-4, M=inverse)[0]
-        self.slowness = np.exp(self.mean)
+        self.mean_log, _ = cg(
+            precision, self.weighted_log, self.mean_log, rtol=1e-4, M=inverse
+        )
+        self.slowness = np.exp(self.mean_log)
 
 
 class TaughtExperience(Experience):
@@ -182,14 +193,15 @@ class TaughtExperience(Experience):
 
     def __init__(self, grid: GridMap) -> None:
         super().__init__(SPEED)
-        self.grid, self.places = grid, 0
+        self.grid = grid
+        self.taught_places = 0  # places when the prior was trained last
 
     def record(self, seconds: Any, positions: Any) -> Learned:
         """Learn from a drive."""
         learned = super().record(seconds, positions)
         places = len(self.evidence.places)
-        if places > self.places and places >= MORE_PLACES * self.places:
-            self.places = places
+        if places > self.taught_places and places >= MORE_PLACES * self.taught_places:
+            self.taught_places = places
             self.prior = prior_of(self.grid, self.evidence.places, self.prior)
         return learned
 

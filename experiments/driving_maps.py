@@ -1,9 +1,9 @@
 """Maps of 24 m by 24 m to drive on, and where their doors are."""
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import scipy.ndimage
@@ -15,21 +15,22 @@ from ddqn_planner.grid import GridMap
 Bool = NDArray[np.bool_]
 SIDE, RESOLUTION = 96, 0.25
 NARROW: Final = 1.25  # metres: the widest door
-APART: Final = 1.5  # metres from one door to the next
-GATES, GATE_AREA = (
-    6,
-    25.0,
-)  # where doors are few: so many narrow places, or one per so many m²
+APART: Final = 1.5  # metres from one door to the next, at least
+BESIDE: Final = 0.5  # metres before and behind a door, where it is wider
+GATES: Final = 6
+"""Where doors are few, narrow places count too, until there are so many."""
+GATE_AREA: Final = 25.0  # m² of free space for each of them
 
 
 def _halls(random: Random) -> Bool:
     """Draw two to four halls with openings of 3 m, and pillars of 0.5 to 1 m."""
     occupancy = np.zeros((SIDE, SIDE), dtype=np.bool_)
     for lines in (occupancy, occupancy.T)[: random.integers(1, 3)]:
-        at, gaps = random.integers(30, 66), random.integers([4, 52], [36, 84])
-        lines[at] = True
-        for gap in gaps:
-            lines[at, gap : gap + 12] = False
+        wall = random.integers(30, 66)
+        openings = random.integers([4, 52], [36, 84])
+        lines[wall] = True
+        for first in openings:
+            lines[wall, first : first + 12] = False
     for y, x, side in random.integers([2, 2, 2], [90, 90, 5], (30, 3)):
         occupancy[y : y + side, x : x + side] = True
     return occupancy
@@ -47,7 +48,8 @@ def _maze(random: Random) -> Bool:
 
 def _warehouse(random: Random) -> Bool:
     """Draw racks of 3 to 6 m, with aisles of 1 to 1.5 m between them."""
-    occupancy, y = np.zeros((SIDE, SIDE), dtype=np.bool_), int(random.integers(5, 8))
+    occupancy = np.zeros((SIDE, SIDE), dtype=np.bool_)
+    y = int(random.integers(5, 8))
     aisle = int(random.integers(4, 7))
     while y < SIDE - 6:
         x = int(random.integers(4, 8))
@@ -67,16 +69,24 @@ def _blobs(random: Random) -> Bool:
     return np.asarray(smooth > np.quantile(smooth, 0.75))
 
 
+def _draw_walls(occupancy: Bool, rows: Any, columns: Any, random: Random) -> None:
+    """Draw a wall in each row, with a door in most of its parts between columns."""
+    for row in rows:
+        occupancy[row] = True
+        for first, end in itertools.pairwise([0, *columns, SIDE]):
+            door = random.integers(first + 2, end - 5)
+            occupancy[row, door : door + 4] = random.random() > 0.8
+
+
 def _rooms(random: Random) -> Bool:
     """Draw rooms of 3 to 5 m, with doors of 1 m in most walls between two of them."""
     occupancy = np.zeros((SIDE, SIDE), dtype=np.bool_)
-    across, along = (np.cumsum(random.integers(12, 21, SIDE // 12)) for _ in range(2))
-    for lines, at, cuts in ((occupancy, across, along), (occupancy.T, along, across)):
-        for line in at[at < SIDE - 8]:
-            lines[line] = True
-            for first, end in itertools.pairwise([0, *cuts[cuts < SIDE - 8], SIDE]):
-                door = random.integers(first + 2, end - 5)
-                lines[line, door : door + 4] = random.random() > 0.8
+    rows = np.cumsum(random.integers(12, 21, SIDE // 12))
+    columns = np.cumsum(random.integers(12, 21, SIDE // 12))
+    rows = rows[rows < SIDE - 8]
+    columns = columns[columns < SIDE - 8]
+    _draw_walls(occupancy, rows, columns, random)
+    _draw_walls(occupancy.T, columns, rows, random)
     return occupancy
 
 
@@ -99,40 +109,60 @@ def draw_map(name: str, random: Random) -> GridMap:
     return GridMap(occupancy, RESOLUTION)
 
 
+class NarrowPlace(NamedTuple):
+    """Free cells in a line between two walls."""
+
+    is_door: bool  # it is wider before and behind
+    order: float  # random
+    rows: Any  # (N,), or the one row of all cells
+    columns: Any
+
+
 def gates(grid: GridMap, random: Random) -> list[tuple[Any, Any]]:
     """Draw half of all doors, or some narrow places.
 
     Return the rows and the columns of the cells of each.
     """
-    found = []  # whether it is no door, a random number, and its cells
-    beside = max(round(0.5 / grid.resolution), 1)
-    for occupancy in (grid.occupancy, grid.occupancy.T):
-        step = np.diff(
-            np.pad(occupancy, ((0, 0), (1, 1)), constant_values=True).astype(np.int8)
-        )
-        rows, begins = np.nonzero(step == -1)
-        ends = np.nonzero(step == 1)[1]
-        widths = np.zeros(occupancy.shape, np.int64)
-        for row, first, end in zip(rows, begins, ends, strict=True):
-            widths[row, first:end] = end - first
-        widths = np.pad(widths, ((beside, beside), (0, 0)))
-        middle, width = (begins + ends) // 2, ends - begins
-        wider = (
-            np.minimum(widths[rows, middle], widths[rows + 2 * beside, middle])
-            > 1.5 * width
-        )
-        for index in np.flatnonzero(width * grid.resolution <= NARROW):
-            columns = np.arange(begins[index], ends[index])
-            cells: tuple[Any, Any] = rows[index], columns
-            cells = cells if occupancy is grid.occupancy else cells[::-1]
-            found.append((not wider[index], random.random(), cells))
-    kept: list[tuple[Any, Any]] = []
-    centres, doors = np.full((1, 2), np.inf), 0
-    for no_door, _, cells in sorted(found, key=lambda each: each[:2]):
-        centre = np.array([cells[0].mean(), cells[1].mean()])
-        if np.hypot(*(centres - centre).T).min() * grid.resolution > APART:
-            doors += not no_door
-            kept.append(cells)
+    places = list(narrow_places(grid.occupancy, grid.resolution, random))
+    for place in narrow_places(grid.occupancy.T, grid.resolution, random):
+        places.append(place._replace(rows=place.columns, columns=place.rows))
+    # Doors first, each kind in random order.
+    places.sort(key=lambda place: (not place.is_door, place.order))
+
+    drawn: list[tuple[Any, Any]] = []
+    doors = 0
+    centres = np.full((1, 2), np.inf)  # of the drawn ones
+    for place in places:
+        centre = np.array([place.rows.mean(), place.columns.mean()])
+        cells_apart = np.hypot(*(centres - centre).T).min()
+        if cells_apart * grid.resolution > APART:
+            doors += place.is_door
+            drawn.append((place.rows, place.columns))
             centres = np.append(centres, [centre], axis=0)
-    free = np.count_nonzero(~grid.occupancy) * grid.resolution**2
-    return kept[: max(doors // 2, min(GATES, round(free / GATE_AREA)))]
+    area = np.count_nonzero(~grid.occupancy) * grid.resolution**2
+    count = max(doors // 2, min(GATES, round(area / GATE_AREA)))
+    return drawn[:count]
+
+
+def narrow_places(
+    occupancy: Bool, resolution: float, random: Random
+) -> Iterator[NarrowPlace]:
+    """Yield the free stretches of rows that are narrow enough for a door."""
+    bordered = np.pad(occupancy, ((0, 0), (1, 1)), constant_values=True)
+    step = np.diff(bordered.astype(np.int8))
+    rows, begins = np.nonzero(step == -1)
+    ends = np.nonzero(step == 1)[1]
+    widths = ends - begins
+    width_of_cells = np.zeros(occupancy.shape, np.int64)  # of the stretch of each cell
+    for row, begin, end in zip(rows, begins, ends, strict=True):
+        width_of_cells[row, begin:end] = end - begin
+
+    beside = max(round(BESIDE / resolution), 1)  # rows
+    width_of_cells = np.pad(width_of_cells, ((beside, beside), (0, 0)))
+    middles = (begins + ends) // 2
+    width_above = width_of_cells[rows, middles]
+    width_below = width_of_cells[rows + 2 * beside, middles]
+    is_door = np.minimum(width_above, width_below) > 1.5 * widths
+    for index in np.flatnonzero(widths * resolution <= NARROW):
+        columns = np.arange(begins[index], ends[index])
+        yield NarrowPlace(bool(is_door[index]), random.random(), rows[index], columns)

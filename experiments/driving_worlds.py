@@ -7,6 +7,7 @@ fewer on small maps, and noise no finer than 25 cm on maps from files, after fir
 measurements.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
@@ -32,59 +33,53 @@ STATIONS: Final = 6  # missions lead from one of so many cells to another
 HOUR: Final = 3600.0
 # Standard deviations: of the log time of each 25 cm, for each drive anew; of the log
 # time of a drive; and of a pose, metres.
-NOISE, DRIVE_NOISE, POSE_NOISE = 0.3, 0.03, 0.02
+NOISE: Final = 0.3
+DRIVE_NOISE: Final = 0.03
+POSE_NOISE: Final = 0.02
+NOISY_PART: Final = 0.25  # metres
 RATE: Final = 10.0  # poses per second
 
 # Each kind of world is a map and what is slow on it.
 TUNING: Final = (
-    *(
-        "office-mixture",
-        "small_rooms-mixture",
-        "corridors-mixture",
-        "rooms-discs",
-        "rooms-sills",
-    ),
-    *("rooms-noise", "halls-discs", "halls-checkerboard", "halls-ramps", "maze-discs"),
-    *(
-        "maze-waits",
-        "warehouse-crowds",
-        "warehouse-gradient",
-        "blobs-clearance",
-        "rooms-waits",
-    ),
+    "office-mixture",
+    "small_rooms-mixture",
+    "corridors-mixture",
+    "rooms-discs",
+    "rooms-sills",
+    "rooms-noise",
+    "halls-discs",
+    "halls-checkerboard",
+    "halls-ramps",
+    "maze-discs",
+    "maze-waits",
+    "warehouse-crowds",
+    "warehouse-gradient",
+    "blobs-clearance",
+    "rooms-waits",
 )
 HELD_OUT: Final = (
-    *(
-        "warehouse-discs",
-        "corridors-waits",
-        "rooms-clearance",
-        "rooms-ramps",
-        "halls-noise",
-    ),
-    *(
-        "halls-crowds",
-        "halls-gradient",
-        "maze-sills",
-        "maze-noise",
-        "maze-checkerboard",
-    ),
-    *(
-        "warehouse-waits",
-        "warehouse-clearance",
-        "blobs-noise",
-        "blobs-discs",
-        "blobs-ramps",
-    ),
-    *("small_rooms-sills", "office-checkerboard", "office-crowds"),
+    "warehouse-discs",
+    "corridors-waits",
+    "rooms-clearance",
+    "rooms-ramps",
+    "halls-noise",
+    "halls-crowds",
+    "halls-gradient",
+    "maze-sills",
+    "maze-noise",
+    "maze-checkerboard",
+    "warehouse-waits",
+    "warehouse-clearance",
+    "blobs-noise",
+    "blobs-discs",
+    "blobs-ramps",
+    "small_rooms-sills",
+    "office-checkerboard",
+    "office-crowds",
 )
-HELD_OUT_SEED: Final = 14_000  # their first one
-ON_FILES: Final = (
-    "mixture",
-    "discs",
-    "waits",
-    "clearance",
-    "noise",
-)  # what is slow on ROS maps
+HELD_OUT_SEED: Final = 14_000  # of the first world of `HELD_OUT`
+ON_FILES: Final = ("mixture", "discs", "waits", "clearance", "noise")
+"""What is slow on ROS maps."""
 
 
 @dataclass
@@ -93,25 +88,24 @@ class World:
 
     grid: GridMap
     always: Float64  # the slowness of slow zones, of a slipping carpet, ...
-    crowds: list[
-        Float64
-    ]  # they come and go by the hour; the first comes in the odd hours
+    crowds: list[Float64]
+    """The slowness of crowds that come and go by the hour, the first in odd hours."""
     stations: list[Cell]
-    waits: Float64 | None = (
-        None  # seconds that the robot stands before it enters a door
-    )
-    ramps: Float64 | None = (
-        None  # (H, W, 2): how much slower is a drive in this direction
-    )
+    waits: Float64 | None = None
+    """Seconds that the robot stands before it enters a door."""
+    ramps: Float64 | None = None
+    """(H, W, 2): a vector (x, y) upward, as long as the slowness of a drive up."""
     best: dict[int, Float64] = field(default_factory=dict)
+    """The least seconds between all stations, in even (0) and in odd (1) hours."""
 
     def slowness(self, seconds: float) -> Float64:
         """Return what is true at a time, in no direction: (H, W)."""
-        now, hour = self.always, int(seconds // HOUR)
+        slowness = self.always
+        hour = int(seconds // HOUR)
         for number, crowd in enumerate(self.crowds):
             if (hour + number) % 2:
-                now = np.maximum(now, crowd)
-        return now
+                slowness = np.maximum(slowness, crowd)
+        return slowness
 
     def known(self, seconds: float) -> GridMap:
         """Return the map of one who knows, but for waits and directions."""
@@ -134,28 +128,28 @@ class World:
     def moves(self, begin: Any, end: Any, seconds: float) -> Float64:
         """Return the seconds of moves, and the seconds of their waits: (3, N).
 
-        The seconds of a move are two rows: its half in the left cell, its half in the
-        next.
+        `begin` and `end` are the cells (2, N) of moves at some seconds of the clock.
+        The seconds of a move are two rows: its half in the first cell, and its half in
+        the next one.
         """
-        (x, y), (next_x, next_y) = begin, end
+        x, y = begin
+        next_x, next_y = end
         way = np.stack([next_x - x, next_y - y], axis=-1).astype(np.float64)
-        length = np.hypot(*way.T)
+        cells = np.hypot(*way.T)
         slowness = self.slowness(seconds)
-        first, second, waits = (
-            slowness[y, x],
-            slowness[next_y, next_x],
-            np.zeros(len(x)),
-        )
+        first = slowness[y, x]
+        second = slowness[next_y, next_x]
         if self.ramps is not None:
-            heading = way / length[:, None]
-            first = first + np.maximum((self.ramps[y, x] * heading).sum(axis=1), 0)
-            second = second + np.maximum(
-                (self.ramps[next_y, next_x] * heading).sum(axis=1), 0
-            )
+            direction = way / cells[:, None]
+            climb = (self.ramps[y, x] * direction).sum(axis=1)
+            next_climb = (self.ramps[next_y, next_x] * direction).sum(axis=1)
+            first = first + np.maximum(climb, 0)
+            second = second + np.maximum(next_climb, 0)
+        waits = np.zeros(len(x))
         if self.waits is not None:
-            entered = self.waits[next_y, next_x]
-            waits = np.where(self.waits[y, x] != entered, entered, 0)
-        half = length / 2 * self.grid.resolution / SPEED
+            wait = self.waits[next_y, next_x]
+            waits = np.where(self.waits[y, x] != wait, wait, 0)
+        half = cells / 2 * self.grid.resolution / SPEED
         return np.stack([half * first, half * second, waits])
 
     def best_seconds(self, start: Cell, goal: Cell, seconds: float) -> float:
@@ -163,25 +157,31 @@ class World:
         hour = int(seconds // HOUR) % 2
         if hour not in self.best:
             self.best[hour] = self._all_pairs(seconds)
-        return float(
-            self.best[hour][self.stations.index(start), self.stations.index(goal)]
-        )
+        row = self.stations.index(start)
+        column = self.stations.index(goal)
+        return float(self.best[hour][row, column])
 
     def _all_pairs(self, seconds: float) -> Float64:
-        """Return the least seconds between all stations."""
-        free = np.pad(~self.grid.occupancy, 1)
-        y, x = np.nonzero(free)
-        begin, end = [], []
-        for dx, dy in ((i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j):
-            legal = free[y + dy, x + dx] & free[y, x + dx] & free[y + dy, x]
-            begin.append(np.stack([x[legal], y[legal]]) - 1)
-            end.append(begin[-1] + [[dx], [dy]])
-        first, last = np.concatenate(begin, axis=1), np.concatenate(end, axis=1)
-        cost = self.moves(first, last, seconds).sum(axis=0)
-        width, cells = self.grid.width, self.grid.occupancy.size
-        edges = cost, (first[1] * width + first[0], last[1] * width + last[0])
+        """Return the least seconds between all stations, by Dijkstra."""
+        is_free = np.pad(~self.grid.occupancy, 1)
+        y, x = np.nonzero(is_free)
+        begins = []
+        ends = []
+        for dx, dy in itertools.product((-1, 0, 1), repeat=2):
+            if dx == dy == 0:
+                continue
+            is_legal = is_free[y + dy, x + dx] & is_free[y, x + dx] & is_free[y + dy, x]
+            begin = np.stack([x[is_legal], y[is_legal]]) - 1
+            begins.append(begin)
+            ends.append(begin + np.array([[dx], [dy]]))
+        begin = np.concatenate(begins, axis=1)
+        end = np.concatenate(ends, axis=1)
+        cost = self.moves(begin, end, seconds).sum(axis=0)
+        width = self.grid.width
+        numbers = begin[1] * width + begin[0], end[1] * width + end[0]
+        cells = self.grid.occupancy.size
+        graph = csr_array((cost, numbers), shape=(cells, cells))
         stations = [y * width + x for x, y in self.stations]
-        graph = csr_array(edges, shape=(cells, cells))
         return np.asarray(dijkstra(graph, indices=stations)[:, stations])
 
     def change(self, hidden: str, random: Random) -> None:
@@ -214,17 +214,18 @@ def _slow_discs(world: World, random: Random) -> None:
 def _mixture(world: World, random: Random) -> None:
     """Draw slow zones, a slipping carpet, two crowds and a narrow cell.
 
-    The cell lies between two walls of 20 cells.
+    The cell lies between two occupied cells, and is 20 times as slow.
     """
-    grid, occupancy = world.grid, world.grid.occupancy
+    grid = world.grid
+    occupancy = grid.occupancy
     _slow_discs(world, random)
-    world.always = np.maximum(
-        world.always, _discs(grid, 1, (1.5, 3), (1.4, 1.4), random)
-    )
+    carpet = _discs(grid, 1, (1.5, 3), (1.4, 1.4), random)
+    world.always = np.maximum(world.always, carpet)
     world.crowds = [_discs(grid, 1, (1, 2), (2, 2), random) for _ in range(2)]
     wall = np.pad(occupancy, 1, constant_values=True)
-    beside = (wall[1:-1, :-2] & wall[1:-1, 2:]) | (wall[:-2, 1:-1] & wall[2:, 1:-1])
-    narrow = np.argwhere(beside & ~occupancy)
+    is_between_columns = wall[1:-1, :-2] & wall[1:-1, 2:]
+    is_between_rows = wall[:-2, 1:-1] & wall[2:, 1:-1]
+    narrow = np.argwhere((is_between_columns | is_between_rows) & ~occupancy)
     if len(narrow):
         y, x = narrow[random.integers(len(narrow))]
         world.always[y, x] = 20.0
@@ -252,18 +253,18 @@ def _gradient(world: World, random: Random) -> None:
     """Let the map be 1 to 4 times as slow, linearly in a direction."""
     angle = random.uniform(0, 2 * np.pi)
     y, x = np.ogrid[: world.grid.height, : world.grid.width]
-    along = np.cos(angle) * x + np.sin(angle) * y
-    world.always = 1 + 3 * (along - along.min()) / np.ptp(along)
+    distance = np.cos(angle) * x + np.sin(angle) * y
+    world.always = 1 + 3 * (distance - distance.min()) / np.ptp(distance)
 
 
 def _checkerboard(world: World, random: Random) -> None:
     """Let every second square of 1 to 3 m be 2 to 3 times as slow."""
     side = random.uniform(1, 3) / world.grid.resolution
     y, x = np.indices(world.grid.occupancy.shape)
-    odd = (
-        (x + random.uniform(0, side)) // side + (y + random.uniform(0, side)) // side
-    ) % 2
-    world.always = np.where(odd == 1, random.uniform(2, 3), 1.0)
+    column = (x + random.uniform(0, side)) // side
+    row = (y + random.uniform(0, side)) // side
+    is_odd = (column + row) % 2 == 1
+    world.always = np.where(is_odd, random.uniform(2, 3), 1.0)
 
 
 def _noise(world: World, random: Random) -> None:
@@ -272,17 +273,16 @@ def _noise(world: World, random: Random) -> None:
     Its standard deviation is 0.65.
     """
     size = world.grid.resolution
-    squares = [(np.arange(n) + 0.5) * size // 0.25 for n in world.grid.occupancy.shape]
-    height, width = (int(of_axis[-1]) + 1 for of_axis in squares)
-    frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width))
+    height, width = world.grid.occupancy.shape
+    rows = ((np.arange(height) + 0.5) * size // 0.25).astype(np.int64)  # of squares
+    columns = ((np.arange(width) + 0.5) * size // 0.25).astype(np.int64)
+    shape = rows[-1] + 1, columns[-1] + 1
+    frequency = np.hypot(np.fft.fftfreq(shape[0])[:, None], np.fft.fftfreq(shape[1]))
     frequency[0, 0] = np.inf
-    log = np.fft.ifft2(
-        np.fft.fft2(random.normal(size=(height, width))) / frequency
-    ).real
-    of_squares = np.exp(np.maximum(0.4 + 0.65 * log / log.std(), 0))
-    world.always = of_squares[
-        np.ix_(*(of_axis.astype(np.int64) for of_axis in squares))
-    ]
+    spectrum = np.fft.fft2(random.normal(size=shape)) / frequency
+    log = np.fft.ifft2(spectrum).real
+    slowness = np.exp(np.maximum(0.4 + 0.65 * log / log.std(), 0))
+    world.always = slowness[np.ix_(rows, columns)]
 
 
 def _ramps(world: World, random: Random) -> None:
@@ -295,12 +295,14 @@ def _ramps(world: World, random: Random) -> None:
     world.ramps = np.zeros((*grid.occupancy.shape, 2))
     for _ in range(5):
         y, x = free[random.integers(len(free))]
-        rows, columns = np.rint(random.uniform(1.5, 3, 2) / grid.resolution).astype(
-            np.int64
-        )
-        angle, more = random.uniform(0, 2 * np.pi), random.uniform(1.5, 4)
+        half_sides = np.rint(random.uniform(1.5, 3, 2) / grid.resolution)
+        rows, columns = half_sides.astype(np.int64)
+        angle = random.uniform(0, 2 * np.pi)
+        climb = random.uniform(
+            1.5, 4
+        )  # the slowness upward, less the 1 of level ground
         box = slice(max(y - rows, 0), y + rows), slice(max(x - columns, 0), x + columns)
-        world.ramps[box] = more * np.cos(angle), more * np.sin(angle)
+        world.ramps[box] = climb * np.cos(angle), climb * np.sin(angle)
 
 
 def _clearance(world: World, random: Random) -> None:
@@ -311,9 +313,8 @@ def _clearance(world: World, random: Random) -> None:
     padded = np.pad(world.grid.occupancy, 1, constant_values=True)
     cells = scipy.ndimage.distance_transform_edt(~padded)[1:-1, 1:-1] - 0.5
     metres = cells * world.grid.resolution
-    world.always = 1 + random.uniform(1.5, 3.5) * np.exp(
-        -metres / random.uniform(0.3, 0.6)
-    )
+    factor = random.uniform(1.5, 3.5)
+    world.always = 1 + factor * np.exp(-metres / random.uniform(0.3, 0.6))
 
 
 HIDDEN: Final[dict[str, Callable[[World, Random], None]]] = {
@@ -365,8 +366,8 @@ class Drive:
 
 def path_seconds(cells: Sequence[Cell], world: World, clock: float) -> float:
     """Return how long a path takes, without noise."""
-    along = np.transpose(cells)
-    return float(world.moves(along[:, :-1], along[:, 1:], clock).sum())
+    path = np.transpose(cells)
+    return float(world.moves(path[:, :-1], path[:, 1:], clock).sum())
 
 
 def drive(
@@ -378,24 +379,27 @@ def drive(
     rate: float = RATE,
 ) -> Drive:
     """Drive a path with noise; its poses begin at the clock's time."""
-    along = np.transpose(cells)
-    first, second, waits = world.moves(along[:, :-1], along[:, 1:], clock)
-    x, y = along
-    metres = np.concatenate([[0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
-    part = (metres * world.grid.resolution / 0.25).astype(np.int64)
-    noise = np.exp(random.normal(0, NOISE, part[-1] + 1) - NOISE**2 / 2)[part]
-    noise *= np.exp(random.normal(0, DRIVE_NOISE))
+    path = np.transpose(cells)
+    first, second, waits = world.moves(path[:, :-1], path[:, 1:], clock)
+    steps = np.hypot(*np.diff(path))
+    metres = np.concatenate([[0], np.cumsum(steps)]) * world.grid.resolution
+    part = (metres / NOISY_PART).astype(np.int64)  # of each cell, for the noise
+    noise_of_parts = np.exp(random.normal(0, NOISE, part[-1] + 1) - NOISE**2 / 2)
+    noise = noise_of_parts[part] * np.exp(random.normal(0, DRIVE_NOISE))
+
     # Of each move: the robot waits in its first cell, then drives through both halves.
-    seconds = np.stack([waits, first * noise[:-1], second * noise[1:]], axis=1).ravel()
-    at = np.concatenate([[0], np.cumsum(seconds)])
-    centres = np.column_stack([x, y]) + 0.5
+    durations = [waits, first * noise[:-1], second * noise[1:]]
+    passage = np.stack(durations, axis=1).ravel()
+    arrival = np.concatenate([[0], np.cumsum(passage)])
+    centres = path.T + 0.5
     points = np.repeat(centres, 3, axis=0)[:-2]
     points[2::3] = (centres[1:] + centres[:-1]) / 2
     points *= world.grid.resolution
-    times = np.arange(0, at[-1], 1 / rate)
-    positions = np.column_stack(
-        [np.interp(times, at, points[:, axis]) for axis in (0, 1)]
-    )
+
+    seconds = np.arange(0, arrival[-1], 1 / rate)
+    x = np.interp(seconds, arrival, points[:, 0])
+    y = np.interp(seconds, arrival, points[:, 1])
+    positions = np.column_stack([x, y])
     positions += random.normal(0, pose_noise, positions.shape)
     positions += world.grid.origin[:2]
-    return Drive(times + clock, positions, float(at[-1]))
+    return Drive(seconds + clock, positions, float(arrival[-1]))

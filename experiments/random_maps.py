@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,16 +12,23 @@ from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.inflation import clearance
 
 MINIMUM_SIDE = 5  # of a map: a maze of two corridors between its walls
-SHORTEST_STEP = (
-    3  # cells from one wall of a room to the next: it is at least two cells wide
-)
+SHORTEST_STEP = 3
+"""Cells from one wall of a room to the next: the room is at least two cells wide."""
 EXTRA_LINKS = 0.15  # of the links outside the spanning tree are opened too
 
-Spans = list[
-    tuple[int, int]
-]  # the first cell of each corridor and the cell after its last
+Spans = list[tuple[int, int]]
+"""The first cell of each corridor, and the cell after its last one."""
 Random = np.random.Generator
 Integers = NDArray[np.int64]
+
+
+class Links(NamedTuple):
+    """The rows and columns (N,) of both ends of links between nodes of a lattice."""
+
+    row: Integers
+    column: Integers
+    next_row: Integers
+    next_column: Integers
 
 
 def _independent(share: float, shape: tuple[int, int], random: Random) -> Occupancy:
@@ -37,8 +44,11 @@ def _maze(shape: tuple[int, int], random: Random) -> Occupancy:
     occupancy = np.ones(shape, dtype=np.bool_)
     rows, columns = (shape[0] - 1) // 2, (shape[1] - 1) // 2
     occupancy[1 : 2 * rows : 2, 1 : 2 * columns : 2] = False
-    row, column, next_row, next_column = _links(rows, columns, 0.0, random)
-    occupancy[row + next_row + 1, column + next_column + 1] = False
+    links = _links(rows, columns, 0.0, random)
+    # The wall between two cells of the tree lies at the mean of their places.
+    wall_row = links.row + links.next_row + 1
+    wall_column = links.column + links.next_column + 1
+    occupancy[wall_row, wall_column] = False
     return occupancy
 
 
@@ -47,19 +57,19 @@ def _rooms(shape: tuple[int, int], random: Random) -> Occupancy:
 
     Doors connect all rooms.
     """
-    longest = int(
-        random.integers(SHORTEST_STEP, np.clip(min(shape) // 3, SHORTEST_STEP, 15) + 1)
-    )
+    longest_step = np.clip(min(shape) // 3, SHORTEST_STEP, 15)
+    longest = int(random.integers(SHORTEST_STEP, longest_step + 1))
     y, x = (_wall_lines(0, side - 1, longest, random) for side in shape)
     occupancy = np.zeros(shape, dtype=np.bool_)
-    occupancy[y] = occupancy[:, x] = True
-    row, column, next_row, next_column = _links(
-        len(y) - 1, len(x) - 1, EXTRA_LINKS, random
-    )
-    beside = next_column > column
-    row, next_column = row[beside], next_column[beside]
-    column, next_row = column[~beside], next_row[~beside]
+    occupancy[y] = True
+    occupancy[:, x] = True
+    links = _links(len(y) - 1, len(x) - 1, EXTRA_LINKS, random)
+    is_along_x = links.next_column > links.column
+    row = links.row[is_along_x]
+    next_column = links.next_column[is_along_x]
     _open_doors(occupancy, x[next_column], y[row], y[row + 1], random)
+    column = links.column[~is_along_x]
+    next_row = links.next_row[~is_along_x]
     _open_doors(occupancy.T, y[next_row], x[column], x[column + 1], random)
     return occupancy
 
@@ -77,24 +87,20 @@ def _corridors(shape: tuple[int, int], random: Random) -> Occupancy:
     x_edges = np.linspace(1, shape[1] - 1, columns + 1).astype(np.int64)
     y = random.integers(y_edges[:-1, None], y_edges[1:, None], (rows, columns))
     x = random.integers(x_edges[:-1], x_edges[1:], (rows, columns))
-    row, column, next_row, next_column = _links(rows, columns, EXTRA_LINKS, random)
-    widths = random.integers(1, 4, len(row))
-    turns = random.random(len(row)) < 0.5
-    (y0s, y1s), (x0s, x1s) = (
-        (of[row, column], of[next_row, next_column]) for of in (y, x)
-    )
+    links = _links(rows, columns, EXTRA_LINKS, random)
+    widths = random.integers(1, 4, len(links.row))
+    turns = random.random(len(links.row)) < 0.5
+    start_y = y[links.row, links.column]
+    start_x = x[links.row, links.column]
+    end_y = y[links.next_row, links.next_column]
+    end_x = x[links.next_row, links.next_column]
+    starts = np.column_stack([start_y, start_x])
+    ends = np.column_stack([end_y, end_x])
     occupancy = np.ones(shape, dtype=np.bool_)
-    for y0, x0, y1, x1, width, turn in zip(
-        y0s, x0s, y1s, x1s, widths, turns, strict=True
-    ):
-        corner_y, corner_x = (y0, x1) if turn else (y1, x0)
-        occupancy[min(y0, y1) : max(y0, y1) + width, corner_x : corner_x + width] = (
-            False
-        )
-        occupancy[corner_y : corner_y + width, min(x0, x1) : max(x0, x1) + width] = (
-            False
-        )
-    occupancy[[0, -1]] = occupancy[:, [0, -1]] = True
+    for start, end, width, is_turned in zip(starts, ends, widths, turns, strict=True):
+        _dig(occupancy, start, end, width, is_turned)
+    occupancy[[0, -1]] = True
+    occupancy[:, [0, -1]] = True
     return occupancy
 
 
@@ -111,10 +117,25 @@ def _dead_ends(shape: tuple[int, int], random: Random) -> Occupancy:
     return occupancy
 
 
+def _dig(
+    occupancy: Occupancy, start: Integers, end: Integers, width: int, is_turned: bool
+) -> None:
+    """Dig a corridor of two legs between two points (y, x).
+
+    It goes along y from the start, and along x to the end; if it is turned, along x
+    and then along y.
+    """
+    top, left = np.minimum(start, end)
+    bottom, right = np.maximum(start, end) + width
+    corner_y, corner_x = (start[0], end[1]) if is_turned else (end[0], start[1])
+    occupancy[top:bottom, corner_x : corner_x + width] = False
+    occupancy[corner_y : corner_y + width, left:right] = False
+
+
 def _office(shape: tuple[int, int], random: Random) -> Occupancy:
     """Draw a building: a net of corridors, rooms along them, desks in the rooms."""
-    along_x = random.random() < 0.5
-    height, width = shape if along_x else shape[::-1]
+    is_along_x = random.random() < 0.5
+    height, width = shape if is_along_x else shape[::-1]
     count = max(1, round(height / random.integers(14, 25)))
     corridors = _corridor_spans(height, count, random)
     # Two or more corridors need another corridor across them, or they would not be
@@ -134,27 +155,40 @@ def _office(shape: tuple[int, int], random: Random) -> Occupancy:
         else:
             rows = [(top, bottom, top if top > 0 else bottom)]
         for left, right in _between(cross_corridors, width):
-            for above, below, door in rows:
-                if min(below - above, right - left) < 2:
-                    continue
-                x = _wall_lines(left, right, 9, random)
-                occupancy[above + 1 : below, left + 1 : right] = False
-                occupancy[above + 1 : below, x] = True
-                _open_doors(
-                    occupancy.T, np.full(len(x) - 1, door), x[:-1], x[1:], random
-                )
+            for upper_wall, lower_wall, door in rows:
+                span = upper_wall, lower_wall, left, right
+                _draw_row_of_rooms(occupancy, span, door, random)
     for desk in random.integers(1, 4, (occupancy.size // 25, 2)).tolist():
         _stamp(occupancy, np.ones(desk, dtype=np.bool_), random)
     occupancy &= ~corridor  # desks stand in rooms only
-    return occupancy if along_x else np.ascontiguousarray(occupancy.T)
+    return occupancy if is_along_x else np.ascontiguousarray(occupancy.T)
 
 
-def _links(
-    rows: int, columns: int, extra: float, random: Random
-) -> tuple[Integers, Integers, Integers, Integers]:
+def _draw_row_of_rooms(
+    occupancy: Occupancy,
+    walls: tuple[int, int, int, int],
+    door: int,
+    random: Random,
+) -> None:
+    """Draw rooms side by side between walls: the row above and below, left and right.
+
+    Each room has a door in the row `door`.
+    """
+    top, bottom, left, right = walls
+    if min(bottom - top, right - left) < 2:
+        return
+    x = _wall_lines(left, right, 9, random)
+    occupancy[top + 1 : bottom, left + 1 : right] = False
+    occupancy[top + 1 : bottom, x] = True
+    doors = np.full(len(x) - 1, door)
+    _open_doors(occupancy.T, doors, x[:-1], x[1:], random)
+
+
+def _links(rows: int, columns: int, extra: float, random: Random) -> Links:
     """Link the nodes of a lattice by a random tree and by more links.
 
-    Return the rows and columns of both ends of each link, in the order of the draw.
+    `extra` is the share of the other pairs of neighbours that are linked, too. The
+    links are in the order of the draw.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import minimum_spanning_tree
@@ -167,12 +201,13 @@ def _links(
     order = random.permutation(len(first))
     first, second = first[order], second[order]
     numbers = np.arange(1, len(first) + 1)  # scipy reads a weight of 0 as no link
-    tree = minimum_spanning_tree(
-        coo_matrix((numbers, (first, second)), (node.size, node.size))
-    )
-    linked = random.random(len(first)) < extra
-    linked[tree.data.astype(np.int64) - 1] = True
-    return *np.divmod(first[linked], columns), *np.divmod(second[linked], columns)
+    graph = coo_matrix((numbers, (first, second)), (node.size, node.size))
+    tree = minimum_spanning_tree(graph)
+    is_linked = random.random(len(first)) < extra
+    is_linked[tree.data.astype(np.int64) - 1] = True
+    row, column = np.divmod(first[is_linked], columns)
+    next_row, next_column = np.divmod(second[is_linked], columns)
+    return Links(row, column, next_row, next_column)
 
 
 def _wall_lines(first: int, last: int, longest: int, random: Random) -> Integers:
@@ -210,20 +245,17 @@ def _corridor_spans(side: int, count: int, random: Random) -> Spans:
     spans = []
     for index in range(count):
         width = int(random.integers(2, min(4, side - 2) + 1))
-        first = round((index + 0.5) * side / count - width / 2) + int(
-            random.integers(-1, 2)
-        )
+        regular = round((index + 0.5) * side / count - width / 2)
+        first = regular + int(random.integers(-1, 2))
         first = min(max(first, 1), side - 1 - width)
         spans.append((first, first + width))
     return spans
 
 
 def _between(spans: Spans, side: int) -> Spans:
-    """Return the parts of a side between corridors: first and last cells."""
-    return [
-        (end, first - 1)
-        for (_, end), (first, _) in itertools.pairwise([(0, 0), *spans, (side, side)])
-    ]
+    """Return the parts of a side between corridors, whose walls are their ends."""
+    bounds = [(0, 0), *spans, (side, side)]
+    return [(end, first - 1) for (_, end), (first, _) in itertools.pairwise(bounds)]
 
 
 # The function that makes each kind of map. All free cells are connected, except in

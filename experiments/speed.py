@@ -9,7 +9,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import dijkstra3d
 import gymnasium
@@ -42,9 +42,8 @@ REQUESTS, ROUNDS, FIELDS, CHANGES = 15, 3, 100, 100
 STEPS, TRAINING_ROUNDS = 3_000, 5
 FLIPPED = 10  # cells that a change near a place flips, of the 25 around it
 WALL = 41  # cells of a wall that opens or closes
-SHORTEST = (
-    40  # moves of the shortest path for replans: robot and goal are far from each other
-)
+SHORTEST = 40
+"""Moves of the shortest path for replans: robot and goal are far from each other."""
 
 # The kinds of changes, and where on the path: a number of moves from its ends, or 0 for
 # its middle.
@@ -60,9 +59,6 @@ CHANGE_KINDS = {
 # straight move, or with tcod 1.4 times as much. pyastar2d is not among them: where
 # cells cost differently, it may read memory that it never set.
 PEERS = "tcod", "dijkstra3d A*", "dijkstra3d from both ends"
-Change = tuple[
-    Occupancy, Occupancy, int, int
-]  # a map, and a patch of it with its x and y
 LOADED = Planner.load("any_map")
 
 
@@ -193,54 +189,76 @@ def measure_requests_with_costs(side: int) -> Iterator[bool]:
         yield report(figure, max(of_peer), "x", 1.0)
 
 
+class Change(NamedTuple):
+    """A map, and another patch of it from the cell (x, y) on."""
+
+    occupancy: Occupancy
+    patch: Occupancy
+    x: int
+    y: int
+
+    def maps(self) -> tuple[GridMap, GridMap]:
+        """Return the map before and after the change."""
+        grid = GridMap(self.occupancy)
+        return grid, grid.with_patch(self.patch, self.x, self.y)
+
+
 def draw_change(
     kind: str, occupancy: Occupancy, path: Sequence[Cell], random: Random
 ) -> Change:
     """Draw a change of cells around a place or anywhere, or a wall across a path."""
-    side, at = len(occupancy), CHANGE_KINDS[kind] or len(path) // 2
-    (x0, y0), (x, y), (x1, y1) = path[at - 2], path[at], path[at + 2]
+    side = len(occupancy)
+    index = CHANGE_KINDS[kind] or len(path) // 2
+    x, y = path[index]
     width = height = side if kind == "cells anywhere" else 5
     if "wall" in kind:
-        width, height = (WALL, 1) if abs(y1 - y0) > abs(x1 - x0) else (1, WALL)
+        way_x, way_y = np.abs(np.subtract(path[index + 2], path[index - 2]))
+        width, height = (WALL, 1) if way_y > way_x else (1, WALL)
     x = int(np.clip(x - width // 2, 0, side - width))
     y = int(np.clip(y - height // 2, 0, side - height))
-    now = occupancy[y : y + height, x : x + width]
-    other = np.ones_like(now)
+    box = occupancy[y : y + height, x : x + width]
     if "wall" not in kind:
-        other = now.copy()
-        other.flat[random.choice(now.size, FLIPPED, replace=False)] ^= True
-    elif kind == "a wall opens" or ("beside" in kind and random.random() < 0.5):
-        before = occupancy.copy()
-        before[y : y + height, x : x + width] = True
-        return before, now, x, y
-    return occupancy, other, x, y
+        flipped = box.copy()
+        flipped.flat[random.choice(box.size, FLIPPED, replace=False)] ^= True
+        return Change(occupancy, flipped, x, y)
+    opens = kind == "a wall opens"
+    if "beside" in kind:
+        opens = random.random() < 0.5
+    if not opens:
+        return Change(occupancy, np.ones_like(box), x, y)
+    walled = occupancy.copy()
+    walled[y : y + height, x : x + width] = True
+    return Change(walled, box, x, y)
 
 
 def draw_changes(
     map_kind: str, side: int, kind: str
 ) -> Iterator[tuple[Change, Cell, Cell]]:
     """Draw changes that leave start and goal free, each with its start and goal."""
-    random, drawn = np.random.default_rng(0), 0
+    random = np.random.default_rng(0)
+    drawn = 0
     occupancy = generate_map(map_kind, (side, side), random)
     while drawn < CHANGES // len(MAP_KINDS):
         ((start, goal),) = random_requests(occupancy, RULE, 1, random)
         path = new_planner().plan(GridMap(occupancy), start, goal, RULE).cells
-        if len(path) > SHORTEST:
-            change = draw_change(kind, occupancy, path, random)
-            after = GridMap(change[0]).with_patch(*change[1:])
-            if after.is_free(start) and after.is_free(goal):
-                drawn += 1
-                yield change, start, goal
+        if len(path) <= SHORTEST:
+            continue
+        change = draw_change(kind, occupancy, path, random)
+        _, changed_map = change.maps()
+        if changed_map.is_free(start) and changed_map.is_free(goal):
+            drawn += 1
+            yield change, start, goal
 
 
 def replan(
-    change: Change, start: Cell, goal: Cell, knows_before: bool
+    change: Change, start: Cell, goal: Cell, knows_former: bool
 ) -> tuple[float, Plan]:
-    """Time a plan after a change, with the plan before it or without."""
-    planner, before = new_planner(), GridMap(change[0])
-    if knows_before:
-        planner.plan(before, start, goal, RULE)
-    return timed(planner.plan, before.with_patch(*change[1:]), start, goal, RULE)
+    """Time a plan on a changed map, by a planner that may know the former map."""
+    planner = new_planner()
+    former_map, changed_map = change.maps()
+    if knows_former:
+        planner.plan(former_map, start, goal, RULE)
+    return timed(planner.plan, changed_map, start, goal, RULE)
 
 
 def measure_replans(side: int) -> Iterator[bool]:
@@ -248,16 +266,15 @@ def measure_replans(side: int) -> Iterator[bool]:
     for kind in CHANGE_KINDS:
         ratios = []
         for map_kind in MAP_KINDS:
-            for drawn in draw_changes(map_kind, side, kind):
+            for change, start, goal in draw_changes(map_kind, side, kind):
                 times = []
                 for _ in range(ROUNDS):
-                    (ms, plan), (fresh_ms, fresh) = (
-                        replan(*drawn, it) for it in (True, False)
-                    )
-                    assert plan.cells == fresh.cells, drawn[1:]
-                    times.append((ms, fresh_ms))
-                ms, fresh_ms = medians(times)
-                ratios.append(ms / fresh_ms)
+                    ms, plan = replan(change, start, goal, knows_former=True)
+                    new_ms, new_plan = replan(change, start, goal, knows_former=False)
+                    assert plan.cells == new_plan.cells, (start, goal)
+                    times.append((ms, new_ms))
+                ms, new_ms = medians(times)
+                ratios.append(ms / new_ms)
         typical = statistics.median(ratios)
         figure = f"{side}x{side}, {kind}: replan / new, median {typical:.3f}; worst"
         yield report(figure, max(ratios), "x", 2.0)
@@ -265,20 +282,19 @@ def measure_replans(side: int) -> Iterator[bool]:
 
 def measure_short_requests(side: int) -> Iterator[bool]:
     """Compare a request of 15 cells on a map of random costs with one without."""
-    random, times = np.random.default_rng(0), []
+    random = np.random.default_rng(0)
     occupancy = random.random((side, side)) < 0.2
     occupancy[3:30, 3:30] = False
-    costs = None, random_costs(occupancy, random)
+    costs = random_costs(occupancy, random)
+    times = []
     for _ in range(CHANGES):
-        maps = [GridMap(occupancy, cost=cost) for cost in costs]
+        maps = GridMap(occupancy), GridMap(occupancy, cost=costs)
         times.append(
-            [timed(new_planner().plan, it, (5, 5), (20, 20), RULE)[0] for it in maps]
+            [timed(new_planner().plan, m, (5, 5), (20, 20), RULE)[0] for m in maps]
         )
-    without, with_costs = medians(times)
-    name = (
-        f"{side}x{side}, 15 cells: {without:.2f} ms; with costs {with_costs:.2f}; ratio"
-    )
-    yield report(name, with_costs / without, "x", 2.0)
+    ms, ms_with_costs = medians(times)
+    name = f"{side}x{side}, 15 cells: {ms:.2f} ms; with costs {ms_with_costs:.2f}"
+    yield report(f"{name}; ratio", ms_with_costs / ms, "x", 2.0)
 
 
 def measure_first_request(side: int) -> Iterator[bool]:

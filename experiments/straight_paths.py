@@ -143,39 +143,45 @@ def theta_star(grid: GridMap, start: Cell, goal: Cell) -> NDArray[np.int64]:
 def _theta_star(
     x: int, y: int, goal_x: int, goal_y: int, moves: NDArray[Any], layers: Any
 ) -> NDArray[np.int64]:
+    """Return the cells (N, 2) of Theta*'s path from (x, y) to the goal."""
     occupancy = layers[0]
     height, width = occupancy.shape
-    cost, parent = np.full(height * width, np.inf), np.full(height * width, -1)
-    closed = np.zeros(height * width, np.bool_)
-    start, goal = y * width + x, goal_y * width + goal_x
-    cost[start], parent[start] = 0.0, start
-    waiting = [(0.0, 0.0, start)]
-    while not closed[goal]:
-        _, _, cell = heapq.heappop(waiting)
-        if closed[cell]:
+    # Of each cell by its number, y * width + x:
+    cost = np.full(height * width, np.inf)
+    parent = np.full(height * width, -1)
+    is_closed = np.zeros(height * width, np.bool_)
+    start = y * width + x
+    goal = goal_y * width + goal_x
+    cost[start] = 0.0
+    parent[start] = start
+    # The bound of the whole cost, minus the cost so far, and the cell.
+    queue = [(0.0, 0.0, start)]
+    while not is_closed[goal]:
+        _, _, cell = heapq.heappop(queue)
+        if is_closed[cell]:
             continue
-        closed[cell] = True
+        is_closed[cell] = True
         y, x = divmod(cell, width)
-        from_y, from_x = divmod(parent[cell], width)
+        parent_y, parent_x = divmod(parent[cell], width)
         for dx, dy in moves:
-            to_x, to_y = x + dx, y + dy
-            number = to_y * width + to_x
-            if not (0 <= to_x < width and 0 <= to_y < height) or closed[number]:
+            next_x = x + dx
+            next_y = y + dy
+            number = next_y * width + next_x
+            is_on_map = 0 <= next_x < width and 0 <= next_y < height
+            if not is_on_map or is_closed[number]:
                 continue
-            through = cost[cell] + segment_cost(x, y, to_x, to_y, True, layers)
-            if through == np.inf:
+            step = segment_cost(x, y, next_x, next_y, True, layers)
+            if step == np.inf:
                 continue
-            direct = cost[parent[cell]] + segment_cost(
-                from_x, from_y, to_x, to_y, True, layers
-            )
-            least = min(through, direct)
-            if least < cost[number] * (1 - 1e-12):
-                cost[number], parent[number] = (
-                    least,
-                    parent[cell] if direct <= through else cell,
-                )
-                order = least + np.hypot(goal_x - to_x, goal_y - to_y)
-                heapq.heappush(waiting, (order, -least, number))
+            by_cell = cost[cell] + step
+            segment = segment_cost(parent_x, parent_y, next_x, next_y, True, layers)
+            by_parent = cost[parent[cell]] + segment
+            cheapest = min(by_cell, by_parent)
+            if cheapest < cost[number] * (1 - 1e-12):
+                cost[number] = cheapest
+                parent[number] = parent[cell] if by_parent <= by_cell else cell
+                bound = cheapest + np.hypot(goal_x - next_x, goal_y - next_y)
+                heapq.heappush(queue, (bound, -cheapest, number))
     path = [goal]
     while path[-1] != start:
         path.append(parent[path[-1]])
@@ -190,42 +196,53 @@ def optimum(occupancy: Occupancy, start: Cell, goal: Cell, finer: int = FINER) -
     shortest path turns at corners of obstacles alone.
     """
     fine = np.kron(occupancy, np.ones((finer, finer), np.bool_))
-    ends = [[finer * of + finer // 2 for of in cell] for cell in (start, goal)]
-    corners = np.argwhere(~occupancy)[:, ::-1]
+    ends = np.array([start, goal]) * finer + finer // 2
+    turns = np.argwhere(~fine)
     if finer > 1:
-        padded = np.pad(fine, 1, constant_values=True)
-        beside = [
-            padded[1 + y : len(fine) + 1 + y, 1 + x : len(fine) + 1 + x]
-            for x, y in MOVES
-        ]
-        is_corner = [
-            beside[n] & ~beside[n - 1] & ~beside[(n + 1) % 8] for n in (1, 3, 5, 7)
-        ]
-        corners = np.argwhere(~fine & np.any(is_corner, axis=0))[:, ::-1]
-    return float(
-        _optimum(np.concatenate([ends, corners]), GridMap(fine).layers(RULE)) / finer
-    )
+        turns = np.argwhere(~fine & _is_at_corner(fine))
+    points = np.concatenate([ends, turns[:, ::-1]])
+    return float(_optimum(points, GridMap(fine).layers(RULE)) / finer)
+
+
+def _is_at_corner(occupancy: Occupancy) -> Occupancy:
+    """Return the cells that touch a corner of an obstacle, and none of its sides."""
+    height, width = occupancy.shape
+    padded = np.pad(occupancy, 1, constant_values=True)
+    # Of each cell, its neighbour by each move, counter-clockwise.
+    neighbour = [
+        padded[1 + dy : height + 1 + dy, 1 + dx : width + 1 + dx] for dx, dy in MOVES
+    ]
+    is_corner = [
+        neighbour[diagonal] & ~neighbour[diagonal - 1] & ~neighbour[(diagonal + 1) % 8]
+        for diagonal in (1, 3, 5, 7)
+    ]
+    return np.asarray(np.any(is_corner, axis=0))
 
 
 @compiled
 def _optimum(points: NDArray[np.int64], layers: Any) -> float:
     """Return the least length from the first point to the second one over all: A*."""
-    cost, closed = np.full(len(points), np.inf), np.zeros(len(points), np.bool_)
-    cost[0], waiting = 0.0, [(0.0, 0)]
-    while not closed[1]:
-        _, number = heapq.heappop(waiting)
-        if closed[number]:
+    cost = np.full(len(points), np.inf)
+    is_closed = np.zeros(len(points), np.bool_)
+    goal_x, goal_y = points[1]
+    cost[0] = 0.0
+    queue = [(0.0, 0)]  # the bound of the whole length, and the number of the point
+    while not is_closed[1]:
+        _, number = heapq.heappop(queue)
+        if is_closed[number]:
             continue
-        closed[number] = True
+        is_closed[number] = True
         x, y = points[number]
-        for other in range(len(points)):
-            to_x, to_y = points[other]
-            if cost[number] + np.hypot(to_x - x, to_y - y) < cost[other] - 1e-9:
-                length = cost[number] + segment_cost(x, y, to_x, to_y, True, layers)
-                if length < cost[other] - 1e-9:
-                    cost[other] = length
-                    order = length + np.hypot(points[1, 0] - to_x, points[1, 1] - to_y)
-                    heapq.heappush(waiting, (order, other))
+        for next_number in range(len(points)):
+            next_x, next_y = points[next_number]
+            distance = np.hypot(next_x - x, next_y - y)
+            if cost[number] + distance < cost[next_number] - 1e-9:
+                segment = segment_cost(x, y, next_x, next_y, True, layers)
+                length = cost[number] + segment
+                if length < cost[next_number] - 1e-9:
+                    cost[next_number] = length
+                    bound = length + np.hypot(goal_x - next_x, goal_y - next_y)
+                    heapq.heappush(queue, (bound, next_number))
     return float(cost[1])
 
 

@@ -442,7 +442,9 @@ def test_a_field_that_is_interrupted_anywhere_is_as_a_new_one(
 
 
 def run_until(line: int, step: Callable[[], object]) -> None:
-    """Run a step, and fail where so many lines of the field's code were run, if it gets there."""
+    """Run a step, and fail where so many lines of the field's code were run, if it gets
+    there.
+    """
     modules = fields, field_cache, cell_space, queues, wavefront
     files = {module.__file__ for module in modules}
     left = line
@@ -754,7 +756,8 @@ def test_arrays_that_fields_share_count_once() -> None:
     planner.fields.nbytes = 16 * 9 * (side + 2) ** 2 + 16 * field_cache.OBJECTS
     for goal in grid.free_cells()[:30]:
         planner.q_field(grid, goal)
-    # One map and one set of costs; by themselves they would count as much as 4 of the fields.
+    # One map and one set of costs; by themselves they would count as much as 4 of the
+    # fields.
     assert 14 <= len(planner.fields.kept) <= 16
     whole = planner.q_field(grid, (0, 0))
     before = whole.nbytes
