@@ -6,7 +6,7 @@ python examples/body_film.py robots.gif
 import math
 import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 
@@ -22,10 +22,19 @@ from ddqn_planner.model import RobotNetwork
 from ddqn_planner.pictures import PATH_COLOUR, VALUE_COLOURS, draw_obstacles
 from ddqn_planner.robot.footprint import placed
 
-FRAMES_PER_SECOND, LAST_FRAMES = 20, 30
+FRAMES_PER_SECOND = 20
+LAST_FRAMES = 30  # in which the robots stand at their goals
 TRACE = 6  # poses from one outline that stays to the next
 
 Pose = tuple[float, float, float]
+
+
+class Drive(NamedTuple):
+    """A robot's outlines along its path, and where they are drawn."""
+
+    outlines: NDArray[Any]  # (poses, corners, 2): in cells
+    axes: Any
+    body: Any  # the drawn polygon
 
 
 def door() -> tuple[GridMap, Pose, Pose]:
@@ -34,7 +43,8 @@ def door() -> tuple[GridMap, Pose, Pose]:
     The robot starts and ends across the door.
     """
     occupancy = np.zeros((70, 110), np.bool_)
-    occupancy[[0, -1]] = occupancy[:, [0, -1]] = True
+    occupancy[[0, -1]] = True
+    occupancy[:, [0, -1]] = True
     occupancy[:, 53:57] = True
     occupancy[28:42, 53:57] = False
     return GridMap(occupancy, 0.05), (1.0, 0.9, math.pi / 2), (4.5, 2.6, math.pi / 2)
@@ -46,49 +56,49 @@ def lane() -> tuple[GridMap, Pose, Pose]:
     The lane is narrower than the car's turning circle.
     """
     occupancy = np.zeros((70, 110), np.bool_)
-    occupancy[:12] = occupancy[58:] = True
+    occupancy[:12] = True
+    occupancy[58:] = True
     occupancy[:, [0, -1]] = True
     return GridMap(occupancy, 0.05), (1.5, 1.2, 0.0), (1.5, 2.4, math.pi)
 
 
 def main(arguments: Sequence[str]) -> int:
     """Save the film; return 1 if there is no path."""
-    scenes = ("differential_robot", door()), ("car", lane())
-    figure, both = plt.subplots(2, 1, figsize=(4.4, 5.8), layout="constrained")
-    bodies: list[tuple[NDArray[Any], Any, Any]] = []
-    for axes, (model, (grid, start, goal)) in zip(both, scenes, strict=True):
+    scenes = {"differential_robot": door(), "car": lane()}
+    figure, panels = plt.subplots(2, 1, figsize=(4.4, 5.8), layout="constrained")
+    drives: list[Drive] = []
+    for axes, (model, (grid, start, goal)) in zip(panels, scenes.items(), strict=True):
         planner = Planner.load(model)
         assert isinstance(planner.network, RobotNetwork)
         plan = planner.plan_poses(grid, start, goal, bound=1.0)
         if not plan.poses.size:
             print(f"no path: {plan.status.value}")
             return 1
-        print(
-            f"{model}: {plan.length * grid.resolution:.2f} m in {plan.field_ms:.0f} ms"
-        )
+        metres = plan.length * grid.resolution
+        print(f"{model}: {metres:.2f} m in {plan.field_ms:.0f} ms")
         axes.axis("off")
         draw_obstacles(axes, grid)
+        # The centre of the first cell is (0, 0) in the picture.
         outlines = placed(planner.network.footprint, plan.poses) / grid.resolution - 0.5
         x, y = plan.poses.T[:2] / grid.resolution - 0.5
         axes.plot(x, y, color=PATH_COLOUR, linewidth=1)
         (body,) = axes.fill([], [], color=PATH_COLOUR, alpha=0.9)
-        bodies.append((outlines, axes, body))
-    longest = max(len(outlines) for outlines, *_ in bodies)
+        drives.append(Drive(outlines, axes, body))
 
     def draw(frame: int) -> Sequence[Any]:
-        for outlines, axes, body in bodies:
-            number = min(frame, len(outlines) - 1)
-            body.set_xy(outlines[number])
+        for drive in drives:
+            number = min(frame, len(drive.outlines) - 1)
+            outline = drive.outlines[number]
+            drive.body.set_xy(outline)
             if frame == number and frame % TRACE == 0:
-                axes.fill(
-                    *outlines[number].T, color=VALUE_COLOURS[2], alpha=0.25, zorder=0
-                )
-        return [body for *_, body in bodies]
+                colour = VALUE_COLOURS[2]
+                drive.axes.fill(*outline.T, color=colour, alpha=0.25, zorder=0)
+        return [drive.body for drive in drives]
 
+    longest = max(len(drive.outlines) for drive in drives)
     frames = [*range(0, longest, 2), *[longest] * LAST_FRAMES]
-    FuncAnimation(figure, draw, frames).save(
-        as_path(arguments[0]), PillowWriter(FRAMES_PER_SECOND)
-    )
+    animation = FuncAnimation(figure, draw, frames)
+    animation.save(as_path(arguments[0]), PillowWriter(FRAMES_PER_SECOND))
     return 0
 
 

@@ -44,21 +44,23 @@ Stages = Sequence[tuple[int, int]]
 
 STAGES: Final = ((0, 20), (20, 50), (50, 100))
 LONG_STAGES: Final = ((0, 200), (200, 600), (600, 1000))
-MOVED_STAGES: Final = (
-    (0, 10),
-    (10, 50),
-    (100, 110),
-    (110, 150),
-)  # new to the world, and moved
+# New to the world, and after all that is slow has moved.
+MOVED_STAGES: Final = ((0, 10), (10, 50), (100, 110), (110, 150))
 NEW_STAGES: Final = ((0, 5), (0, 20))
 # What is slow on the map where the robot learned, and on those that are new to it.
 PRIORS: Final = (("clearance", "clearance"), ("discs", "discs"), ("clearance", "discs"))
 NEW_MAPS: Final = ("warehouse", "blobs", "halls")
-EXPERIENCE, SHORTEST, HELD_OUT_SET = "experience", "shortest path", "Held-out worlds"
+EXPERIENCE: Final = "experience"
+SHORTEST: Final = "shortest path"
+HELD_OUT_SET: Final = "Held-out worlds"
 DRAWN: Final = (EXPERIENCE, SHORTEST, "Gaussian process", "Markov field")
 SMOOTHED: Final = 10  # missions that a point of the curve averages
-DOOR_WAITS, DOOR_DRIVES = (10, 30, 60), 40
-ZONE_NOISES, ZONE_RATES, ZONE_WIDTHS = (0.02, 0.035, 0.05), (10, 50), (0.2, 0.35, 0.5)
+DOOR_WAITS: Final = (10, 30, 60)  # seconds
+DOOR_DRIVES: Final = 40
+ZONE_NOISES: Final = (0.02, 0.035, 0.05)  # metres
+ZONE_RATES: Final = (10, 50)  # poses per second
+ZONE_WIDTHS: Final = (0.2, 0.35, 0.5)  # metres, of the robot
+ZONE_DRIVES: Final = 10
 
 
 def compared(options: Options) -> Sections:
@@ -66,32 +68,30 @@ def compared(options: Options) -> Sections:
     sections = {}
     for title, kinds in options.sets.items():
         results = _runs(kinds, tuple(LEARNERS), options)
-        rows, of_kinds = [], {kind: [_short(kind)] for kind in kinds}
-        of_learners = _by(results, "learner")
-        for learner, own in of_learners.items():
-            over = {}
-            for kind, of_kind in _by(own, "kind").items():
-                over[kind] = np.mean(
-                    [result.over_shortest(0, 20) for result in of_kind]
-                )
-                of_kinds[kind].append(
-                    ", ".join(f"{value:.1f}" for value in _above(of_kind))
-                )
-            worst = max(over, key=lambda kind: over[kind])
-            beyond = f"{100 * over[worst] - 100:+.1f} % ({_short(worst)})"
-            rows.append([learner, *_percent(_above(own)), beyond])
-        header = (
-            f"missions | {_names(STAGES)} | worst kind over the shortest path, 1 to 20"
-        )
-        sections[title] = table(header, rows)
+        results_by_learner = _by(results, "learner")
+        rows = []
+        rows_by_kind = {kind: [_short(kind)] for kind in kinds}
+        for learner, results_of_learner in results_by_learner.items():
+            over_shortest = {}
+            for kind, results_of_kind in _by(results_of_learner, "kind").items():
+                ratios = [result.over_shortest(0, 20) for result in results_of_kind]
+                over_shortest[kind] = np.mean(ratios)
+                percentages = [f"{value:.1f}" for value in _above(results_of_kind)]
+                rows_by_kind[kind].append(", ".join(percentages))
+            worst = max(over_shortest, key=over_shortest.__getitem__)
+            excess = 100 * over_shortest[worst] - 100
+            cells = _percent(_above(results_of_learner))
+            rows.append([learner, *cells, f"{excess:+.1f} % ({_short(worst)})"])
+        columns = "worst kind over the shortest path, 1 to 20"
+        sections[title] = table(f"missions | {_names(STAGES)} | {columns}", rows)
         header = " | ".join(["kind", *LEARNERS])
-        sections[f"{title}, by kind"] = table(header, [*of_kinds.values()])
+        sections[f"{title}, by kind"] = table(header, [*rows_by_kind.values()])
         if title == HELD_OUT_SET:
-            drawn = {name: of_learners[name] for name in DRAWN}
-            sections["From mission to mission"] = _curve(
-                options.out / "curve.png", drawn
-            )
-            sections["Expected times"] = _forecasts(of_learners[EXPERIENCE])
+            drawn = {name: results_by_learner[name] for name in DRAWN}
+            curve = _curve(options.out / "curve.png", drawn)
+            sections["From mission to mission"] = curve
+            forecasts = _forecasts(results_by_learner[EXPERIENCE])
+            sections["Expected times"] = forecasts
     return sections
 
 
@@ -122,18 +122,21 @@ def priors(options: Options) -> Sections:
     rows = []
     for source, hidden in PRIORS[: 1 if options.quick else None]:
         kinds = [f"{name}-{hidden}" for name in (*NEW_MAPS, *options.maps_found)]
-        without, own = (
+        untaught, taught = (
             _runs(kinds, (EXPERIENCE,), options, missions=20, prior_from=prior_from)
             for prior_from in ("", f"rooms-{source}")
         )
-        cells = _percent(_above(own, NEW_STAGES))
-        for number, (first, end) in enumerate(NEW_STAGES[: len(cells)]):
-            pairs = zip(own, without, strict=True)
-            more = [100 * (a.ratio(first, end) - b.ratio(first, end)) for a, b in pairs]
-            error = np.std(more) / math.sqrt(len(more))
-            cells[number] += f" ({np.mean(more):+.1f} ± {error:.1f})"
+        cells = []
+        percentages = _percent(_above(taught, NEW_STAGES))
+        for percentage, (first, end) in zip(percentages, NEW_STAGES, strict=False):
+            differences = [
+                100 * (with_prior.ratio(first, end) - without_prior.ratio(first, end))
+                for with_prior, without_prior in zip(taught, untaught, strict=True)
+            ]
+            error = np.std(differences) / math.sqrt(len(differences))
+            cells.append(f"{percentage} ({np.mean(differences):+.1f} ± {error:.1f})")
         title = f"{source}, then {hidden}"
-        rows.append([title, "without", *_percent(_above(without, NEW_STAGES))])
+        rows.append([title, "without", *_percent(_above(untaught, NEW_STAGES))])
         rows.append([title, "with", *cells])
     return {"A map never driven": table(f"worlds | prior | {_names(NEW_STAGES)}", rows)}
 
@@ -145,19 +148,23 @@ def doors(options: Options) -> Sections:
     """
     occupancy = np.zeros((40, 40), dtype=np.bool_)
     occupancy[20] = True
-    occupancy[20, 10:13] = occupancy[20, 24:27] = False
-    ends, rows = [(11, 8), (11, 32)], []
+    occupancy[20, 10:13] = False
+    occupancy[20, 24:27] = False
+    stations = [(11, 8), (11, 32)]
+    rows = []
     for seconds in DOOR_WAITS:
         waits = np.zeros(occupancy.shape)
         waits[20, 10:13] = seconds
-        world = World(GridMap(occupancy, 0.25), np.ones(waits.shape), [], ends, waits)
-        through = []
+        always = np.ones(occupancy.shape)
+        world = World(GridMap(occupancy, 0.25), always, [], stations, waits)
+        passages = []  # of each seed
         for seed in range(options.seeds):
             job = Job("doors", seed, EXPERIENCE, DOOR_DRIVES, options.exploration)
             result = run_in(job, world, Experience(SPEED))
             # The shortest path leads through it, and the detour takes less time.
-            through.append(np.count_nonzero(result.seconds > result.shortest - 1e-6))
-        rows.append([f"{seconds} s", f"{np.mean(through):.1f}", max(through)])
+            is_through = result.seconds > result.shortest - 1e-6
+            passages.append(np.count_nonzero(is_through))
+        rows.append([f"{seconds} s", f"{np.mean(passages):.1f}", max(passages)])
     return {"Doors": table(f"wait | drives through it, of {DOOR_DRIVES} | most", rows)}
 
 
@@ -166,32 +173,26 @@ def zones(_: Options) -> Sections:
 
     The poses are of several kinds.
     """
-    grid, always = GridMap(np.zeros((20, 80), dtype=np.bool_), 0.25), np.ones((20, 80))
+    grid = GridMap(np.zeros((20, 80), dtype=np.bool_), 0.25)
+    always = np.ones((20, 80))
     always[:, 32:48] = 4
     path = [(x, 10) for x in range(2, 78)]
-    world, rows = World(grid, always, [], [path[0], path[-1]]), []
+    world = World(grid, always, [], [path[0], path[-1]])
+    rows = []
     for noise, rate in itertools.product(ZONE_NOISES, ZONE_RATES):
         learned = []
         for width in ZONE_WIDTHS:
-            experience, random, clock = (
-                Experience(SPEED, width),
-                np.random.default_rng(0),
-                0.0,
-            )
-            for number in range(10):
-                measured = drive(
-                    path[:: 1 - 2 * (number % 2)], world, clock, random, noise, rate
-                )
+            experience = Experience(SPEED, width)
+            random = np.random.default_rng(0)
+            clock = 0.0
+            for number in range(ZONE_DRIVES):
+                route = path if number % 2 == 0 else path[::-1]
+                measured = drive(route, world, clock, random, noise, rate)
                 experience.record(measured.seconds, measured.positions)
                 clock += measured.duration
-            learned.append(experience.slowness(grid)[10, 36:44].mean())
-        rows.append(
-            [
-                f"{100 * noise:g} cm",
-                f"{rate} Hz",
-                *(f"{value:.2f}" for value in learned),
-            ]
-        )
+            slowness = experience.slowness(grid)[10, 36:44].mean()
+            learned.append(f"{slowness:.2f}")
+        rows.append([f"{100 * noise:g} cm", f"{rate} Hz", *learned])
     widths = " | ".join(f"robot_width {width}" for width in ZONE_WIDTHS)
     return {"A zone of slowness 4.0": table(f"noise of poses | rate | {widths}", rows)}
 
@@ -205,33 +206,35 @@ def speed(_: Options) -> Sections:
     grid = GridMap(generate_map("office", (1000, 1000), random), 0.05)
     world = worlds.make_world(grid, "mixture", random)
     requests = random_requests(world.grid.occupancy, RULE, 6, random)
-    goal, experience, clock = requests[0][1], Experience(SPEED), 0.0
+    goal = requests[0][1]
+    experience = Experience(SPEED)
+    clock = 0.0
     times = []
     for number in range(25):
-        cells = (
-            planner().plan(experience.apply(grid), requests[number % 6][0], goal).cells
-        )
+        start = requests[number % 6][0]
+        cells = planner().plan(experience.apply(grid), start, goal).cells
         measured = drive(cells[:1001], world, clock, random)
-        some = np.linspace(0, len(measured.seconds) - 1, 1000).astype(np.int64)
+        rows_of_poses = np.linspace(0, len(measured.seconds) - 1, 1000)
+        poses = rows_of_poses.astype(np.int64)
         clock += measured.duration
-        began = [time.thread_time()]
-        experience.record(measured.seconds[some], measured.positions[some])
-        began.append(time.thread_time())
-        applied = experience.apply(grid)
-        began.append(time.thread_time())
-        planner().plan(applied, cells[: len(cells) // 2 + 1][-1], goal)
-        began.append(time.thread_time())
-        steps = 1e3 * np.diff(began)
+        middle = cells[: len(cells) // 2 + 1][-1]
+        moments = [time.thread_time()]
+        experience.record(measured.seconds[poses], measured.positions[poses])
+        moments.append(time.thread_time())
+        learned_map = experience.apply(grid)
+        moments.append(time.thread_time())
+        planner().plan(learned_map, middle, goal)
+        moments.append(time.thread_time())
+        steps = 1e3 * np.diff(moments)
         times.append([*steps, steps.sum()])
-    columns = zip(
-        ("record", "apply", "plan again", "all"), np.array(times[5:]).T, strict=True
-    )
-    rows = [[name, f"{np.median(ms):.1f}", f"{ms.max():.1f}"] for name, ms in columns]
-    return {
-        "Speed": table(
-            "1,000 poses on 1000 x 1000 cells | median [ms] | worst [ms]", rows
-        )
-    }
+    columns = np.array(times[5:]).T
+    names = ("record", "apply", "plan again", "all")
+    rows = [
+        [name, f"{np.median(milliseconds):.1f}", f"{milliseconds.max():.1f}"]
+        for name, milliseconds in zip(names, columns, strict=True)
+    ]
+    header = "1,000 poses on 1000 x 1000 cells | median [ms] | worst [ms]"
+    return {"Speed": table(header, rows)}
 
 
 FIGURES: Final[dict[str, Callable[[Options], Sections]]] = {

@@ -37,16 +37,35 @@ NOT_SOURCE = (
 )
 # Their tests take long, and share nothing.
 ANY_WORKER = {"test_cli.py", "test_demo.py", "test_plan_command.py"}
+# The files that take longest come first: so the workers end at the same time.
+LONGEST_FILES = (
+    "test_poses.py",
+    "test_update.py",
+    "test_field.py",
+    "test_package.py",
+    "test_imports.py",
+    "test_trainer_node.py",
+    "test_trainer.py",
+    "test_claims_of_poses.py",
+    "test_lifecycle.py",
+    "test_paths.py",
+    "test_driving.py",
+    "test_evidence.py",
+    "test_planner_robot.py",
+    "test_planner.py",
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the slow tests last, the longest of them first: so the workers end at the
-    same time.
-    """
+    """Put the files that take longest first; in each file, the slow tests last."""
 
-    def order(item: pytest.Item) -> tuple[bool, int]:
+    def order(item: pytest.Item) -> tuple[int, bool, int]:
+        rank = len(LONGEST_FILES)
+        if item.path.name in LONGEST_FILES:
+            rank = LONGEST_FILES.index(item.path.name)
         slow = item.get_closest_marker("slow")
-        return slow is not None, -slow.kwargs.get("seconds", 0) if slow else 0
+        seconds = slow.kwargs.get("seconds", 0) if slow else 0
+        return rank, slow is not None, -seconds
 
     items.sort(key=order)
 

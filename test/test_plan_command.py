@@ -4,6 +4,7 @@ import csv
 import json
 import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ from PIL import Image
 
 from ddqn_planner import Planner, inflate, pictures
 from ddqn_planner.grid import MapFile
+from ddqn_planner.model import robot_network
+from ddqn_planner.robot import footprint
 from ddqn_planner.robot.footprint import placed
 
 
@@ -132,6 +135,22 @@ def test_missing_matplotlib_is_named(
     assert said.endswith("; pip install matplotlib\n")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def swept_once() -> Iterator[None]:
+    """Each load of a body computes what it sweeps, for half a second: here only one."""
+    known: dict[bytes, Any] = {}
+
+    def swept_cells(corners: Any, motions: Any) -> Any:
+        key = b"".join(array.tobytes() for array in (corners, *motions.poses))
+        if key not in known:
+            known[key] = footprint.swept_cells(corners, motions)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(robot_network, "swept_cells", swept_cells)
+        yield
+
+
 @pytest.fixture
 def rooms(tmp_path: Path) -> tuple[MapFile, str]:
     """Two rooms of 3 x 3.5 m and a door of 1 m between them, and the map's file."""
@@ -166,6 +185,9 @@ def test_plan_drives_a_body_as_the_library_and_without_a_collision(
 ) -> None:
     map_file, path = rooms
     file, seen = tmp_path / "poses.csv", set()
+    car = Planner.load("car")
+    assert car.pose_planner is not None
+    body = str(car.pose_planner.footprint.tolist())
     for options, (rules, weight, ends, asked) in BODY_ASKED.items():
         grid = inflate(map_file.grid(**rules), 0, weight)
         cells = ends.get("start", (15, 25)), ends.get("goal", (112, 40))
@@ -173,9 +195,7 @@ def test_plan_drives_a_body_as_the_library_and_without_a_collision(
             (*grid.cell_to_world(cell), yaw)
             for cell, yaw in zip(cells, ends.get("yaws", (0, 0)), strict=True)
         )
-        planner = Planner.load("car")
-        assert planner.pose_planner is not None
-        body = str(planner.pose_planner.footprint.tolist())
+        planner = Planner(car.network, car.metadata)  # it knows no map yet
         plan = planner.plan_poses(grid, start, goal, **{"bound": 1.0, **asked})
         given, status = [path, "--csv", file, *options.split()], 0 if plan.cells else 1
         answer = json.loads(
