@@ -88,7 +88,9 @@ class Driver:
 
     def drive(self, goal: Cell) -> Mission:
         """Drive to a station, and wait until the planner knows what that taught."""
-        grid, slowness, began = self.world.grid, self.known_slowness(), self.now()
+        grid = self.world.grid
+        slowness = self.known_slowness()
+        began = self.now()
         self.plans.clear()
         self.drives.clear()
         stamped = pose(grid, goal)
@@ -98,28 +100,36 @@ class Driver:
             "plan", self.plans, lambda plan: cells_of(grid, plan)[-1:] == [goal]
         )
         self.wait(
-            "odometry at the goal", self.odometry, lambda at: _is_at(at.pose, stamped)
+            "odometry at the goal",
+            self.odometry,
+            lambda message: _is_at(message.pose, stamped),
         )
         # Other drives end on the way: one that is long, or if the trainer hears the
         # goal late.
         self.wait("drive", self.drives, lambda path: _is_at(path.poses[-1], stamped, 2))
         measured = self.now() - began
         time.sleep(0.3)  # the planner loads it
-        learned, truth = cells_of(grid, path), self.world.slowness(began)
-        shortest, best = self.world.routes(
-            self.planner, learned[0], goal, began
-        ).values()
-        routes = {"shortest": shortest, "learned": learned, "best possible": best}
-        seconds = {
-            name: path_seconds(of, self.world, began) for name, of in routes.items()
+        learned = cells_of(grid, path)
+        routes = self.world.routes(self.planner, learned[0], goal, began)
+        routes = {
+            "shortest": routes["shortest"],
+            "learned": learned,
+            "best possible": routes["best possible"],
         }
+        seconds = {
+            name: path_seconds(cells, self.world, began)
+            for name, cells in routes.items()
+        }
+        truth = self.world.slowness(began)
         return Mission(routes, seconds, measured, truth, slowness)
 
 
 def _is_at(stamped: Any, goal: PoseStamped, factor: float = 1) -> bool:
     """Return whether a pose is so near to the goal that the robot has arrived."""
-    at, there = stamped.pose.position, goal.pose.position
-    return math.dist((at.x, at.y), (there.x, there.y)) <= factor * ARRIVAL_DISTANCE
+    position = stamped.pose.position
+    goal_position = goal.pose.position
+    metres = math.hypot(position.x - goal_position.x, position.y - goal_position.y)
+    return metres <= factor * ARRIVAL_DISTANCE
 
 
 def save_pictures(world: World, missions: Sequence[Mission]) -> None:
@@ -130,16 +140,14 @@ def save_pictures(world: World, missions: Sequence[Mission]) -> None:
     width = min(MEAN_OF, len(missions))
     best = min(
         missions[-width:],
-        key=lambda each: each.ratio("learned") - each.ratio("shortest"),
+        key=lambda mission: mission.ratio("learned") - mission.ratio("shortest"),
     )
     frames = []
     for number, mission in enumerate(missions, start=1):
+        learned = {"learned": mission.routes["learned"]}
         panels = {
             "what nobody told the robot": (mission.truth, mission.routes),
-            "what it has learned": (
-                mission.slowness,
-                {"learned": mission.routes["learned"]},
-            ),
+            "what it has learned": (mission.slowness, learned),
         }
         figure: Any = draw_slowness(world.grid, world.stations, panels, (8.4, 4.7))
         ratio = mission.ratio("learned")
@@ -150,12 +158,11 @@ def save_pictures(world: World, missions: Sequence[Mission]) -> None:
             frames[-1].save("demo_driving.png")
     save_film("demo_driving.gif", frames, 450)
     seconds = {
-        name: [np.array([each.seconds[name] for each in missions])]
+        name: [np.array([mission.seconds[name] for mission in missions])]
         for name in ROUTE_STYLES
     }
-    curve, _ = draw_times(
-        seconds, seconds.pop("best possible"), width, banded="learned"
-    )
+    best_seconds = seconds.pop("best possible")
+    curve, _ = draw_times(seconds, best_seconds, width, banded="learned")
     curve.savefig("demo_driving_curve.png", dpi=110)
 
 

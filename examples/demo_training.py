@@ -6,7 +6,6 @@ The number of steps is an argument, 50,000 by default.
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -33,10 +32,11 @@ def draw(
     steps: int,
 ) -> tuple[Image.Image, float]:
     """Draw the last episode and the policy; return the share of solved starts."""
-    grid, field = scenario.grid, planner.q_field(scenario.grid, scenario.goal)
-    ratios = length_ratios(field, grid, scenario.move_rule)
+    field = planner.q_field(scenario.grid, scenario.goal)
+    ratios = length_ratios(field, scenario.grid, scenario.move_rule)
     solved = np.where(np.isnan(ratios), np.nan, np.isfinite(ratios))
-    share, step = float(np.nanmean(solved)), planner.metadata.steps
+    share = float(np.nanmean(solved))
+    step = planner.metadata.steps
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.6, 4.8), layout="constrained")
     left.imshow(solved, origin="lower", cmap="RdYlGn", vmin=-0.6, vmax=1.6, alpha=0.6)
     draw_map(left, scenario, f"step {step:,}: {share:.0%} of the cells lead to the end")
@@ -45,9 +45,8 @@ def draw(
     draw_path(left, field.rollout(scenario.start).cells, 0, "the path it would take")
     right.plot(*np.transpose([*curve, (step, share)]), color=COLOURS[2], linewidth=2)
     right.set(xlim=(0, steps), ylim=(0, 1.03), xlabel="environment steps")
-    right.set_title(
-        "share of the starts from which the robot reaches the end", fontsize=10
-    )
+    title = "share of the starts from which the robot reaches the end"
+    right.set_title(title, fontsize=10)
     right.grid(alpha=0.3)
     return frame_of(figure), share
 
@@ -55,26 +54,24 @@ def draw(
 def main(arguments: Sequence[str]) -> int:
     """Train, print how well, and save the film."""
     steps = int(arguments[0]) if arguments else HyperParameters().steps
-    scenario, parameters = (
-        paper_scenario(),
-        HyperParameters(learning_rate=0.001, steps=steps),
-    )
+    scenario = paper_scenario()
+    parameters = HyperParameters(learning_rate=0.001, steps=steps)
     trainer = Trainer([scenario], parameters, seed=0)
-    interval, curve = max(1, steps // FRAMES), list[tuple[int, float]]()
-    frames, episodes = list[Image.Image](), list[Any]()
+    interval = max(1, steps // FRAMES)
+    curve: list[tuple[int, float]] = []
+    frames: list[Image.Image] = []
+    episodes: list[Sequence[Cell]] = []
     for ended in trainer.run(steps, interval):
-        # What it does from the given start, in the dead end.
-        episodes += [
-            episode.cells for episode in ended if episode.cells[0] == scenario.start
-        ]
+        for episode in ended:
+            # What it does from the given start, in the dead end.
+            if episode.cells[0] == scenario.start:
+                episodes.append(episode.cells)
         if trainer.steps // interval > len(curve):
             frame, share = draw(scenario, trainer.planner(), episodes, curve, steps)
             curve.append((trainer.steps, share))
             frames.append(frame)
-            print(
-                f"step {trainer.steps:6,}: {share:4.0%} of the starts are solved",
-                flush=True,
-            )
+            print(f"step {trainer.steps:6,}: {share:4.0%} of the starts are solved")
+            sys.stdout.flush()
             episodes.clear()
     save_film("demo_training.gif", frames, 200)
     print("saved demo_training.gif")

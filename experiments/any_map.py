@@ -141,7 +141,7 @@ def move_errors(planner: Planner) -> tuple[int, float]:
 
 def _of_centres(value_AHW: NDArray[Any]) -> NDArray[Any]:
     """Return the values of the centres of a map's patches: (B, A)."""
-    return value_AHW[:, 1::3, 1::3].reshape(8, -1).T
+    return np.array(value_AHW[:, 1::3, 1::3].reshape(8, -1).T)
 
 
 def _held_out(planner: Planner, with_costs: bool) -> tuple[int, int, float]:

@@ -21,6 +21,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from processes import memory
 from random_maps import KINDS, generate_map
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
@@ -421,18 +422,18 @@ def speed(options: argparse.Namespace) -> Iterator[list[Any]]:
 
 def figures_of(speeds: list[Speed]) -> list[float]:
     """Return the figures of a row of the table of speed."""
-    columns = Speed(*np.array(speeds).T)
-    ratio = columns.repair / columns.new
+    first, following, repair, new, bound, megabytes = np.array(speeds).T
+    ratio = repair / new
     return [
-        columns.first.mean(),
-        columns.first.max(),
-        np.median(columns.next),
-        np.median(columns.repair),
-        np.median(columns.new),
-        np.median(ratio),
+        first.mean(),
+        first.max(),
+        float(np.median(following)),
+        float(np.median(repair)),
+        float(np.median(new)),
+        float(np.median(ratio)),
         ratio.max(),
-        columns.bound.mean(),
-        columns.megabytes.max(),
+        bound.mean(),
+        megabytes.max(),
     ]
 
 
@@ -445,11 +446,11 @@ def drive(
     planner.plan_poses(grid, start, start)
     other_planner.plan_poses(grid, start, start)
     gc.collect()
-    former_memory = resident()
+    former_memory = memory(os.getpid())
     first, plan = timed(planner, grid, start, goal, bound)
-    memory = resident() - former_memory
+    megabytes = memory(os.getpid()) - former_memory
     if not plan.poses.size:
-        return Speed(first, 0, 1, 1, 1, memory)
+        return Speed(first, 0, 1, 1, 1, megabytes)
     times = [
         timed(planner, grid, tuple(pose), goal, bound)[0] for pose in plan.poses[1:12]
     ]
@@ -461,7 +462,7 @@ def drive(
     changed = grid.with_patch(np.ones((8, 8), np.bool_), x - 4, y - 4)
     repair, _ = timed(planner, changed, start, goal, bound)
     new, _ = timed(other_planner, changed, start, goal, bound)
-    return Speed(first, float(np.median(times)), repair, new, plan.bound, memory)
+    return Speed(first, float(np.median(times)), repair, new, plan.bound, megabytes)
 
 
 def timed(
@@ -471,12 +472,6 @@ def timed(
     began = time.process_time()
     plan = planner.plan_poses(grid, start, goal, bound=bound)
     return 1e3 * (time.process_time() - began), plan
-
-
-def resident() -> float:
-    """Return the memory of this process in MB."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGESIZE") / 1e6
 
 
 def blocks(share: float, seed: int) -> GridMap:

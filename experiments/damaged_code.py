@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -76,6 +77,17 @@ def plan(folder: Path, python: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+def damage_files(
+    folder: Path, suffix: str, name: str, random: np.random.Generator
+) -> None:
+    """Damage all files with a suffix in a folder; a name of `DAMAGES`, or a folder."""
+    for path in sorted(folder.rglob(f"*{suffix}")):
+        if name == "a folder":
+            make_folder(path)
+        else:
+            path.write_bytes(DAMAGES[name](path.read_bytes(), random))
+
+
 def main(arguments: Sequence[str]) -> int:
     """Damage the files; return 1 if a plan or a warning was wrong.
 
@@ -83,31 +95,28 @@ def main(arguments: Sequence[str]) -> int:
     """
     python = arguments[0] if arguments else sys.executable
     random = np.random.default_rng(0)
-    rows, n_wrong = [], 0
+    rows = []
+    is_wrong = False
     with tempfile.TemporaryDirectory() as name:
-        intact, folder = Path(name, "intact"), Path(name, "code")
+        intact = Path(name, "intact")
+        folder = Path(name, "code")
         first = plan(intact, python)
         if first.returncode or not first.stdout:
             raise RuntimeError(f"no plan with an empty folder: {first.stderr}")
-        for suffix in (".nbi", ".nbc"):
-            for damage in (*DAMAGES, "a folder"):
-                shutil.rmtree(folder, ignore_errors=True)
-                shutil.copytree(intact, folder)
-                for path in sorted(folder.rglob(f"*{suffix}")):
-                    if damage == "a folder":
-                        make_folder(path)
-                    else:
-                        path.write_bytes(DAMAGES[damage](path.read_bytes(), random))
-                runs = [plan(folder, python) for _ in range(2)]
-                are_right = [
-                    run.returncode == 0 and run.stdout == first.stdout for run in runs
-                ]
-                n_warnings = [run.stderr.count(WARNING) for run in runs]
-                n_wrong += not all(are_right) or n_warnings != [1, 0]
-                rows.append([suffix, damage, *are_right, *n_warnings])
+        for suffix, damage in product((".nbi", ".nbc"), (*DAMAGES, "a folder")):
+            shutil.rmtree(folder, ignore_errors=True)
+            shutil.copytree(intact, folder)
+            damage_files(folder, suffix, damage, random)
+            runs = [plan(folder, python) for _ in range(2)]
+            are_right = [
+                run.returncode == 0 and run.stdout == first.stdout for run in runs
+            ]
+            warnings = [run.stderr.count(WARNING) for run in runs]
+            is_wrong |= not all(are_right) or warnings != [1, 0]
+            rows.append([suffix, damage, *are_right, *warnings])
     words = "plans are right | and with the next start | warnings | with the next start"
     print(table(f"files | damage | {words}", rows))
-    return int(n_wrong > 0)
+    return int(is_wrong)
 
 
 if __name__ == "__main__":

@@ -109,13 +109,16 @@ def draw_times(
 ) -> tuple[Any, Any]:
     """Draw times over the best, means of `width` missions.
 
-    The curves of several seeds with one name become a median and a band.
+    `seconds` has by a learner's name, as `best`, an array (missions,) of each world.
+    The curve of the learner `banded` gets a band, the others are medians.
     """
-    window, curves = np.ones(width), dict[str, Sequence[Array]]()
-    least = [np.convolve(of_world, window, "valid") for of_world in best]
-    for name, of_worlds in seconds.items():
-        sums = [np.convolve(of_world, window, "valid") for of_world in of_worlds]
-        ratios = [of_world / b for of_world, b in zip(sums, least, strict=True)]
+    window = np.ones(width)
+    best_sums = [np.convolve(world, window, "valid") for world in best]
+    curves = dict[str, Sequence[Array]]()
+    for name, worlds in seconds.items():
+        ratios = []
+        for world, best_sum in zip(worlds, best_sums, strict=True):
+            ratios.append(np.convolve(world, window, "valid") / best_sum)
         curves[name] = ratios if name == banded else [np.median(ratios, axis=0)]
     figure, axes = plt.subplots(figsize=(7.2, 3.6), layout="constrained")
     missions = np.arange(len(curves[banded][0])) + width

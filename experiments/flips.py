@@ -122,8 +122,8 @@ def _costmap(occupancy: Occupancy, robot: Cell, goal: Cell, noise: Random) -> Gr
     is_in_sight = np.hypot(x - robot[0], y - robot[1]) <= SIGHT
     flickers = noise.random(occupancy.shape) < share
     seen = occupancy | (flickers & is_in_sight)
-    for x, y in (robot, goal):
-        seen[y, x] = False
+    for column, row in (robot, goal):
+        seen[row, column] = False
     return GridMap(seen, cost=inflated_costs(seen, INFLATION))
 
 

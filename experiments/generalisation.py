@@ -178,8 +178,32 @@ def _scenario_map(
 
     Short and long paths are drawn alike.
     """
-    random, rule = settings.random(path.stem), settings.move_rule
+    random = settings.random(path.stem)
+    rule = settings.move_rule
     grid = settings.grid(read_map_file(path).grid().occupancy, random)
+    lines = _scenario_lines(scenario)
+    lines = lines[lines[:, -1].argsort(kind="stable")]  # by the optimal length
+    # One from each of as many equal parts as requests.
+    count = min(settings.requests, len(lines))
+    edges = np.arange(count + 1) * len(lines) // count
+    drawn = lines[random.integers(edges[:-1], edges[1:])]
+    ends = drawn[:, 2:-1].astype(np.int64).tolist()
+    requests = [((x, y), (goal_x, goal_y)) for x, y, goal_x, goal_y in ends]
+    labels = grid.labels(rule)
+    for start, goal in requests:
+        are_free = grid.is_free(start) and grid.is_free(goal)
+        if not are_free or labels[start[::-1]] != labels[goal[::-1]]:
+            raise ValueError(
+                f"{scenario}: no path joins {start} and {goal} on this map"
+            )
+    optima = None
+    if rule is MoveRule.ROBOT_SAFE and grid.cost is None:  # as in the file
+        optima = drawn[:, -1].tolist()
+    return BenchmarkMap(f"movingai {path.stem}", str(path), grid, requests, optima)
+
+
+def _scenario_lines(scenario: Path) -> NDArray[np.float64]:
+    """Return the last seven numbers of each line of a scenario file: (N, 7)."""
     try:
         lines = np.loadtxt(scenario, usecols=range(-7, 0), comments="version", ndmin=2)
     except ValueError as error:
@@ -190,23 +214,7 @@ def _scenario_map(
         raise ValueError(f"{scenario}: {error}; {words}") from None
     if not len(lines):
         raise ValueError(f"{scenario}: has no requests; give a file with some")
-    lines = lines[lines[:, -1].argsort(kind="stable")]
-    # One from each of as many equal parts as requests.
-    count = min(settings.requests, len(lines))
-    edges = np.arange(count + 1) * len(lines) // count
-    drawn = lines[random.integers(edges[:-1], edges[1:])]
-    ends = drawn[:, 2:-1].astype(np.int64).tolist()
-    requests = [((x, y), (goal_x, goal_y)) for x, y, goal_x, goal_y in ends]
-    labels = grid.labels(rule)
-    for start, goal in requests:
-        both_free = grid.is_free(start) and grid.is_free(goal)
-        if not both_free or labels[start[::-1]] != labels[goal[::-1]]:
-            raise ValueError(
-                f"{scenario}: no path joins {start} and {goal} on this map"
-            )
-    known = rule is MoveRule.ROBOT_SAFE and grid.cost is None
-    optima = drawn[:, -1].tolist() if known else None
-    return BenchmarkMap(f"movingai {path.stem}", str(path), grid, requests, optima)
+    return lines
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Goal iii (section 5.3, Fig. 9): new obstacles, most of them never trained on."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -22,6 +22,7 @@ from trainings import (
     rollouts,
 )
 
+from ddqn_planner import Planner
 from ddqn_planner.files import write_atomically
 from ddqn_planner.grid import (
     LENGTHS,
@@ -94,16 +95,62 @@ def networks(settings: Settings) -> dict[str, tuple[str, HyperParameters]]:
     return {**found, "propagation": ("propagation", PROFILES["propagation"])}
 
 
+def _rows(settings: Settings, noise: str) -> Iterator[list[object]]:
+    """Yield the row of each planner on the maps with a kind of noise."""
+    training, test = drawn_maps(settings, noise)
+    maps = GridVectorEnvironment([*training, *test], PAPER)
+    lengths = {}  # of each planner: (seeds, maps), NaN where it is trapped
+    for label, (folder, parameters) in networks(settings).items():
+        name = f"{noise}/{folder}"
+        lengths[label] = _lengths(settings.planners(name, KEPT), maps)
+        # Obstacles on the path alone can be avoided by one fixed path.
+        if parameters.network == "paper" and noise == "near_path":
+            supervised = f"{name}/supervised"
+            updates = replace(parameters, steps=SUPERVISED_UPDATES)
+            jobs = settings.trainings({supervised: updates}, training)
+            in_parallel(train_supervised, jobs, settings.backend)
+            planners = settings.planners(supervised)
+            lengths[f"{label}, supervised"] = _lengths(planners, maps)
+    path = fixed_path(training)
+    is_free = [all(map(scenario.grid.is_free, path)) for scenario in maps.scenarios]
+    lengths["one fixed path"] = np.where([is_free], path_length(path), np.nan)
+    optimum = np.array([_optimum(scenario) for scenario in test])
+    for label, lengths_of_seeds in lengths.items():
+        solved = np.isfinite(lengths_of_seeds)
+        counts = [
+            median_and_range(part.sum(axis=1).tolist())
+            for part in np.split(solved, [len(training)], axis=1)
+        ]
+        test_ratios = lengths_of_seeds[:, len(training) :] / optimum
+        ratios = [ratio[np.isfinite(ratio)] for ratio in test_ratios]
+        yield [noise, label, *counts, mean_and_worst(ratios)[0]]
+
+
+def _lengths(
+    planners: Sequence[Planner], maps: GridVectorEnvironment
+) -> NDArray[np.float64]:
+    """Return the length of each seed's rollout on each map: (seeds, maps)."""
+    return np.array([rollouts(planner, maps)[0] for planner in planners])
+
+
+def _optimum(scenario: Scenario) -> float:
+    """Return the length of the shortest path of a map."""
+    distances = shortest_distances(scenario.grid, scenario.goal, MOVE_RULE)
+    x, y = SCENARIO.start
+    return float(distances[y, x])
+
+
 def trainings(settings: Settings) -> list[Training]:
     """Return the trainings of each network on the training maps of each noise."""
-    found = []
+    jobs = []
     for noise in settings.noise:
-        parameters_of = {
-            f"{noise}/{name}": p for name, p in networks(settings).values()
+        parameters = {
+            f"{noise}/{folder}": parameters
+            for folder, parameters in networks(settings).values()
         }
         maps, _ = drawn_maps(settings, noise)
-        found += settings.trainings(parameters_of, maps, EVALUATION_INTERVAL)
-    return found
+        jobs += settings.trainings(parameters, maps, EVALUATION_INTERVAL)
+    return jobs
 
 
 def train_supervised(training: Training) -> None:
@@ -150,13 +197,12 @@ def best_moves(scenario: Scenario) -> NDArray[np.bool_]:
     """
     occupancy = scenario.grid.occupancy
     distance = shortest_distances(scenario.grid, scenario.goal, MOVE_RULE).ravel()
-    onward_AC = (
-        np.append(distance, np.inf)[neighbours(occupancy.shape)] + LENGTHS[:, None]
-    )
+    next_cell_AC = neighbours(occupancy.shape)  # the last number is off the map
+    distance_of_next_AC = np.append(distance, np.inf)[next_cell_AC]
+    onward_AC = distance_of_next_AC + LENGTHS[:, None]
     legal_AC = legal_moves(occupancy, MOVE_RULE).reshape(len(LENGTHS), -1)
-    return np.array(
-        (legal_AC & np.isfinite(onward_AC) & (onward_AC <= distance + 1e-9)).T
-    )
+    is_shortest_AC = np.isfinite(onward_AC) & (onward_AC <= distance + 1e-9)
+    return np.array((legal_AC & is_shortest_AC).T)
 
 
 def fixed_path(maps: Sequence[Scenario]) -> tuple[Cell, ...]:
@@ -171,41 +217,8 @@ def fixed_path(maps: Sequence[Scenario]) -> tuple[Cell, ...]:
 
 def report(settings: Settings) -> str:
     """Return the table of goal iii, and write its figure."""
-    rows = []
-    for noise in settings.noise:
-        training, test = drawn_maps(settings, noise)
-        maps, lengths = GridVectorEnvironment([*training, *test], PAPER), {}
-        for label, (folder, parameters) in networks(settings).items():
-            name = f"{noise}/{folder}"
-            lengths[label] = np.array(
-                [rollouts(p, maps)[0] for p in settings.planners(name, KEPT)]
-            )
-            # Obstacles on the path alone can be avoided by one fixed path.
-            if parameters.network == "paper" and noise == "near_path":
-                taught = {
-                    f"{name}/supervised": replace(parameters, steps=SUPERVISED_UPDATES)
-                }
-                jobs = settings.trainings(taught, training)
-                in_parallel(train_supervised, jobs, settings.backend)
-                planners = settings.planners(*taught)
-                lengths[f"{label}, supervised"] = np.array(
-                    [rollouts(p, maps)[0] for p in planners]
-                )
-        path = fixed_path(training)
-        is_free = [all(map(scenario.grid.is_free, path)) for scenario in maps.scenarios]
-        lengths["one fixed path"] = np.where([is_free], path_length(path), np.nan)
-        distances = (shortest_distances(s.grid, s.goal, MOVE_RULE) for s in test)
-        optimum = np.array([d[SCENARIO.start[::-1]] for d in distances])
-        for label, of_seeds in lengths.items():
-            parts = np.split(np.isfinite(of_seeds), [len(training)], axis=1)
-            counts = [median_and_range(part.sum(axis=1).tolist()) for part in parts]
-            ratios = [
-                ratio[np.isfinite(ratio)]
-                for ratio in of_seeds[:, len(training) :] / optimum
-            ]
-            rows.append([noise, label, *counts, mean_and_worst(ratios)[0]])
-    drawn = table(COLUMNS, rows), _draw(settings)
-    return "\n\n".join(drawn)
+    rows = [row for noise in settings.noise for row in _rows(settings, noise)]
+    return f"{table(COLUMNS, rows)}\n\n{_draw(settings)}"
 
 
 def _draw(settings: Settings) -> str:

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import client as ros
 import numpy as np
@@ -26,12 +26,18 @@ from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.nodes.nav2 import QUEUES
 from ddqn_planner.nodes.quality import LATCHED
 
-REQUESTS, CLIENTS, CHANGES, GOALS_PER_MAP = 10_000, 8, 50, 40
-WARM_UP = (
-    0.3  # of the requests, in which the planner comes to keep as many fields as it may
-)
-GOALS, GOALS_PERIOD = 2000, 0.005
-SIZES, COUNTS, BURST_CLIENTS, BURSTS = (20, 400, 2000), (20, 50, 200), (1, 20), 30
+REQUESTS = 10_000
+CLIENTS = 8
+CHANGES = 50  # of the map
+GOALS_PER_MAP = 40
+WARM_UP = 0.3
+"""Share of the requests until the planner keeps as many fields as it may."""
+GOALS = 2000
+GOALS_PERIOD = 0.005  # seconds
+SIZES = (20, 400, 2000)  # cells of a side
+COUNTS = (20, 50, 200)  # requests of a burst
+BURST_CLIENTS = (1, 20)
+BURSTS = 30
 BURST_GOALS = 2  # as many as the fields of the greatest map that the planner keeps
 REACH = 30  # cells from start to goal along an axis at most: short answers come fast
 
@@ -41,52 +47,65 @@ def three_maps() -> list[ros.MapFixture]:
     return [*ros.shipped_maps().values(), ros.generated_map("rooms", 200)]
 
 
-def ask(seed: int, count: int, shared: SimpleNamespace) -> None:
-    """Ask for plans, and put a result of each answer into the queue.
+class Answer(NamedTuple):
+    """What came of one request."""
 
-    A result has milliseconds, the number of poses, and what is wrong.
-    """
+    milliseconds: float
+    poses: int
+    error: str  # "" if nothing is wrong
+
+
+def ask(seed: int, count: int, shared: SimpleNamespace) -> None:
+    """Ask for plans, and put an `Answer` of each into the queue."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # it ends with its parent
-    random, maps = np.random.default_rng(seed), three_maps()
-    asked = [fixture.requests(GOALS_PER_MAP, random) for fixture in maps]
+    random = np.random.default_rng(seed)
+    maps = three_maps()
+    requests = [fixture.requests(GOALS_PER_MAP, random) for fixture in maps]
     with ros.Client() as client:
-        client.call(
-            GetPlan, "planner/get_plan"
-        )  # not measured: it waits for the service
+        # Not measured: it waits for the service.
+        client.call(GetPlan, "planner/get_plan")
         shared.ready.wait(ros.TIMEOUT)
         for _ in range(count):
             first = shared.confirmed.value
-            current = first % len(maps)
-            one, other = (
-                asked[current][i] for i in random.integers(GOALS_PER_MAP, size=2)
+            requests_on_map = requests[first % len(maps)]
+            start_number, goal_number = random.integers(GOALS_PER_MAP, size=2)
+            request = GetPlan.Request(
+                start=requests_on_map[start_number].start,
+                goal=requests_on_map[goal_number].goal,
             )
-            request = GetPlan.Request(start=one.start, goal=other.goal)
             began = time.perf_counter()
             try:
-                plan, lost = client.get_plan(request.start, request.goal), ""
+                plan = client.get_plan(request.start, request.goal)
+                loss = ""
             except TimeoutError as error:
-                plan, lost = Path(), str(error)
+                plan = Path()
+                loss = str(error)
             milliseconds = 1e3 * (time.perf_counter() - began)
             # The maps that it had between request and answer, mostly one.
-            possible = {n % len(maps) for n in range(first, shared.published.value + 1)}
-            wrong = [lost or maps[number].error(request, plan) for number in possible]
-            said = f"on map {first} or later: {wrong[0]}" if all(wrong) else ""
-            shared.answers.put((milliseconds, len(plan.poses), said))
+            last = shared.published.value
+            possible = {number % len(maps) for number in range(first, last + 1)}
+            errors = [loss or maps[number].error(request, plan) for number in possible]
+            problem = f"on map {first} or later: {errors[0]}" if all(errors) else ""
+            shared.answers.put(Answer(milliseconds, len(plan.poses), problem))
 
 
 def load_requests(planner: int, requests: int, clients: int) -> bool:
     """Ask a planner while maps change; return whether it failed.
 
-    No other map was sent to the planner's process before.
+    `planner` is its process, to which no other map was sent before.
     """
-    context, maps = multiprocessing.get_context("spawn"), three_maps()
-    number = len(maps)
-    # Of the last map: its number where the planner is known to have it, and where it
-    # was published.
-    confirmed, published = context.Value("i", number), context.Value("i", number)
-    shared = SimpleNamespace(confirmed=confirmed, published=published)
-    shared.ready, shared.answers = context.Barrier(clients + 1), context.Queue()
-    answers: list[tuple[float, int, str]] = []
+    context = multiprocessing.get_context("spawn")
+    maps = three_maps()
+    number = len(maps)  # of the last map
+    shared = SimpleNamespace(
+        # The number of the last map that the planner is known to have.
+        confirmed=context.Value("i", number),
+        # The number of the last map that was published.
+        published=context.Value("i", number),
+        ready=context.Barrier(clients + 1),
+        answers=context.Queue(),
+    )
+    answers: list[Answer] = []
     with ros.Client() as client:
         diagnostics = client.subscribe(DiagnosticArray, "/diagnostics", keep=1)
 
@@ -105,15 +124,15 @@ def load_requests(planner: int, requests: int, clients: int) -> bool:
                 shared.published.value = number
                 send_map(number)
                 shared.confirmed.value = number
-            answers.append(
-                shared.answers.get(timeout=2 * ros.TIMEOUT)
-            )  # Empty if a process failed
+            # Raises Empty if a process failed.
+            answers.append(shared.answers.get(timeout=2 * ros.TIMEOUT))
             if len(answers) == math.ceil(WARM_UP * requests):
                 first_memory = memory(planner)
         last_memory = memory(planner)
-    milliseconds, poses, of_answers = zip(*answers, strict=True)
+    poses = [answer.poses for answer in answers]
+    milliseconds = [answer.milliseconds for answer in answers]
     median, slow = np.percentile(milliseconds, (50, 99))
-    errors = [error for error in of_answers if error]
+    errors = [answer.error for answer in answers if answer.error]
     print(
         *errors[:10],
         f"GetPlan: {requests} requests of {clients} processes, "
@@ -133,20 +152,26 @@ def load_goals(goals: int) -> bool:
 
     Return whether a plan for an older goal followed a plan for a newer one.
     """
-    office, random = ros.shipped_maps()["office"], np.random.default_rng(0)
-    grid, message = office.grid, office.message(2**20)
+    office = ros.shipped_maps()["office"]
+    grid = office.grid
+    message = office.message(2**20)
     # All free cells are joined.
-    cells = random.permutation(grid.free_cells())[: goals + 1].tolist()
-    from_start, *poses = (ros.pose(grid, (x, y)) for x, y in cells)
-    numbers = {
+    cells = np.random.default_rng(0).permutation(grid.free_cells())[: goals + 1]
+    start, *poses = (ros.pose(grid, (x, y)) for x, y in cells.tolist())
+    number_of_cell = {
         ros.cell_of(grid, stamped): number for number, stamped in enumerate(poses)
     }
+
+    def number_of(plan: Path) -> int:
+        """Return the number of the goal to which a plan leads."""
+        return number_of_cell[ros.cell_of(grid, plan.poses[-1])]
+
     with ros.Client() as client:
         diagnostics = client.subscribe(DiagnosticArray, "/diagnostics", keep=1)
         client.publish("map", message, LATCHED)
         ros.wait_for_map(diagnostics, message.header.stamp)
-        client.publish("initialpose", ros.initial_pose(from_start))
-        ros.wait_for("start", lambda: client.get_plan(PoseStamped(), from_start).poses)
+        client.publish("initialpose", ros.initial_pose(start))
+        ros.wait_for("start", lambda: client.get_plan(PoseStamped(), start).poses)
         plans = client.subscribe(Path, "plan", goals)
         ros.wait_for("publisher of plan", lambda: client.node.count_publishers("plan"))
         began = time.monotonic()
@@ -154,13 +179,13 @@ def load_goals(goals: int) -> bool:
             time.sleep(max(0.0, began + sent * GOALS_PERIOD - time.monotonic()))
             client.publish("goal_pose", stamped)
         seconds = time.monotonic() - began
-        plans.wait(lambda plan: numbers[ros.cell_of(grid, plan.poses[-1])] == goals - 1)
+        plans.wait(lambda plan: number_of(plan) == goals - 1)
         time.sleep(2)  # a plan for an older goal would come now
-        order = [
-            numbers[ros.cell_of(grid, plan.poses[-1])] for plan in plans.messages()
-        ]
-    print(f"goal_pose: {goals} goals in {seconds:.1f} s, {len(order)} plans published")
-    late = sum(later < earlier for earlier, later in itertools.pairwise(order))
+        numbers = [number_of(plan) for plan in plans.messages()]
+    print(
+        f"goal_pose: {goals} goals in {seconds:.1f} s, {len(numbers)} plans published"
+    )
+    late = sum(later < earlier for earlier, later in itertools.pairwise(numbers))
     return report("  plans for a goal before the last one's", late, "", 0)
 
 
@@ -255,54 +280,54 @@ def load_bursts(
     """
     for size in sizes:
         fixture = ros.generated_map("rooms", size, resolution=0.5)
-        free = fixture.grid.free_cells()
-        goals = [
-            free[i]
-            for i in np.random.default_rng(1).integers(len(free), size=BURST_GOALS)
-        ]
-        sent = {
-            count: [
-                burst_requests(fixture.grid, goals, count, seed)
-                for seed in range(bursts)
-            ]
+        grid = fixture.grid
+        free = grid.free_cells()
+        drawn = np.random.default_rng(1).integers(len(free), size=BURST_GOALS)
+        goals = [free[number] for number in drawn]
+        requests_of_bursts = {
+            count: [burst_requests(grid, goals, count, seed) for seed in range(bursts)]
             for count in counts
         }
-
-        def wrong(
-            asking: BurstClients, asked: Sequence[Any], fixture: Any = fixture
-        ) -> int:
-            """Send a burst of requests.
-
-            Count the lost answers, and the answers without a path where there is a
-            path.
-            """
-            answers = zip(asked, asking.burst(asked), strict=True)
-            return sum(
-                not it or bool(fixture.error(request, it.plan))
-                for request, it in answers
-            )
-
-        with BurstClients(1) as one:
-            one.publish("map", fixture.message(), LATCHED)
+        with BurstClients(1) as client:
+            client.publish("map", fixture.message(), LATCHED)
             # Until it plans on this map, and knows the fields, whose times do not count
             # here.
-            pairs = [ros.plan_request(fixture.grid, a, b) for a in goals for b in goals]
-            while wrong(one, pairs):
+            pairs = [
+                ros.plan_request(grid, start, goal)
+                for start, goal in itertools.product(goals, repeat=2)
+            ]
+            while count_of_wrong(client, pairs, fixture):
                 pass
             for count, clients in itertools.product(counts, BURST_CLIENTS):
-                with BurstClients(clients) as asking:
-                    missing = sum(wrong(asking, requests) for requests in sent[count])
-                what = (
-                    f"{bursts} bursts of {count} from {clients} clients, "
-                    f"{size} x {size} cells"
-                )
-                yield report(f"{what}: lost or wrong", missing, "", 0)
+                with BurstClients(clients) as burst_clients:
+                    wrong = sum(
+                        count_of_wrong(burst_clients, requests, fixture)
+                        for requests in requests_of_bursts[count]
+                    )
+                name = f"{bursts} bursts of {count} from {clients} clients"
+                figure = f"{name}, {size} x {size} cells: lost or wrong"
+                yield report(figure, wrong, "", 0)
     with suppress(ModuleNotFoundError), GoalBursts() as action:
         for count in counts:
-            missing = sum(count - action.burst(requests) for requests in sent[count])
-            yield report(
-                f"{bursts} bursts of {count} actions: without a result", missing, "", 0
+            missing = sum(
+                count - action.burst(requests) for requests in requests_of_bursts[count]
             )
+            figure = f"{bursts} bursts of {count} actions: without a result"
+            yield report(figure, missing, "", 0)
+
+
+def count_of_wrong(
+    client: BurstClients, requests: Sequence[Any], fixture: ros.MapFixture
+) -> int:
+    """Send a burst of requests.
+
+    Count the lost answers, and the answers without a path where there is a path.
+    """
+    answers = client.burst(requests)
+    return sum(
+        answer is None or bool(fixture.error(request, answer.plan))
+        for request, answer in zip(requests, answers, strict=True)
+    )
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -23,8 +23,8 @@ from rcl_interfaces.srv import GetParameters, ListParameters
 from std_srvs.srv import Trigger
 from tables import report
 
-from ddqn_planner import Planner
-from ddqn_planner.grid import OCCUPIED, MapFile, read_map_file
+from ddqn_planner import GridMap, Planner
+from ddqn_planner.grid import OCCUPIED, Cell, MapFile, read_map_file
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.resources import find_map
@@ -150,33 +150,33 @@ def measure_requests(client: ros.Client, map_file: Path) -> Iterator[bool]:
     """Measure the first and the later answers of the planner node on a map."""
     fixture = ros.MapFixture(read_map_file(map_file))
     requests = fixture.requests(GOALS, np.random.default_rng(0))
-    first, ratios = [], []
+    first_times = []
+    ratios = []
     server = processes.running_node("map_server_node", yaml_filename=map_file.resolve())
     with server, processes.running_node("planner_node"):
         planner = client.service(GetPlan, "planner/get_plan")
         ros.wait_for("plan", lambda: ros.ask(planner, requests[0]).plan.poses)
         for request in requests[1:]:
-            took, answer = timed(planner, request)
+            first_ms, answer = timed(planner, request)
+            first_times.append(first_ms)
             poses = len(answer.plan.poses)
-            first.append(took)
+            planner_times = []
+            bare_times = []
             with processes.running(*BARE, str(poses)):
                 bare = client.service(GetPlan, "bare/get_plan")
                 timed(bare, request)
-                both = [
-                    [timed(s, request)[0] for s in (planner, bare)]
-                    for _ in range(CALLS)
-                ]
-            ours, theirs = (
-                statistics.median(column) for column in zip(*both, strict=True)
-            )
-            ratios.append(ours / theirs)
+                for _ in range(CALLS):
+                    planner_times.append(timed(planner, request)[0])
+                    bare_times.append(timed(bare, request)[0])
+            planner_ms = statistics.median(planner_times)
+            bare_ms = statistics.median(bare_times)
+            ratios.append(planner_ms / bare_ms)
             print(
-                f"GetPlan of {poses} poses: first {took:.1f} ms, "
-                f"then {ours:.2f} ms; bare "
-                f"service {theirs:.2f} ms"
+                f"GetPlan of {poses} poses: first {first_ms:.1f} ms, "
+                f"then {planner_ms:.2f} ms; bare service {bare_ms:.2f} ms"
             )
     name = f"{map_file.stem}, {fixture.grid.width}x{fixture.grid.height}"
-    yield report(f"{name}: GetPlan to a new goal, slowest", max(first), "ms", 100)
+    yield report(f"{name}: GetPlan to a new goal, slowest", max(first_times), "ms", 100)
     yield report(f"{name}: GetPlan again / bare service, worst", max(ratios), "x", 1.5)
 
 
@@ -243,42 +243,48 @@ def measure_changing_map(client: ros.Client) -> Iterator[bool]:
 
     It has no goal at first; then a few cells change.
     """
+    name = f"{CHANGING}x{CHANGING}"
     random = np.random.default_rng(0)
     fixture = ros.generated_map("office", CHANGING, seed=random)
     grid = fixture.grid
     ((start, goal),) = random_requests(grid.occupancy, ros.RULE, 1, random)
-    local, messages = Planner.load("any_map"), [fixture.message()]
-    path = local.plan(grid, start, goal, ros.RULE).cells
-    while len(messages) < 12 * RATE:
-        x, y = random.choice(path[3:-3])
-        changed = grid.with_patch(~grid.occupancy[y : y + 2, x : x + 2], x, y)
-        if local.plan(changed, start, goal, ros.RULE).cells:
-            values = OCCUPIED * changed.occupancy.astype(np.int8)
-            messages.append(ros.map_message(values, changed))
+    messages = [fixture.message()]
+    messages += changed_maps(grid, start, goal, 12 * RATE - 1, random)
     with processes.running_node("planner_node") as planner:
         client.publish("map", messages[0], LATCHED)
         time.sleep(IDLE / 2)  # until all is compiled
-        computed = processes.cpu_seconds(planner.pid)
+        cpu = processes.cpu_seconds(planner.pid)
         time.sleep(IDLE)
-        idle = processes.cpu_seconds(planner.pid) - computed
-        yield report(
-            f"{CHANGING}x{CHANGING}: no goal: share of a core",
-            100 * idle / IDLE,
-            "%",
-            0.2,
-        )
+        idle_cpu = processes.cpu_seconds(planner.pid) - cpu
+        share = 100 * idle_cpu / IDLE
+        yield report(f"{name}: no goal: share of a core", share, "%", 0.2)
         client.publish_ends(ros.plan_request(grid, start, goal))
         for number, message in enumerate(messages):
             if number == 2 * RATE:  # the node is warm
-                began, computed = time.monotonic(), processes.cpu_seconds(planner.pid)
+                began = time.monotonic()
+                cpu = processes.cpu_seconds(planner.pid)
             client.publish("map", message, LATCHED)
             time.sleep(1 / RATE)
-        seconds, computed = (
-            time.monotonic() - began,
-            processes.cpu_seconds(planner.pid) - computed,
-        )
-    name = f"{CHANGING}x{CHANGING}: a few cells change, {RATE} Hz: share of a core"
-    yield report(name, 100 * computed / seconds, "%", 8)
+        seconds = time.monotonic() - began
+        busy_cpu = processes.cpu_seconds(planner.pid) - cpu
+    figure = f"{name}: a few cells change, {RATE} Hz: share of a core"
+    yield report(figure, 100 * busy_cpu / seconds, "%", 8)
+
+
+def changed_maps(
+    grid: GridMap, start: Cell, goal: Cell, count: int, random: ros.Random
+) -> list[OccupancyGrid]:
+    """Return messages of the map, each with 2 x 2 other cells on the shortest path."""
+    planner = Planner.load("any_map")
+    path = planner.plan(grid, start, goal, ros.RULE).cells
+    messages: list[OccupancyGrid] = []
+    while len(messages) < count:
+        x, y = random.choice(path[3:-3])
+        changed = grid.with_patch(~grid.occupancy[y : y + 2, x : x + 2], x, y)
+        if planner.plan(changed, start, goal, ros.RULE).cells:
+            values = OCCUPIED * changed.occupancy.astype(np.int8)
+            messages.append(ros.map_message(values, changed))
+    return messages
 
 
 def measure_trainer(client: ros.Client) -> Iterator[bool]:

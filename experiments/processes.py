@@ -96,10 +96,10 @@ def running_node(
     name: str, *arguments: str, **parameters: object
 ) -> AbstractContextManager[subprocess.Popen[bytes]]:
     """Run a node of the package with ROS arguments and parameters."""
-    given = [
-        word for key, value in parameters.items() for word in ("-p", f"{key}:={value}")
-    ]
-    return running(executable(name), "--ros-args", *arguments, *given)
+    words = list(arguments)
+    for key, value in parameters.items():
+        words += ["-p", f"{key}:={value}"]
+    return running(executable(name), "--ros-args", *words)
 
 
 def memory(process: int, kind: str = "VmRSS") -> float:
@@ -110,13 +110,12 @@ def memory(process: int, kind: str = "VmRSS") -> float:
 
 def cpu_seconds(process: int) -> float:
     """Return how long a process has computed so far, in all its threads."""
-    fields = (
-        Path(f"/proc/{process}/stat")
-        .read_text(encoding="utf-8")
-        .rpartition(")")[2]
-        .split()
-    )
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    stat = Path(f"/proc/{process}/stat").read_text(encoding="utf-8")
+    _, _, after_name = stat.rpartition(")")  # a name may hold blanks
+    fields = after_name.split()
+    user_ticks = int(fields[11])
+    system_ticks = int(fields[12])
+    return (user_ticks + system_ticks) / os.sysconf("SC_CLK_TCK")
 
 
 def run_script(main: Callable[[Sequence[str]], int]) -> NoReturn:

@@ -95,35 +95,34 @@ def measure_requests(side: int) -> Iterator[bool]:
     A request to a known goal is timed, too.
     """
     for kind in MAP_KINDS:
-        random, of_requests = np.random.default_rng(0), []
+        random = np.random.default_rng(0)
         occupancy = generate_map(kind, (side, side), random)
-        of_nano = occupancy.astype(np.uint8)
+        nano_map = occupancy.astype(np.uint8)
         weights = np.where(occupancy, np.inf, 1).astype(np.float32)
+        requests = []  # of each the medians of its times, and the length of its path
         for start, goal in random_requests(occupancy, RULE, REQUESTS, random):
-            cells, times = (start[::-1], goal[::-1]), []
+            ends = start[::-1], goal[::-1]
+            times = []
             for _ in range(ROUNDS):
-                planner, grid = new_planner(), GridMap(occupancy)
+                planner = new_planner()
+                grid = GridMap(occupancy)
                 ms, plan = timed(planner.plan, grid, start, goal, RULE)
                 known_ms, _ = timed(planner.plan, grid, plan.cells[1], goal, RULE)
-                nano_ms, (_, length) = timed(nano_astar.astar, of_nano, *cells)
+                nano_ms, (_, length) = timed(nano_astar.astar, nano_map, *ends)
                 pyastar_ms, _ = timed(
-                    pyastar2d.astar_path, weights, *cells, allow_diagonal=True
+                    pyastar2d.astar_path, weights, *ends, allow_diagonal=True
                 )
                 times.append((ms, nano_ms, pyastar_ms, known_ms))
-            assert math.isclose(plan.length, length, rel_tol=1e-6), (
-                plan.length,
-                length,
-            )
-            of_requests.append((*medians(times), len(plan.cells)))
-        ms, nano_ms, pyastar_ms, known_ms, moves = medians(of_requests)
-        name = f"{side}x{side} {kind}: request {ms:.2f} ms"
+            lengths = plan.length, length
+            assert math.isclose(*lengths, rel_tol=1e-6), lengths
+            requests.append((*medians(times), len(plan.cells)))
+        ms, nano_ms, pyastar_ms, known_ms, moves = medians(requests)
+        place = f"{side}x{side} {kind}"
+        name = f"{place}: request {ms:.2f} ms"
         yield report(f"{name}, nano-astar {nano_ms:.2f}; ratio", ms / nano_ms, "x", 1.0)
-        yield report(
-            f"{name}, pyastar2d* {pyastar_ms:.2f}; ratio", ms / pyastar_ms, "x", 1.3
-        )
-        yield report(
-            f"{side}x{side} {kind}: known goal, {moves:.0f} cells", known_ms, "ms", 0.1
-        )
+        ratio = ms / pyastar_ms
+        yield report(f"{name}, pyastar2d* {pyastar_ms:.2f}; ratio", ratio, "x", 1.3)
+        yield report(f"{place}: known goal, {moves:.0f} cells", known_ms, "ms", 0.1)
     print(
         "* cuts corners, and a diagonal counts 1: its paths are no paths under our rule"
     )
@@ -369,30 +368,30 @@ def measure_whole_fields(side: int, costs: bool, bound: float) -> Iterator[bool]
 
     The time of scipy's includes the graph.
     """
-    ratios, nbytes, name = [], 0, f"{side}x{side}{', random costs' if costs else ''}"
+    name = f"{side}x{side}, random costs" if costs else f"{side}x{side}"
     rounds = 20 if side < 1000 else 1
+    ratios = []
+    nbytes = 0
     for kind in KINDS:
-        random, times = np.random.default_rng(0), []
+        random = np.random.default_rng(0)
         occupancy = generate_map(kind, (side, side), random)
         cost = random_costs(occupancy, random) if costs else None
+        times = []
         for _, goal in random_requests(occupancy, RULE, ROUNDS, random):
             for _ in range(rounds):
                 ms, field = timed(all_values, GridMap(occupancy, cost=cost), goal)
                 new_map = GridMap(occupancy, cost=cost)
-                times.append((ms, timed(shortest_distances, new_map, goal, RULE)[0]))
+                scipy_ms, _ = timed(shortest_distances, new_map, goal, RULE)
+                times.append((ms, scipy_ms))
             nbytes = max(nbytes, field.nbytes - field.value.nbytes)
-        ours, dijkstra = medians(
-            times[rounds // 2 :]
-        )  # Python makes code faster that ran often
-        ratios.append((ours / dijkstra, kind))
-        print(
-            f"{name}, {kind}: field {ours:.1f} ms, Dijkstra {dijkstra:.1f} ms",
-            flush=True,
-        )
+        # Python makes code faster that ran often.
+        ms, scipy_ms = medians(times[rounds // 2 :])
+        ratios.append((ms / scipy_ms, kind))
+        print(f"{name}, {kind}: field {ms:.1f} ms, Dijkstra {scipy_ms:.1f} ms")
+        sys.stdout.flush()
     worst, kind = max(ratios)
-    yield report(
-        f"{name}: field / Dijkstra, worst kind ({kind})", 100 * worst, "%", bound
-    )
+    figure = f"{name}: field / Dijkstra, worst kind ({kind})"
+    yield report(figure, 100 * worst, "%", bound)
     yield report(f"{name}: bytes per cell of a field", nbytes / side**2, "B", 10)
 
 

@@ -324,17 +324,18 @@ def _rollouts_of_paper(
 
 def optimal_value(environment: GridVectorEnvironment) -> NDArray[np.float32]:
     """Return V* of the first scenario, exact by value iteration: (C,) float32."""
-    e, p, near_AC = environment, environment.parameters, neighbours(environment.shape)
-    given = (
-        e.legal[:1].astype(np.float32).swapaxes(1, 2),
-        e.free_reward[:1].swapaxes(1, 2),
-    )
+    legal_CA = environment.legal[0].T
+    parameters = environment.parameters
     (return_CA,), _ = value_iteration(
-        *given, e.goal[:1], near_AC, p.gamma, p.obstacle_reward
+        legal_CA[None].astype(np.float32),
+        environment.free_reward[:1].swapaxes(1, 2),
+        environment.goal[:1],
+        neighbours(environment.shape),
+        parameters.gamma,
+        parameters.obstacle_reward,
     )
-    return np.array(
-        np.where(e.legal[0].T, return_CA, np.float32(p.obstacle_reward)).max(axis=1)
-    )
+    obstacle_reward = np.float32(parameters.obstacle_reward)
+    return np.array(np.where(legal_CA, return_CA, obstacle_reward).max(axis=1))
 
 
 def read_csv(path: Path) -> NDArray[Any]:
