@@ -262,17 +262,20 @@ SERVICES: dict[str, Any] = {
 }
 
 
-def test_the_lifecycle_is_that_of_rclpys_own_nodes() -> None:
-    """Except for their answer to a transition that the state does not have: it ends a
-    process.
-    """
-    rclpy.init(args=["--ros-args", "-p", "autostart:=false"])
-    planner = PlannerNode()
-    nodes = [planner, LifecycleNode("example")]
-    listener, executor = rclpy.create_node("listener"), SingleThreadedExecutor()
-    for node in (*nodes, listener):
-        executor.add_node(node)
-    events: list[list[tuple[State, State]]] = [[], []]
+def fields_of(message: Any) -> dict[str, Any]:
+    """Return the values of a message's fields, lists in any one order."""
+    values = {}
+    for name in message.get_fields_and_field_types():
+        value = getattr(message, name)
+        values[name] = sorted(value, key=repr) if isinstance(value, list) else value
+    return values
+
+
+def heard_transitions(
+    nodes: list[Any], listener: Any, executor: SingleThreadedExecutor
+) -> list[list[tuple[State, State]]]:
+    """Return a list for each node, to which its transitions are added as they come."""
+    events: list[list[tuple[State, State]]] = [[] for _ in nodes]
     for node, seen in zip(nodes, events, strict=True):
 
         def hear(
@@ -284,6 +287,20 @@ def test_the_lifecycle_is_that_of_rclpys_own_nodes() -> None:
         listener.create_subscription(TransitionEvent, name, hear, 100)
         while not listener.count_publishers(name):
             executor.spin_once(timeout_sec=0.05)
+    return events
+
+
+def test_the_lifecycle_is_that_of_rclpys_own_nodes() -> None:
+    """Except for their answer to a transition that the state does not have: it ends a
+    process.
+    """
+    rclpy.init(args=["--ros-args", "-p", "autostart:=false"])
+    planner = PlannerNode()
+    nodes = [planner, LifecycleNode("example")]
+    listener, executor = rclpy.create_node("listener"), SingleThreadedExecutor()
+    for node in (*nodes, listener):
+        executor.add_node(node)
+    events = heard_transitions(nodes, listener, executor)
 
     def ask(service: str, kind: Any, **request: Any) -> list[Any]:
         """Return what both nodes answer."""
@@ -308,12 +325,7 @@ def test_the_lifecycle_is_that_of_rclpys_own_nodes() -> None:
                 assert example.success
             for service, kind in SERVICES.items():
                 ours, example = ask(service, kind)
-                for field in kind.Response.get_fields_and_field_types():
-                    values = [
-                        sorted(value, key=repr) if isinstance(value, list) else value
-                        for value in (getattr(ours, field), getattr(example, field))
-                    ]
-                    assert values[0] == values[1]
+                assert fields_of(ours) == fields_of(example)
         assert planner.state == "finalized"
         while len(events[0]) < 2 * len(LABELS) or len(events[1]) < 2 * len(LABELS):
             executor.spin_once(timeout_sec=TIMEOUT)
