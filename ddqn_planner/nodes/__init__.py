@@ -1,4 +1,7 @@
-"""The three ROS 2 nodes and the message conversions; nothing else of the package imports rclpy."""
+"""The three ROS 2 nodes and the message conversions.
+
+Nothing else of the package imports rclpy.
+"""
 
 import logging
 import os
@@ -12,15 +15,16 @@ from typing import NoReturn
 
 from ddqn_planner.resources import with_remedy
 
-# NumPy and torch are imported after this. The networks' products are small: more threads than one
-# only wait for each other, ten times as long on a busy machine.
+# NumPy and torch are imported after this. The networks' products are small: more
+# threads than one only wait for each other, ten times as long on a busy machine.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 def run(name: str) -> NoReturn:
     """Run a node, and end the process; its exit code is 1 if the node cannot start."""
-    # Until the node listens to signals, one of them ends the process: nothing is there to be saved.
-    # Not by an exception, as Python drops those that come inside a callback of the import system.
+    # Until the node listens to signals, one of them ends the process: nothing is there
+    # to be saved. Not by an exception, as Python drops those that come inside a
+    # callback of the import system.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: os._exit(0))
     code = 1
@@ -30,9 +34,10 @@ def run(name: str) -> NoReturn:
         print(f"{name}: {with_remedy(error)}", file=sys.stderr)
     except Exception:
         traceback.print_exc()
-    # Python's own end frees all that numba has compiled, for seconds on a busy machine. It stops
-    # threads in the middle of LLVM, too, and may then wait without end for a lock that one holds.
-    # The node has saved what it has to save, DDS has left the graph, and these are written:
+    # Python's own end frees all that numba has compiled, for seconds on a busy machine.
+    # It stops threads in the middle of LLVM, too, and may then wait without end for a
+    # lock that one holds. The node has saved what it has to save, DDS has left the
+    # graph, and these are written:
     logging.shutdown()
     for stream in (sys.stdout, sys.stderr):
         with suppress(

@@ -327,8 +327,8 @@ def _finished(task: _Task, path: Path, method: PlanMethod) -> Plan:
     goal = (int(path[-1, 0]), int(path[-1, 1]))
     if len(task.escape_path) > 1:
         path = np.concatenate([task.escape_path[:-1], path], dtype=np.int32)
-        # The extra cost is that of a path under way. This path is one only if its escape
-        # path belongs to the path under way, too.
+        # The extra cost is that of a path under way. This path is one only if its
+        # escape path belongs to the path under way, too.
         under_way = np.asarray(request.under_way)
         if not np.array_equal(path, under_way[-len(path) :]):
             extra_cost = None
