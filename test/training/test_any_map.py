@@ -35,15 +35,15 @@ def test_training_on_random_maps_learns_moves_and_costs(
     planner: Planner, rule: MoveRule
 ) -> None:
     random = np.random.default_rng(2)
-    rooms = np.zeros((40, 50), dtype=bool)
+    rooms = np.zeros((24, 30), dtype=bool)
     rooms[::8] = rooms[:, ::10] = True
     rooms[4::8, ::10] = rooms[::8, 5::10] = False  # doors
-    rooms |= random.random((40, 50)) < 0.05
+    rooms |= random.random((24, 30)) < 0.05
     evaluation = evaluation_of(planner, GridMap(rooms), rule)
     assert evaluation.solved == evaluation.starts > 100
     assert evaluation.worst_ratio < 1.3
 
-    cost = np.where(random.random((40, 50)) < 0.2, UNKNOWN, random_costs(rooms, random))
+    cost = np.where(random.random((24, 30)) < 0.2, UNKNOWN, random_costs(rooms, random))
     with_costs = GridMap(rooms, cost=cost.astype(np.int8))
     evaluation = evaluation_of(planner, with_costs, rule)
     assert evaluation.solved == evaluation.starts > 100
