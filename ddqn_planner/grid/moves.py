@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,14 @@ MOVES: NDArray[np.int64] = np.array(
 LENGTHS: NDArray[np.float64] = np.hypot(MOVES[:, 0], MOVES[:, 1])
 """(8,) float64: the length of each action in cells, 1 or sqrt(2)."""
 
-NO_ACTION = len(MOVES)
+NO_ACTION: Final = -1
+"""In place of an action where there is none, or none was found."""
 
-# (3, 3): the action of a step (dx, dy), at [dy + 1, dx + 1]; `NO_ACTION` for (0, 0).
-ACTION_OF_STEP = np.full((3, 3), NO_ACTION)
+STAND = len(MOVES)
+"""The number behind the actions, for a step (0, 0)."""
+
+# (3, 3): the action of a step (dx, dy), at [dy + 1, dx + 1]; `STAND` for (0, 0).
+ACTION_OF_STEP = np.full((3, 3), STAND)
 ACTION_OF_STEP[MOVES[:, 1] + 1, MOVES[:, 0] + 1] = np.arange(len(MOVES))
 
 # (3, 3): that action as a bit of a `GridMap.forbidden`; 0 for (0, 0).

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place, inlined, inner, specialised
 from ddqn_planner.grid import MOVES
+from ddqn_planner.grid.moves import NO_ACTION
 from ddqn_planner.model.move_costs import COST_CODES, MARGIN, MoveCosts
 from ddqn_planner.planning.queues import (
     Buckets,
@@ -48,7 +49,6 @@ SAME: Final = 1 + 1e-12  # paths cost the same up to this factor: sums are round
 # Cells that cost as much as the start, up to this factor, are closed too: so a rollout
 # does not depend on the requests before.
 TIES: Final = 1 + 1e-6
-NO_ACTION: Final = -1
 TOO_MANY: Final = -1  # what `_lose_unsupported` returns where a limit is exceeded
 
 MOVE_X, MOVE_Y = MOVES.T.copy()

@@ -12,7 +12,7 @@ from ddqn_planner.grid.arguments import OCCUPIED
 from ddqn_planner.grid.boxes import Box
 from ddqn_planner.grid.layers import Layers, forbids, has_costs, multiplier_at
 from ddqn_planner.grid.map_changes import changed_cells
-from ddqn_planner.grid.moves import ACTION_OF_STEP, NO_ACTION
+from ddqn_planner.grid.moves import ACTION_OF_STEP, STAND
 from ddqn_planner.robot.motions import HEADINGS, Motions, dense_poses
 
 SHIFT: Final = 2  # so many bits tell where in its tile a cell lies, along a side
@@ -242,7 +242,7 @@ def _passed_cells(poses: NDArray[np.float64]) -> PassedCells:
     cells = cell_of_step[begins]  # (C, 2)
     shares = np.add.reduceat(lengths, begins) / lengths.sum()  # (C,)
     dx, dy = np.diff(cells, axis=0).T  # (C - 1,) each
-    actions = np.append(ACTION_OF_STEP[dy + 1, dx + 1], NO_ACTION)
+    actions = np.append(ACTION_OF_STEP[dy + 1, dx + 1], STAND)
     return PassedCells(cells, actions, shares)
 
 

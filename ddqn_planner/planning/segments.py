@@ -20,6 +20,7 @@ from ddqn_planner.grid.layers import (
     has_costs,
     multiplier_at,
 )
+from ddqn_planner.grid.moves import NO_ACTION
 
 Path: TypeAlias = NDArray[np.int32]  # (N, 2): cells, joined by moves or by segments
 CellArray: TypeAlias = NDArray[np.int64]  # (N, 2): the same for compiled code
@@ -33,7 +34,6 @@ SAME_COST: Final = 1 + 1e-9
 # Cells by which a segment is first made longer. Half of it is 1, so that some cells are
 # passed over: with corners at the very last cells that are seen, a path is longer.
 FIRST_STEP: Final = 3
-NO_ACTION: Final = -1
 LEGAL: Final = True  # segments must be legal, see `segment_cost`
 
 
@@ -446,7 +446,7 @@ def _move_corners(
     while corner < count - 1:
         was_moved_by = moved_by
         first_action = 0
-        end_action = 8
+        end_action = len(MOVES)
         if was_moved_by != NO_ACTION:  # this action alone is tried once more
             first_action = was_moved_by
             end_action = was_moved_by + 1
