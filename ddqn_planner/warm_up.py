@@ -40,7 +40,7 @@ def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
     planner.plan(grid, start, goal, simplified=True)
     rule = planner.metadata.move_rule
     leg = np.array([start, goal], np.int32)
-    exact_path([leg], grid, rule, [(0.6, 0.7), grid.cell_to_world(goal)])
+    exact_path([leg], grid, [(0.6, 0.7), grid.cell_to_world(goal)])
     planner.plan(grid.with_patch([[True]], 1, 1), start, goal)
     rest_of_path([start, goal], start, grid, rule)
     yield

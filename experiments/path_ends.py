@@ -40,7 +40,7 @@ def main() -> None:
         offsets = random.random((2, 2)) - 0.5  # cells from the centres
         ends = grid.centres(np.array([start_cell, goal_cell]) + offsets)  # metres
         end_points = [(x, y) for x, y in ends.tolist()]
-        path = exact_path([plan.path], grid, plan.move_rule, end_points)
+        path = exact_path([plan.path], grid, end_points)
         path_distances.append(distances(path.points[[0, -1]], ends))
         centre_distances.append(distances(grid.centres(plan.path[[0, -1]]), ends))
         with_more_points += len(path.points) > max(len(plan.path), 2)

@@ -185,7 +185,7 @@ def ask(planner):
         grid = GridMap(occupancy, **layers)
         for simplified in (False, True):
             plan = planner.plan(grid, (2, 2), (40, 4), simplified=simplified)
-            exact_path([plan.path], grid, plan.move_rule, [(2.3, 2.6), (40.5, 4.9)])
+            exact_path([plan.path], grid, [(2.3, 2.6), (40.5, 4.9)])
         planner.plan(grid, (2, 2), (40, 38), tolerance=40)
         patched = grid.with_patch([[True]], 20, 2)
         planner.plan(patched, (2, 2), (40, 4))

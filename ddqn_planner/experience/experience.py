@@ -56,9 +56,9 @@ OPTIONS = {
 
 LATEST = 1e12  # seconds of a clock: a pose of a later time is not believed
 # Times the nominal speed: a robot that usually drives faster is not believed.
-LARGEST_USUAL_SPEED = 10.0
+MAX_MEDIAN_FACTOR = 10.0
 # Times the usual speed: a faster move is not believed.
-LARGEST_SPEED = 3
+MAX_SPEED_FACTOR = 3
 # Of the log speed: the steps in which the fastest move that a map knows of changes.
 FAST_STEP = 0.1
 
@@ -123,6 +123,7 @@ class Experience:
         half_life: float = 36_000.0,
         max_pause: float = 90.0,
     ) -> None:
+        """Begin without evidence; the class tells what the options hold."""
         self.nominal_speed = _as_option("nominal_speed", nominal_speed)
         self.robot_width = _as_option("robot_width", robot_width)
         self.half_life = _as_option("half_life", half_life)
@@ -170,16 +171,16 @@ class Experience:
         poses = _possible(time, position)
         if len(poses.time) < 2:
             return Learned(0, 0.0, self._why_nothing(poses, count))
-        window = window_of(poses, self.learned_speed)
-        speeds = speeds_of(poses, window)
+        window = window_of(poses, self.learned_speed)  # seconds to average poses over
+        speeds = speeds_of(poses, window)  # metres per second
         usual_speed = float(np.median(speeds)) if len(speeds) else 0.0
-        if usual_speed > self.nominal_speed * LARGEST_USUAL_SPEED:
+        if usual_speed > self.nominal_speed * MAX_MEDIAN_FACTOR:
             reason = self._wrong_speed(usual_speed, "at", "greater")
             return Learned(0, 0.0, reason, is_possible=False)
         limits = Limits(
             window=window,
             speed=self.learned_speed,
-            max_speed=max(self.max_speed, LARGEST_SPEED * usual_speed),
+            max_speed=max(self.max_speed, MAX_SPEED_FACTOR * usual_speed),
             max_pause=self.max_pause,
         )
         visits = visits_of(poses, self.evidence.side, limits)
@@ -280,7 +281,7 @@ class Experience:
     @property
     def max_speed(self) -> float:
         """The speed up to which a robot is believed, metres per second."""
-        return LARGEST_SPEED * max(self.nominal_speed, self.learned_speed)
+        return MAX_SPEED_FACTOR * max(self.nominal_speed, self.learned_speed)
 
     @property
     def learned_speed(self) -> float:

@@ -183,9 +183,11 @@ class Posterior:
             self._predicted[:] = prior.log_slowness(map_features(self.grid)[y, x])
 
     def _sums_of(self, places: Places) -> SumsOnMap:
-        """Return the sums of all places of the world that lie in each place of the map.
+        """Return, for each place of the map, the sums of what was seen there.
 
-        A place of the world has the size of a place of the map, but lies elsewhere.
+        `places` are squares of the world's frame. The places of the map are blocks of
+        cells, of the same size, that lie otherwise: each place of the world counts for
+        the place of the map that has its centre.
         """
         place_on_map = self.places_at(places.position)
         is_on_map = place_on_map != NO_PLACE

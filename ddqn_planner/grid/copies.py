@@ -17,9 +17,8 @@ from ddqn_planner.grid.boxes import Box, cells_in, hull
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
-SMALL = (
-    2**22
-)  # bytes: so small an array is copied as fast, and a plain copy read faster
+# Bytes: so small an array is copied as fast, and a plain copy is read faster.
+SMALL = 2**22
 CELLS_PER_BOX = 2**13  # cells that are copied in the time that a box itself takes
 CELLS_PER_CHANGE = 64  # copies share memory if they differ in less than one cell of 64
 MAX_ALIVE = 128  # copies that share memory: each takes one or two open files
@@ -73,9 +72,15 @@ def replaced(
 def _replaced_in_pages(
     array: NDArray[Scalar], box: Box, values: NDArray[Scalar]
 ) -> NDArray[Scalar]:
-    """Return a copy as `replaced`, whose cells lie in a mapping of a file."""
+    """Return a copy of an array, with other values in a box, in a mapping of a file.
+
+    The array and the mapping differ from the file in few boxes. So only these boxes are
+    copied, and the copy shares the memory of all other cells with the file.
+    """
     file, boxes_of_array = _source_of(array)
-    try:  # to map and unmap pages takes longer than the copy
+    # A file is also the list of its mappings that nobody uses: to map and unmap pages
+    # takes longer than the copy.
+    try:
         pages = file.pop()
     except IndexError:  # no mapping is free, or another thread has just taken it
         pages = _Pages(file.io.fileno(), array.nbytes, access=mmap.ACCESS_COPY)

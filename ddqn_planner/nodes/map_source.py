@@ -155,13 +155,15 @@ class MapSource:
 
     @property
     def retry_wait(self) -> float:
-        """The seconds that a failed plan waits for the next costmap; 0 for a map."""
-        # A request has waited after the last costmap, and none came.
-        is_silent = self.arrivals.awaited_in_vain == self.arrivals.number
+        """The seconds that a failed plan waits for the next costmap.
+
+        They are 0 for a map, and as long as no costmap comes after a wait in vain.
+        """
+        is_silent = self.arrivals.number_at_vain_wait == self.arrivals.number
         if not self._is_costmap or is_silent:
             return 0.0
         timeout: float = self._node.value("map_timeout")
-        wait = 2 * self.arrivals.period
+        wait = 2 * self.arrivals.period  # infinite before the second costmap
         if timeout > 0:
             wait = min(wait, timeout)
         return wait if wait < math.inf else UPDATE_WAIT

@@ -91,7 +91,7 @@ class Requests:
             while outcome.has_failed and is_in_time:
                 if not await self._wait_for_costmap(costmap, deadline):
                     # Until a costmap comes, the next query does not wait.
-                    self.map.arrivals.awaited_in_vain = first_costmap
+                    self.map.arrivals.number_at_vain_wait = first_costmap
                     break
                 is_in_time = time.monotonic() < deadline
                 costmap = self.map.arrivals.number
@@ -493,4 +493,4 @@ def exact_path_through(
         return NO_PATH
     cells = [plan.path for plan in plans]
     points = [pose_of(stop)[:2] for stop in stops]  # (x, y) in metres
-    return exact_path(cells, request.grid, request.move_rule, points)
+    return exact_path(cells, request.grid, points)

@@ -23,8 +23,8 @@ class Arrivals:
         self._clock = clock
         self.number = 0
         """How many maps and updates came: also the number of the last one."""
-        self.awaited_in_vain = -1
-        """The number of the last one after which a request waited for nothing."""
+        self.number_at_vain_wait = -1
+        """What `number` was when a request last waited, and nothing came."""
         self._times: deque[float] = deque(maxlen=INTERVALS + 1)
 
     def note(self) -> float:

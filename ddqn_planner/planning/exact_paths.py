@@ -34,7 +34,7 @@ NO_PATH: Final = ExactPath(np.empty((0, 2)), 0.0)
 
 
 def exact_path(
-    legs: Sequence[Path], grid: GridMap, move_rule: MoveRule, points: Sequence[Point]
+    legs: Sequence[Path], grid: GridMap, points: Sequence[Point]
 ) -> ExactPath:
     """Return the path along the cells of legs that leads through exact points.
 
@@ -43,8 +43,6 @@ def exact_path(
     legs : sequence of (N, 2)
         Cells, each leg from the last cell of the one before it.
     grid : GridMap
-    move_rule : MoveRule
-        How the length is measured.
     points : sequence of (x, y)
         Metres in the map frame: the point in the first cell of the first leg, and the
         point at the end of each leg. Where a point lies in another cell, as for a goal

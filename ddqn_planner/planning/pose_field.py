@@ -88,7 +88,7 @@ class PoseField(Field[Search]):
         """The last path that was made from the field."""
         self.visits = 0
         """States that were visited for the start that is aimed at."""
-        self._least_cost = math.inf
+        self._lower_bound = math.inf
         """A lower bound of the cost from that start."""
 
     def _goals_alone(self) -> Search:
@@ -170,11 +170,11 @@ class PoseField(Field[Search]):
         heap = make_heap((len(tiles) << pose_space.TILE_BITS) + HEAP)
         search = self.known._replace(aim=aim, heap=heap)
         self._known = search
-        self._least_cost = pose_space.queue_open_states(search, tiles)
+        self._lower_bound = pose_space.queue_open_states(search, tiles)
 
     def _is_enough(self, bound: float) -> bool:
         """Return whether a bound is proved, or that no path leads from the start."""
-        return self._proved_bound() <= bound * SAME or self._least_cost == math.inf
+        return self._proved_bound() <= bound * SAME or self._lower_bound == math.inf
 
     def _should_look_at_map(self) -> bool:
         """Return whether to look at the map's tiles now, for a better lower bound.
@@ -200,7 +200,7 @@ class PoseField(Field[Search]):
         # The rounds of weighted A* end when the start's cost is the least key, the last
         # round as soon as the bound is proved.
         share = 1.0 if aim.weight > 1 else 1 / bound
-        target = Target(aim.number, share, bound * self._least_cost, most_visits)
+        target = Target(aim.number, share, bound * self._lower_bound, most_visits)
         progress: Progress = pose_space.spread_over_poses(
             search.distance, search.mark, search.heap, target, None, search
         )
@@ -213,16 +213,17 @@ class PoseField(Field[Search]):
         return progress.visits
 
     def _proved_bound(self) -> float:
-        """Return how many times the least cost the cost from the start may be.
+        """Return the proved ratio of the cost of the known path to the least cost.
 
-        It is infinite as long as no path is known.
+        The least cost is at least `_lower_bound`. The ratio is infinite as long as no
+        path from the start is known.
         """
         cost = _cost_from_start(self.known)
         if cost == math.inf:
             return math.inf
-        if cost <= self._least_cost:
+        if cost <= self._lower_bound:
             return 1.0
-        return cost / self._least_cost if self._least_cost > 0 else math.inf
+        return cost / self._lower_bound if self._lower_bound > 0 else math.inf
 
     def _can_leave(self) -> bool:
         """Return whether primitives lead from the start to `UNGUIDED` states."""
@@ -298,7 +299,7 @@ class PoseField(Field[Search]):
             return True
         with older._lock:
             search = older._take_known()
-            self._least_cost = min(older._least_cost, _cost_from_start(search))
+            self._lower_bound = min(older._lower_bound, _cost_from_start(search))
             self._known = self._repaired(search._replace(world=self.world), changed)
         return True
 
@@ -316,7 +317,7 @@ class PoseField(Field[Search]):
         occupied = occupied_for_body(self.grid)
         has_freed_cell = not occupied[changed[:, 1], changed[:, 0]].all()
         # A path may have become cheaper where a cell is free: then the lower bounds are
-        # void. Otherwise what is open stays in order, and `_least_cost` a lower bound.
+        # void. Otherwise what is open stays in order, and `_lower_bound` a lower bound.
         if has_freed_cell:
             search = search._replace(aim=NOWHERE, heap=make_heap(most_opened))
         elif search.heap.size[0] + most_opened > search.heap.keys.size:

@@ -431,17 +431,18 @@ def _may_lead_through(x: int, y: int, primitive: int, world: Any) -> bool:
 def is_passable(
     row: int, column: int, shift: int, passability: Any, world: Any
 ) -> bool:
-    """Return whether the origin of the body may pass a cell of a tile.
+    """Return whether the origin of the body may pass any cell of a tile.
 
-    The tile has 2**shift cells along a side. What was found is kept in `passability`
-    (rows, columns).
+    `row` and `column` are those of the tile, which has 2**shift cells along a side. The
+    answer is kept in `passability`, an array by rows and columns of tiles.
     """
     if passability[row, column] == UNSEEN:
         passability[row, column] = IMPASSABLE
         for y in range(row << shift, min((row + 1) << shift, world.height)):
             for x in range(column << shift, min((column + 1) << shift, world.width)):
-                is_undecided = passability[row, column] == IMPASSABLE
-                if is_undecided and may_pass(x, y, world):
+                # As soon as a cell may be passed, no other cell needs a look.
+                has_no_cell = passability[row, column] == IMPASSABLE
+                if has_no_cell and may_pass(x, y, world):
                     passability[row, column] = PASSABLE
     return bool(passability[row, column] == PASSABLE)
 

@@ -137,7 +137,7 @@ def test_ends_are_exact_and_centres_stay_only_where_a_piece_is_not_clear(
         legs = [[*simplify(leg, grid, rule)] for leg in legs]
     points = [drawn_point(data, cell) for cell in (start, via, goal)]
     cells = [np.array(leg, np.int32) for leg in legs]
-    path = exact_path(cells, grid, rule, [metres(point) for point in points])
+    path = exact_path(cells, grid, [metres(point) for point in points])
     found = [in_cells(point) for point in path.points]
     first, second = (
         expected_leg(leg, *ends, grid)
@@ -157,7 +157,7 @@ def test_a_path_between_centres_is_the_plans_own(yaw: float) -> None:
     cells = np.array([(2, 3), (9, 4), (30, 25)], np.int32)
     for path in (cells, cells[:2], cells[:1]):
         points = [grid.cell_to_world((*path[end].tolist(),)) for end in (0, -1)]
-        exact = exact_path([path], grid, MoveRule.ROBOT_SAFE, points)
+        exact = exact_path([path], grid, points)
         expected = grid.centres(path)
         assert exact.points.tolist() == expected.tolist()
         assert exact.length == pytest.approx(path_length(path), abs=1e-6)
@@ -174,7 +174,7 @@ def test_a_goal_in_the_robots_cell_is_reached_directly_or_at_its_cells_centre() 
         ([(x, y + 0.1), (x, y + 0.1)], [(x, y + 0.1)]),
         ([(x - 0.1, y), (x + 9.0, y)], [(x - 0.1, y), (x, y)]),
     ):
-        path = exact_path([cell], grid, MoveRule.ROBOT_SAFE, ends)
+        path = exact_path([cell], grid, ends)
         assert path.points.tolist() == [[*point] for point in expected]
 
 
@@ -190,7 +190,7 @@ def test_a_robot_leaves_an_obstacle_directly_unless_another_is_in_the_way() -> N
     ):
         start, goal = np.add(cells[0], offset) + 0.5, np.array(cells[-1]) + 0.5
         ends = [(*start.tolist(),), (*goal.tolist(),)]
-        path = exact_path([np.array(cells, np.int32)], grid, MoveRule.ROBOT_SAFE, ends)
+        path = exact_path([np.array(cells, np.int32)], grid, ends)
         assert (path.points[1:-1] - 0.5).tolist() == [[*cell] for cell in expected]
 
 
