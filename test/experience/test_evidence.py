@@ -278,6 +278,14 @@ def test_a_failure_costs_as_a_wait_and_is_forgotten_where_the_robot_succeeds() -
     assert at(HALL, experience.slowness(HALL), 7, 5) < 1.5
 
 
+def test_a_wait_long_ago_counts_less_although_nobody_came_by_since() -> None:
+    experience = driven(waited(40.0), half_life=100.0)
+    at_first = at(HALL, experience.slowness(HALL), 7, 5)
+    for _ in range(20):
+        experience.record(*straight((2, 2), (12, 2)))
+    assert at(HALL, experience.slowness(HALL), 7, 5) < 0.5 * at_first
+
+
 @pytest.mark.parametrize("noise", [0.1, 0.4])
 def test_nine_of_ten_drives_take_a_time_within_their_interval(noise: float) -> None:
     random, experience = np.random.default_rng(0), Experience(SPEED)
