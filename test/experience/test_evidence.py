@@ -301,3 +301,36 @@ def test_nine_of_ten_drives_take_a_time_within_their_interval(noise: float) -> N
     assert 0.8 < np.mean(inside[50:]) <= 1
     assert expected.low < expected.seconds < expected.high
     assert expected.seconds == pytest.approx(actual, rel=0.3)
+
+
+@pytest.mark.parametrize("origin", [(-3.0, 2.0, 0.0), (5.0, -8.0, 0.7)])
+def test_evidence_lies_where_the_map_has_that_position(
+    origin: tuple[float, float, float],
+) -> None:
+    experience = driven(*[straight((4, 4), (8, 5), 6)] * 3)
+    experience.record_failure((6, 4.5))
+    experience.slowness(GridMap(np.zeros((80, 80), dtype=bool), 0.25))
+    grid = GridMap(np.zeros((80, 80), dtype=bool), 0.25, origin)
+    slowness = experience.slowness(grid)
+    row, column = np.unravel_index(slowness.argmax(), slowness.shape)
+    cell = int(column), int(row)
+    assert grid.cell_to_world(cell) == pytest.approx((6, 4.5), abs=0.5)
+
+
+def test_the_two_sides_of_an_axis_are_two_places() -> None:
+    above, below = straight((2, 0.1), (12, 0.1)), straight((2, -0.1), (12, -0.1))
+    both = len(driven(above, below).evidence.places)
+    assert both == len(driven(above).evidence.places) + len(
+        driven(below).evidence.places
+    )
+
+
+def test_a_wait_lengthens_the_time_of_a_drive_as_its_slowness_does() -> None:
+    quick, slow = driven(straight((2, 5), (12, 5))), driven(straight((2, 5), (12, 5)))
+    for experience, drive in (
+        (quick, straight((2, 5), (12, 5))),
+        (slow, waited(40.0)),
+    ):
+        experience.apply(HALL)
+        experience.record(*drive)
+    assert slow.evidence.errors[-1] > quick.evidence.errors[-1] + 2

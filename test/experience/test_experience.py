@@ -509,3 +509,19 @@ def test_a_drive_says_how_much_it_taught() -> None:
         assert 10 < learned.places < 60
         assert 15 < learned.seconds <= 20.1
         assert not learned.reason
+
+
+def test_what_another_learns_after_a_merge_is_not_merged(tmp_path: Path) -> None:
+    file = tmp_path / "experience.npz"
+    one = driven(straight((2, 2), (12, 2)))
+    one.save(file)
+    other = driven(straight((2, 5), (12, 5), 2))
+    one.merge(other)
+    other.record(*straight((2, 8), (12, 8), 4))
+    another = Experience.load(file)
+    another.record(*straight((2, 3), (12, 3)))
+    another.save(file)
+    one.save(file)  # joins the changes of both
+    expected = driven(straight((2, 2), (12, 2)), straight((2, 3), (12, 3)))
+    expected.merge(driven(straight((2, 5), (12, 5), 2)))
+    assert one.to_bytes() == expected.to_bytes()
