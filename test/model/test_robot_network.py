@@ -24,6 +24,7 @@ from ddqn_planner.model import (
     model_of,
     save_model,
 )
+from ddqn_planner.robot.body_certificate import certify_body
 from ddqn_planner.robot.footprint import read_footprint, swept_cells
 from ddqn_planner.robot.motions import Motions, make_motions
 
@@ -198,3 +199,22 @@ def test_a_robot_without_sense_is_refused(name: str, place: int, value: float) -
     content = model_bytes(network, metadata_of(network))
     with pytest.raises(ValueError, match=r"train|give"):
         cast(RobotNetwork, model_of(content)[0]).swept()
+
+
+def test_a_sum_that_float32_may_round_up_to_the_threshold_proves_nothing() -> None:
+    random = np.random.default_rng(0)
+    swept = np.zeros((1, 41, 41), np.bool_)
+    swept[0, 20, 20] = True
+    weight = random.uniform(1e-4, 1e-3, swept.shape).astype(np.float32)
+    weight[swept] = 10
+    others = weight[~swept]
+    total = others.sum(dtype=np.float64)
+    threshold = np.nextafter(np.float32(total), np.float32(np.inf))
+    assert total < threshold
+    orders = [random.permutation(others) for _ in range(20)]
+    assert max(np.cumsum(order)[-1] for order in orders) > threshold
+    for share, is_proved in ((1.0, False), (1.01, True)):
+        certificate = certify_body(
+            weight, np.array([threshold * share], np.float32), swept, np.zeros(1, int)
+        )
+        assert certificate.proved == is_proved

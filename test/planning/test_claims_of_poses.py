@@ -246,3 +246,13 @@ def test_no_lower_bound_is_above_the_true_cost(planner: Planner, shift: int) -> 
             assert (bounds <= least + 1e-3).all()
             is_guided |= bool((bounds > straight + 2).any())
     assert is_guided  # by the map, not by the straight distance alone
+
+
+def test_a_passage_along_the_border_of_the_map_is_no_wall(planner: Planner) -> None:
+    occupancy = np.zeros((40, 60), np.bool_)
+    occupancy[:34, 28:31] = True
+    for grid, row in ((occupancy, 36), (occupancy[::-1], 3)):
+        bounds = lower_bounds(
+            planner, GridMap(grid, CELL), (10, row, 0), (50, row, 0), 2
+        )
+        assert bounds[row, 50] <= 40

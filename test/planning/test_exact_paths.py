@@ -216,3 +216,15 @@ def test_a_dense_path_passes_all_points_with_as_few_others_as_can_be(
         assert len(steps) <= math.ceil(math.dist(begin, end) / spacing)
         number += len(steps)
     assert number == len(piece)
+
+
+def test_a_piece_to_a_centre_is_not_direct_if_it_touches_an_obstacle() -> None:
+    grid = GridMap(np.zeros((4, 5))).with_patch([[True]], 0, 1)
+    leg = np.array([(0, 0), (2, 1)], np.int32)
+    start, goal = (0.1, 0.9), (2.5, 1.5)  # metres: from there one passes the obstacle
+    for cells, ends, centre in (
+        (leg, (start, goal), [0.5, 0.5]),
+        (leg[::-1], (goal, start), [0.5, 0.5]),
+    ):
+        path = exact_path([cells], grid, MoveRule.ROBOT_SAFE, ends)
+        assert path.points.tolist() == [[*ends[0]], centre, [*ends[1]]]

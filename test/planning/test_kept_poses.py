@@ -123,3 +123,39 @@ def test_a_robot_that_cannot_leave_its_own_cell_keeps_its_path(
     assert plan(planner, grid, aside).status is PlanStatus.NO_PATH
     kept = plan(planner, grid, aside, under_way=path.poses)
     assert np.array_equal(kept.poses, path.poses[20:])
+
+
+def test_a_path_to_where_a_goal_moved_is_no_path_to_the_goal_itself(
+    planner: Planner,
+) -> None:
+    x, y, _ = GOAL
+    hall = GridMap(np.zeros((20, 60)), CELL)
+    occupied = hall.with_patch([[True]], *hall.world_to_cell(x, y))
+    moved = plan(planner, occupied, START, tolerance=(0.8, 0.3))
+    assert moved.status is PlanStatus.SUCCEEDED
+    assert plan(planner, occupied, START).status is PlanStatus.GOAL_OCCUPIED
+
+
+def test_a_path_is_not_used_on_a_map_with_too_many_changes_to_compare(
+    planner: Planner,
+) -> None:
+    hall = GridMap(np.zeros((20, 60)), CELL)
+    assert plan(planner, hall, START).status is PlanStatus.SUCCEEDED
+    walled = hall.with_patch(np.ones((20, 8)), 16, 0)
+    assert plan(planner, walled, START).status is PlanStatus.NO_PATH
+
+
+def test_a_kept_path_costs_as_much_time_as_it_takes(planner: Planner) -> None:
+    hall = GridMap(np.zeros((20, 60)), CELL)
+    timed = hall.with_layers(seconds_per_cell=0.2)
+    x, y, yaw = START
+    path = plan(planner, hall, START, bound=1.0)
+    aside = np.add(path.poses, (0, 0.04, 0))  # as long, and beside the new path
+    under_way = {"under_way": aside, "switch_threshold": 0.5, "bound": 1.0}
+    kept, kept_timed = (
+        plan(planner, grid, (x, y + 0.04, yaw), **under_way) for grid in (hall, timed)
+    )
+    for found in (kept, kept_timed):
+        assert np.array_equal(found.poses, aside)
+    assert kept_timed.cost == pytest.approx(0.2 * kept.cost)
+    assert kept_timed.bound == pytest.approx(kept.bound)

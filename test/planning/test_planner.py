@@ -33,7 +33,7 @@ from ddqn_planner.planning import (
 )
 from ddqn_planner.planning.field import DistanceField
 from ddqn_planner.planning.field_cache import OBJECTS
-from ddqn_planner.planning.path_finder import last_step
+from ddqn_planner.planning.path_finder import Clock, last_step
 from ddqn_planner.planning.plan import ROUNDING
 from ddqn_planner.planning.segments import cost_along
 
@@ -551,3 +551,19 @@ def test_wrong_goals_are_named() -> None:
             plan(grid, (0, 0), [])
         with pytest.raises(ValueError, match=r"goal 2 is .*; give two whole numbers"):
             plan(grid, (0, 0), [(1, 1), (0.5, 1)])  # type: ignore[list-item]
+
+
+def test_a_clock_counts_the_time_between_pauses_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now = 100.0
+    monkeypatch.setattr(time, "perf_counter", lambda: now)
+    clock = Clock()
+    for seconds in (1, 2, 4):
+        now += seconds
+        clock.pause()
+        now += 50
+        clock.resume()
+    clock.end_field()
+    now += 8
+    assert (clock.field_ms, clock.rollout_ms) == (7e3, 8e3)

@@ -649,3 +649,66 @@ def test_cells_that_are_only_too_near_for_a_disc_are_free_at_the_highest_cost() 
     values[:, 30] = 100
     walled = grid_from_costmap(values, CELL)
     assert plan(body, walled, start, goal).status is PlanStatus.NO_PATH
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_an_obstacle_inside_a_body_leaves_no_rest_of_a_path(side: int) -> None:
+    # Wider than long: the obstacle is inside, where the outline does not touch it.
+    wide = "[[0.2, 0.6], [-0.2, 0.6], [-0.2, -0.6], [0.2, -0.6]]"
+    body = planner("differential", wide)
+    hall = GridMap(np.zeros((40, 40)), CELL)
+    pose = pose_of(hall, (20, 20, 0))
+    assert len(body.rest_of([pose], pose, hall)) == 1
+    occupied = hall.with_patch([[True]], 20, 20 + 4 * side)
+    assert not len(body.rest_of([pose], pose, occupied))
+
+
+def test_a_gap_that_opens_as_another_cell_closes_is_driven_through() -> None:
+    walled = GridMap(np.zeros((60, 80)), CELL).with_patch(np.ones((50, 2)), 40, 0)
+    changed = np.ones((30, 2))
+    changed[1:13] = 0
+    changed = np.pad(changed, ((0, 0), (0, 10)))  # and one cell beside the wall
+    changed[15, -1] = 1
+    opened = walled.with_patch(changed, 40, 5)
+    start, goal = (pose_of(walled, (x, 12, 0)) for x in (20, 65))
+    body = planner("differential")
+    around = plan(body, walled, start, goal, bound=1.0)
+    found = plan(body, opened, start, goal, bound=1.0)
+    assert found.cost == pytest.approx(45)
+    assert found.cost < around.cost
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_wide_body_of_short_steps_drives_around_what_comes_beside_its_path(
+    side: int,
+) -> None:
+    motions = make_motions("differential", 0.2, CELL)
+    is_short = np.abs(motions.offset).max(axis=1) <= 2
+    motions = replace(
+        motions,
+        **{
+            name: getattr(motions, name)[is_short]
+            for name in ("start", "end", "offset", "cost")
+        },
+        poses=tuple(
+            poses for poses, short in zip(motions.poses, is_short, strict=True) if short
+        ),
+    )
+    footprint = read_footprint(
+        "[[0.1, 0.45], [-0.1, 0.45], [-0.1, -0.45], [0.1, -0.45]]"
+    )
+    network = SimpleNamespace(
+        motions=motions,
+        swept=lambda: swept_cells(footprint, motions),
+        footprint=footprint,
+    )
+    hall = GridMap(np.zeros((44, 80)), CELL)
+    for row in range(20, 24):  # wherever it lies in its tile
+        start, goal = (pose_of(hall, (x, row, 0)) for x in (10, 70))
+        body = PosePlanner(network)
+        before = plan(body, hall, start, goal, bound=1.0)
+        grid = hall.with_patch([[True]], 40, row + 5 * side)
+        after = plan(body, grid, start, goal, bound=1.0)
+        fresh = plan(PosePlanner(network), grid, start, goal, bound=1.0)
+        assert after.cost == pytest.approx(fresh.cost, rel=1e-5)
+        assert after.cost > before.cost
