@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from integration.messages import NUMBERS_32, STAMPED_POSES, maps, some_parameters
 from integration.robot import GOAL, NUMBERS, Robot, check_path
@@ -16,13 +16,14 @@ from load import BurstClients, GoalBursts, burst_requests
 from nav_msgs.msg import OccupancyGrid, Odometry
 from nav_msgs.srv import GetPlan
 from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
-from rclpy.parameter import Parameter
+from rclpy.parameter import Parameter, parameter_value_to_python
 from std_msgs.msg import UInt8MultiArray
 
 from ddqn_planner.nodes.conversions import grid_from_message
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.quality import LATCHED
 
+AN_INTEGER_FOR_A_DOUBLE = Parameter("map_timeout", value=0).to_parameter_msg()
 TOPICS = st.sampled_from(["initialpose", "goal_pose", "goal_poses", "odom"])
 fuzz = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -98,8 +99,19 @@ def test_any_pose_is_taken_or_refused(
 NAMES = [*PLANNER_PARAMETERS, "use_sim_time"]
 
 
+def in_type_of(current: Any, value: Any) -> Any:
+    """Return a value that was accepted, as the node keeps it.
+
+    It takes an integer for a double, and a double without a fraction for an integer.
+    """
+    if type(current) in (int, float) and type(value) in (int, float):
+        return type(current)(value)
+    return value
+
+
 @fuzz
 @given(parameters=some_parameters(NAMES), together=st.booleans())
+@example(parameters=[AN_INTEGER_FOR_A_DOUBLE], together=False)
 def test_any_parameters_are_answered(
     robot: Robot, parameters: list[Any], together: bool
 ) -> None:
@@ -108,7 +120,10 @@ def test_any_parameters_are_answered(
         values = robot.client.call(
             GetParameters, "planner/get_parameters", request
         ).values
-        return dict(zip(NAMES, values, strict=True))
+        return {
+            name: parameter_value_to_python(value)
+            for name, value in zip(NAMES, values, strict=True)
+        }
 
     expected = read()
     if together:
@@ -124,9 +139,8 @@ def test_any_parameters_are_answered(
     assert all(result.successful or result.reason for result in results)
     for parameter, result in zip(parameters, results, strict=True):
         if result.successful:
-            # Of its fields the one that its type names counts.
-            whole = Parameter.from_parameter_msg(parameter).to_parameter_msg()
-            expected[parameter.name] = whole.value
+            value = parameter_value_to_python(parameter.value)
+            expected[parameter.name] = in_type_of(expected[parameter.name], value)
     assert read() == expected
     robot.set(use_sim_time=False)
     robot.reset()

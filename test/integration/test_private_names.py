@@ -12,6 +12,7 @@ import rclpy
 ROOT = Path(__file__).resolve().parents[2] / "ddqn_planner"
 PUBLIC = {
     "_asdict",
+    "_fields",
     "_make",
     "_replace",
     "_exit",
