@@ -741,3 +741,26 @@ def test_a_first_map_is_waited_for_as_long_as_it_takes_on_a_loaded_machine() -> 
 
     assert may_come(3.0)  # as long as it took beside 14 busy processes on two cores
     assert not may_come(10.0)
+
+
+def test_zones_end_with_directions_that_cannot_hold(source: Source) -> None:
+    source.on_directions(1)
+    assert source.on_map(2) == (2, EAST)
+    elsewhere = directions_of(3)
+    elsewhere.header.frame_id = "odom"
+    source.directions.take(elsewhere)
+    assert source.used() == (2, None)
+
+
+def test_the_newest_map_waits_when_that_in_use_has_to_wait_too(
+    source: Source, set_parameters: SetParameters
+) -> None:
+    set_parameters(require_directions=True)
+    source.on_directions(1)
+    assert source.on_map(1) == (1, EAST)
+    assert source.on_map(2, yaw=0.1) == (1, EAST)
+    elsewhere = directions_of(3)
+    elsewhere.header.frame_id = "odom"
+    source.directions.take(elsewhere)
+    assert source.used() == NOTHING
+    assert source.on_directions(4, None) == (2, None)
