@@ -525,3 +525,23 @@ def test_what_another_learns_after_a_merge_is_not_merged(tmp_path: Path) -> None
     expected = driven(straight((2, 2), (12, 2)), straight((2, 3), (12, 3)))
     expected.merge(driven(straight((2, 5), (12, 5), 2)))
     assert one.to_bytes() == expected.to_bytes()
+
+
+def test_each_save_adds_to_the_file_what_is_new_alone(tmp_path: Path) -> None:
+    file = tmp_path / "experience.npz"
+    first, second, third, fourth = (
+        straight((2, y), (12, y), slowness)
+        for y, slowness in ((2, 1), (5, 2), (8, 4), (3, 3))
+    )
+    one = driven(first, second)
+    one.save(file)
+    other = Experience.load(file)
+    other.record(*third)
+    other.save(file)
+    one.record(*fourth)
+    one.save(file)
+    expected = driven(first, second, third, fourth)
+    for measured in ("slowness", "uncertainty"):
+        np.testing.assert_allclose(
+            getattr(one, measured)(HALL), getattr(expected, measured)(HALL), rtol=1e-6
+        )
