@@ -89,7 +89,8 @@ class PlannerNode(ManagedNode):
         self._worker = Worker(self)
         self._map_worker = Worker(self)
         self._display_worker = Worker(self)
-        self._model = ModelSource(self, self._diagnostics, self._worker)
+        self.model_source = ModelSource(self, self._diagnostics, self._worker)
+        """Loads the model; it holds the planner of paths."""
         self.deactivate()
         self.add_post_set_parameters_callback(self._apply_parameters)
         if self._settings.autostart:
@@ -103,7 +104,7 @@ class PlannerNode(ManagedNode):
         The state becomes active with the model, by `_on_replan`.
         """
         # Meanwhile DDS discovers other nodes, and the node tells what else is missing.
-        self._model.load()
+        self.model_source.load()
         self.change("configure")
         self.activate()
 
@@ -116,22 +117,27 @@ class PlannerNode(ManagedNode):
         # again.
         group = MutuallyExclusiveCallbackGroup()
         self._replan = self.create_guard_condition(self._on_replan, group)
-        self._map = MapSource(self, self._diagnostics, self._map_worker, self._on_map)
-        self._poses = Poses(
+        self.map_source = MapSource(
+            self, self._diagnostics, self._map_worker, self._on_map
+        )
+        """Receives the map and its updates; from `configure` to `cleanup`."""
+        self.poses = Poses(
             self,
             self._diagnostics,
             settings=lambda: self._settings,
-            map_frame=lambda: self._map.frame,
+            map_frame=lambda: self.map_source.frame,
             on_start=self._on_start,
         )
-        self._requests = Requests(
+        """Receives the robot's pose; from `configure` to `cleanup`."""
+        self.requests = Requests(
             self._settings,
-            self._map,
-            self._poses,
-            self._model,
+            self.map_source,
+            self.poses,
+            self.model_source,
             self._worker,
             self._check_soon,
         )
+        """Answers queries for paths; from `configure` to `cleanup`."""
         self.create_subscription(PoseStamped, "goal_pose", self._on_goals, 10)
         self.create_subscription(PoseArray, "goal_poses", self._on_goals, 10)
         if self._settings.follow_trainer:
@@ -143,15 +149,16 @@ class PlannerNode(ManagedNode):
         self.create_service(
             GetPlan, "~/get_plan", self._on_get_plan, callback_group=reentrant
         )
-        self.create_trigger("~/reload_model", self._model.on_reload)
-        navigation = NavigationServer(
+        self.create_trigger("~/reload_model", self.model_source.on_reload)
+        self.navigation = NavigationServer(
             refusal=lambda: self._refusal,
             plan=self._plan_for_action,
             await_other=self._await_other_planner,
             is_own=lambda planner_id: planner_id in ("", self._settings.planner_id),
             on_is_path_valid=self._on_is_path_valid,
         )
-        serve_nav2(self, navigation, self._settings.other_planners)
+        """Answers Nav2's requests, also where nav2_msgs is not installed."""
+        serve_nav2(self, self.navigation, self._settings.other_planners)
 
     def activate(self) -> None:
         """Answer requests from now on."""
@@ -183,12 +190,12 @@ class PlannerNode(ManagedNode):
         self._diagnostics.refused.clear()
         self._diagnostics.note(NO_REQUEST)
         self.jump_back_callbacks.clear()
-        for name in ("_poses", "_display", "_map", "_requests"):
+        for name in ("poses", "_display", "map_source", "requests"):
             if hasattr(self, name):  # `configure` may have failed before it
                 delattr(self, name)
         # At the end of the process nothing is freed: a collection may take a second.
         if not self.is_stopping:
-            self._model.forget()
+            self.model_source.forget()
 
     async def prepare(self, transition: str) -> bool:
         """Load the model before ``configure``; refuse waiting requests before a stop.
@@ -196,16 +203,16 @@ class PlannerNode(ManagedNode):
         Return False if the transition is impossible, as there is no model.
         """
         if transition == "configure":
-            self._model.load()
+            self.model_source.load()
             await unless_refused(
-                self._model.wait_until_loaded(), lambda: self.is_stopping
+                self.model_source.wait_until_loaded(), lambda: self.is_stopping
             )
-            return self._model.planner is not None and not self.is_stopping
+            return self.model_source.planner is not None and not self.is_stopping
         if transition != "activate":
             self._refuse(NOT_ACTIVE)
             while self.state in CONFIGURED and self.is_answering:
                 self._check_soon()
-                await self._requests.next_wake
+                await self.requests.next_wake
         return True
 
     def refuse_requests(self) -> None:
@@ -217,7 +224,7 @@ class PlannerNode(ManagedNode):
         """Answer all requests with a refusal, also those that wait."""
         self._refusal = refusal
         if self.state in CONFIGURED:
-            self._requests.wake_waiting()  # to see the refusal
+            self.requests.wake_waiting()  # to see the refusal
 
     # Parameters
 
@@ -246,28 +253,28 @@ class PlannerNode(ManagedNode):
         if not changed or self.state not in CONFIGURED:
             return
         if "model" in changed:
-            self._model.use(*self._new_model)
-        self._poses.listen_to_source()
-        self._requests.settings = self._settings
-        self._map.apply_parameters(changed)
+            self.model_source.use(*self._new_model)
+        self.poses.listen_to_source()
+        self.requests.settings = self._settings
+        self.map_source.apply_parameters(changed)
         if "experience" in changed:
-            self._map.times.use(self._new_experience)
+            self.map_source.times.use(self._new_experience)
         self._set_active_goal(self._active_goal.poses)
 
     def _on_model(self, message: UInt8MultiArray) -> None:
         """Plan with the trainer's model, or report it as refused."""
         with self._diagnostics.receiving("trainer/model"):
             data = bytes_of("model", message)
-            if message.layout == self._model.layout:  # the layout holds a digest
+            if message.layout == self.model_source.layout:  # the layout holds a digest
                 return
             planner = Planner(*model_of(data))
-            self._model.use(planner, "trainer/model", message.layout)
+            self.model_source.use(planner, "trainer/model", message.layout)
             self._set_active_goal(self._active_goal.poses)
 
     # Map, start and goal
 
     def _on_map(self) -> None:
-        self._requests.wake_waiting()
+        self.requests.wake_waiting()
         self._replan.trigger()
 
     def _on_start(self) -> None:
@@ -313,7 +320,7 @@ class PlannerNode(ManagedNode):
         """Answer ``~/get_plan``; a start without a frame means the robot's pose."""
         start = request.start if request.start.header.frame_id else None
         query = PathQuery(start, [request.goal], tolerance=request.tolerance)
-        outcome = await self._answer(query.goals, self._requests.plan(query))
+        outcome = await self._answer(query.goals, self.requests.plan(query))
         response.plan = path_message(*path_poses(outcome))
         self._diagnostics.log(outcome)
         return response
@@ -323,7 +330,7 @@ class PlannerNode(ManagedNode):
 
         A node that has started without a lifecycle manager becomes active before.
         """
-        await self._model.wait_until_loaded()
+        await self.model_source.wait_until_loaded()
         accepts_requests = self._refusal is None
         if accepts_requests and self.state == "inactive":
             self.change("activate")
@@ -337,7 +344,7 @@ class PlannerNode(ManagedNode):
         """
         active = self._active_goal
         goals = active.poses
-        outcome = await self._answer(goals, self._requests.plan_for(active))
+        outcome = await self._answer(goals, self.requests.plan_for(active))
         if outcome.status in (UNCHANGED.status, NOT_ACTIVE.status):
             return
         self._publish(outcome, active)
@@ -359,7 +366,7 @@ class PlannerNode(ManagedNode):
         self, query: PathQuery, given_up: GivenUp
     ) -> tuple[Path, Outcome]:
         """Return the path for a goal of an action, and the outcome."""
-        planning = self._requests.plan(query, self._path_of_action)
+        planning = self.requests.plan(query, self._path_of_action)
         outcome = await self._answer(query.goals, planning, given_up)
         poses = path_poses(outcome)
         if len(outcome.plan.path):
@@ -412,7 +419,7 @@ class PlannerNode(ManagedNode):
         def given_up() -> Outcome | None:
             return None if outcome is self._newest_outcome else UNCHANGED
 
-        better = await self._answer([], self._requests.improve(outcome), given_up)
+        better = await self._answer([], self.requests.improve(outcome), given_up)
         if outcome is self._active_goal.last and better.request is not None:
             self._publish(better, self._active_goal)
 
@@ -421,9 +428,7 @@ class PlannerNode(ManagedNode):
         response.is_valid = False
         # Releases whose response has this field need the robot's pose.
         has_success = hasattr(response, "success")
-        checking = check_path(
-            self._requests, PathCheck.of_message(request), has_success
-        )
+        checking = check_path(self.requests, PathCheck.of_message(request), has_success)
         try:
             with self.answering():
                 invalid_poses = await unless_refused(checking, lambda: self._refusal)
@@ -475,8 +480,8 @@ class PlannerNode(ManagedNode):
         """Return the frame of a path: its map's, or without a map the goal's."""
         if outcome.goal is not None:  # the node's map may be another one by now
             return str(outcome.goal.header.frame_id)
-        if self._map.frame or not goals:
-            return self._map.frame
+        if self.map_source.frame or not goals:
+            return self.map_source.frame
         return str(goals[0].header.frame_id)
 
     # Diagnostics
@@ -497,10 +502,10 @@ class PlannerNode(ManagedNode):
         self._set_check_period(SOON_PERIOD if self._expects_change() else IDLE_PERIOD)
         map_missing = ""
         if self.state in CONFIGURED:
-            map_missing = self._map.missing
+            map_missing = self.map_source.missing
             self._wake_requests(lacks_map=bool(map_missing))
         # Once all is compiled, the memory of the compiler is given back.
-        if llvm_was_used.is_set() and not self._model.loading:
+        if llvm_was_used.is_set() and not self.model_source.loading:
             llvm_was_used.clear()
             self._worker.call(give_back)
         if self._diagnostics.begin_period_if_due():
@@ -510,28 +515,30 @@ class PlannerNode(ManagedNode):
         """Return whether the next check has to come soon."""
         active = self._active_goal
         replans_often = bool(active.poses) and active.period < IDLE_PERIOD
-        is_map_settling = self.state in CONFIGURED and self._map.is_settling
+        is_map_settling = self.state in CONFIGURED and self.map_source.is_settling
         return replans_often or active.lacks_pose or is_map_settling
 
     def _wake_requests(self, lacks_map: bool) -> None:
         """Wake the requests that wait, and plan for the active goal if that is due."""
         active = self._active_goal
-        self._requests.wake_waiting()
-        self._poses.transform_initial_pose()
-        pose_has_come = active.lacks_pose and self._poses.can_transform(active.poses)
+        self.requests.wake_waiting()
+        self.poses.transform_initial_pose()
+        pose_has_come = active.lacks_pose and self.poses.can_transform(active.poses)
         if pose_has_come or active.is_check_due(lacks_map):
             self._replan.trigger()
 
     def _publish_diagnostics(self, map_missing: str) -> None:
         """Publish the diagnostics; `map_missing` says why there is no map, if so."""
         refusal = self._refusal.reason if self._refusal is not None else ""
-        model_missing = "the model is being loaded" if self._model.loading else ""
+        model_missing = "the model is being loaded" if self.model_source.loading else ""
         missing = [refusal, map_missing, model_missing]
         values = {"state": self.state}
-        values |= self._model.describe(self._settings.move_rule)
+        values |= self.model_source.describe(self._settings.move_rule)
         if self.state in CONFIGURED:
-            values |= self._map.describe()
-        is_fatal = self._model.planner is None and "model" in self._diagnostics.refused
+            values |= self.map_source.describe()
+        is_fatal = (
+            self.model_source.planner is None and "model" in self._diagnostics.refused
+        )
         self._diagnostics.publish(is_fatal, "; ".join(filter(None, missing)), values)
 
 

@@ -25,19 +25,20 @@ class Arrivals:
         """How many maps and updates came: also the number of the last one."""
         self.number_at_vain_wait = -1
         """What `number` was when a request last waited, and nothing came."""
-        self._times: deque[float] = deque(maxlen=INTERVALS + 1)
+        self.times: deque[float] = deque(maxlen=INTERVALS + 1)
+        """When the last maps and updates came, in seconds by the clock."""
 
     def note(self) -> float:
         """Count a map or an update that comes now; return the time in seconds."""
         now = self._clock()
         self.number += 1
-        self._times.append(now)
+        self.times.append(now)
         return now
 
     @property
     def period(self) -> float:
         """Seconds between messages, the median; infinite before the second message."""
-        intervals = np.diff(self._times)
+        intervals = np.diff(self.times)
         if len(intervals) == 0:
             return math.inf
         if len(intervals) <= 2:

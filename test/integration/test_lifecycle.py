@@ -211,7 +211,7 @@ def test_cleanup_frees_map_model_and_fields(make_robot: Any, model: Path) -> Non
     try:
         robot = make_robot("/freed")
         robot.begin()
-        planner, grid = node._model.planner, node._map.ready().result()
+        planner, grid = node.model_source.planner, node.map_source.ready().result()
         assert planner is not None
         freed = [weakref.ref(it) for it in (planner, grid, planner.q_field(grid, GOAL))]
         del planner, grid

@@ -476,10 +476,10 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
             node.set_parameters([Parameter("switch_threshold", value=threshold)])
             costs = values.copy()
             costs[dear, 10:20] = 2
-            node._map.take(map_message(costs, grid, next(NUMBERS)))
-            path, outcome = run(node._plan_for_action(task, lambda: None))
+            node.map_source.take(map_message(costs, grid, next(NUMBERS)))
+            path, outcome = run(node.navigation.plan(task, lambda: None))
             request, validity = SimpleNamespace(path=path), SimpleNamespace()
-            assert run(node._on_is_path_valid(request, validity)).is_valid
+            assert run(node.navigation.on_is_path_valid(request, validity)).is_valid
             return max(
                 stamped.pose.position.y for stamped in path.poses
             ) > 8, outcome.reason
@@ -498,9 +498,9 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
             False,
         ]
         assert "kept: its cost is +" in above_kept[1][1]
-        assert node._model.planner is not None
+        assert node.model_source.planner is not None
         assert (
-            node._model.planner.fields.nbytes == 0
+            node.model_source.planner.fields.nbytes == 0
         )  # what the node was started with holds
 
         def fail(*_: Any) -> GridMap:
@@ -513,14 +513,14 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
             ("none", False),
         ):
             node.set_parameters([Parameter("path_simplification", value=form)])
-            _, outcome = run(node._plan_for_action(task, lambda: None))
+            _, outcome = run(node.navigation.plan(task, lambda: None))
             assert (outcome.plan.extra_cost is not None) == is_kept
 
         # A path that cannot be checked is not valid, and the node lives.
         request, validity = SimpleNamespace(path=PathMessage()), SimpleNamespace()
-        node._map._inflate = fail
-        node._map.change()
-        assert not run(node._on_is_path_valid(request, validity)).is_valid
+        node.map_source._inflate = fail
+        node.map_source.change()
+        assert not run(node.navigation.on_is_path_valid(request, validity)).is_valid
     finally:
         node.destroy_node()
         try_shutdown()
@@ -544,9 +544,9 @@ def test_a_path_leads_through_its_goals_in_order_or_as_far_as_it_can() -> None:
         )
 
         def plan(*goals: PoseStamped, via: bool = False) -> tuple[PathMessage, Outcome]:
-            node._map.take(map_message(values, grid, next(NUMBERS)))
+            node.map_source.take(map_message(values, grid, next(NUMBERS)))
             task = PathQuery(start, [*goals], "", via)
-            future = executor.create_task(node._plan_for_action(task, lambda: None))
+            future = executor.create_task(node.navigation.plan(task, lambda: None))
             executor.spin_until_future_complete(future, TIMEOUT)
             path, outcome = future.result()
             return path, outcome

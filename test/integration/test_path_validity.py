@@ -50,6 +50,8 @@ class Asked:
     def __init__(self, node: PlannerNode) -> None:
         self.node, self._executor = node, SingleThreadedExecutor()
         self._executor.add_node(node)
+        self._plans = node.create_client(GetPlan, "~/get_plan")
+        assert self._plans.wait_for_service(60)
 
     def run(self, task: Any) -> Any:
         future = self._executor.create_task(task)
@@ -60,17 +62,19 @@ class Asked:
         defaults, answer = RELEASES[release]
         request = SimpleNamespace(path=path, **{**defaults, **fields})
         response = SimpleNamespace(**answer)
-        return self.run(self.node._on_is_path_valid(request, response))
+        return self.run(self.node.navigation.on_is_path_valid(request, response))
 
     def set_map(self, values: np.ndarray) -> None:
-        self.node._map.take(map_message(values, GRID, next(NUMBERS)))
+        self.node.map_source.take(map_message(values, GRID, next(NUMBERS)))
 
     def stand(self, stamped: PoseStamped) -> None:
-        self.node._poses.receive(stamped)
+        self.node.poses.receive(stamped)
 
     def get_plan(self, start: PoseStamped, goal: PoseStamped, **fields: Any) -> Path:
         request = GetPlan.Request(start=start, goal=goal, **fields)
-        return self.run(self.node._on_get_plan(request, GetPlan.Response())).plan
+        future = self._plans.call_async(request)
+        self._executor.spin_until_future_complete(future, 60)
+        return future.result().plan
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +124,8 @@ def test_each_release_gets_the_fields_that_it_has(asked: Asked, release: str) ->
         assert asked.check(path, release, max_cost=150).invalid_pose_indices == [20]
         unknown = asked.check(path, release, consider_unknown_as_obstacle=True)
         assert unknown.invalid_pose_indices == [21]
-    asked.node._poses._last_pose = None
+    for source in ("odometry", "initialpose"):  # the set pose is forgotten
+        asked.node.set_parameters([Parameter("start_source", value=source)])
 
 
 def test_newer_requests_name_all_poses_a_footprint_and_a_distance(asked: Asked) -> None:

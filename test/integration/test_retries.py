@@ -65,18 +65,20 @@ class Asked:
         if seconds_ahead is not None:
             stamp = self.node.get_clock().now() + Duration(seconds=seconds_ahead)
             message.header.stamp = stamp.to_msg()
-        self.node._map.take(message)
+        self.node.map_source.take(message)
 
     def send_update(self, values: np.ndarray) -> None:
         """Send all cells as an update, which has no stamp, as Nav2's costmaps do."""
         height, width = values.shape
         box = {"x": 0, "y": 0, "width": width, "height": height}
         header, data = Header(frame_id="map"), array.array("b", values.tobytes())
-        self.node._map.take_update(SimpleNamespace(header=header, data=data, **box))
+        self.node.map_source.take_update(
+            SimpleNamespace(header=header, data=data, **box)
+        )
 
     def set_period(self, seconds: float) -> None:
         """Let the last costmaps have come so far apart."""
-        times = self.node._map.arrivals._times
+        times = self.node.map_source.arrivals.times
         times.clear()
         times.extend([0.0, seconds])
 
@@ -91,7 +93,7 @@ class Asked:
     ) -> Any:
         """Return the future of an answer, asked for as an action asks."""
         task = PathQuery(pose(GRID, START), [pose(GRID, goal)], "")
-        return self.executor.create_task(self.node._plan_for_action, task, given_up)
+        return self.executor.create_task(self.node.navigation.plan, task, given_up)
 
     def answer(self, task: Any) -> str:
         """Return the status of an answer."""
@@ -178,7 +180,7 @@ def test_the_last_costmap_in_time_counts_though_it_is_planned_on_later(
     clock = SimpleNamespace(monotonic=lambda: time.monotonic() + late[0])
     monkeypatch.setattr("ddqn_planner.nodes.requests.time", clock)
     failed_before(asked)
-    plan_once, costmaps = asked.node._requests.plan_once, [RING, FREE]
+    plan_once, costmaps = asked.node.requests.plan_once, [RING, FREE]
 
     async def slow_plan(*arguments: Any, **options: Any) -> Outcome:
         outcome = await plan_once(*arguments, **options)
@@ -188,7 +190,7 @@ def test_the_last_costmap_in_time_counts_though_it_is_planned_on_later(
             late[0] += 2500.0
         return outcome
 
-    monkeypatch.setattr(asked.node._requests, "plan_once", slow_plan)
+    monkeypatch.setattr(asked.node.requests, "plan_once", slow_plan)
     assert asked.answer(asked.ask()) == "SUCCEEDED"
 
 
@@ -223,16 +225,16 @@ def test_a_deactivation_answers_at_once(asked: Asked) -> None:
 def test_a_costmap_that_stays_away_is_awaited_once(asked: Asked) -> None:
     failed_before(asked)
     asked.set_period(0.05)
-    wait = asked.node._map.retry_wait
+    wait = asked.node.map_source.retry_wait
     assert wait == pytest.approx(0.1)
     assert asked.answer(asked.ask()) == "NO_PATH"
-    assert asked.node._map.retry_wait == 0
+    assert asked.node.map_source.retry_wait == 0
     asked.send(RING)
-    assert asked.node._map.retry_wait > 0
+    assert asked.node.map_source.retry_wait > 0
 
 
 def test_how_long_a_retry_waits(asked: Asked) -> None:
-    map_source = asked.node._map
+    map_source = asked.node.map_source
     asked.send(RING)
     assert map_source.retry_wait == 3600  # one costmap has no period
     asked.set(map_timeout=0.0)
@@ -299,4 +301,7 @@ def test_a_retry_has_the_goal_of_a_recent_failure(
         assert not retries.is_retry([at(1.0)], 7, resolution)
     for number in range(40):
         retries.note([at(float(number))], 7, outcome("NO_PATH"))
-    assert len(retries._failures) == 16
+    remembered = [
+        retries.is_retry([at(float(number))], 7, resolution) for number in range(40)
+    ]
+    assert remembered == 24 * [False] + 16 * [True]

@@ -240,15 +240,17 @@ def test_actions_lead_through_poses_and_paths_are_checked(
 
     def is_valid(path: Path) -> bool:
         answer = run(
-            node._on_is_path_valid(SimpleNamespace(path=path), SimpleNamespace())
+            node.navigation.on_is_path_valid(
+                SimpleNamespace(path=path), SimpleNamespace()
+            )
         )
         return bool(answer.is_valid)
 
     try:
         executor.add_node(node)
-        node._map.take(map_message(rooms, grid, next(NUMBERS)))
+        node.map_source.take(map_message(rooms, grid, next(NUMBERS)))
         path, outcome = run(
-            node._plan_for_action(PathQuery(start, [middle, goal], ""), lambda: None)
+            node.navigation.plan(PathQuery(start, [middle, goal], ""), lambda: None)
         )
         poses = check(path, grid, BEYOND, 1.0)
         assert outcome.status == "SUCCEEDED"
@@ -257,11 +259,9 @@ def test_actions_lead_through_poses_and_paths_are_checked(
         )
         assert np.abs(np.diff(poses, axis=0)).max(axis=1).min() > 1e-6
         assert any(ends_at(Path(poses=[it]), grid, BESIDE, 2.0) for it in path.poses)
-        first, _ = run(
-            node._plan_for_action(PathQuery(start, [goal], ""), lambda: None)
-        )
+        first, _ = run(node.navigation.plan(PathQuery(start, [goal], ""), lambda: None))
         again, outcome = run(
-            node._plan_for_action(PathQuery(first.poses[9], [goal], ""), lambda: None)
+            node.navigation.plan(PathQuery(first.poses[9], [goal], ""), lambda: None)
         )
         assert outcome.plan.extra_cost is not None  # kept
         assert np.array_equal(array_of(again), array_of(first)[9:])
@@ -271,9 +271,9 @@ def test_actions_lead_through_poses_and_paths_are_checked(
         narrow = rooms.copy()
         narrow[:, 28:33] = 100
         narrow[24:29, 28:33] = 0
-        node._map.take(map_message(narrow, grid, next(NUMBERS)))
+        node.map_source.take(map_message(narrow, grid, next(NUMBERS)))
         through, _ = run(
-            node._plan_for_action(PathQuery(start, [goal], ""), lambda: None)
+            node.navigation.plan(PathQuery(start, [goal], ""), lambda: None)
         )
         poses_through = array_of(through)
         from_door = np.abs(poses_through[:, :2] - grid.cell_to_world((30, 26))).sum(
@@ -284,18 +284,18 @@ def test_actions_lead_through_poses_and_paths_are_checked(
         aside.pose.position.x -= 0.06 * math.sin(ORIGIN[2])
         aside.pose.position.y += 0.06 * math.cos(ORIGIN[2])
         rest, outcome = run(
-            node._plan_for_action(PathQuery(aside, [goal], ""), lambda: None)
+            node.navigation.plan(PathQuery(aside, [goal], ""), lambda: None)
         )
         assert np.array_equal(array_of(rest), poses_through[number:])
         assert (
             "cells, kept, as there is none from the cell and heading nearest"
             in outcome.reason
         )
-        node._map.take(map_message(rooms, grid, next(NUMBERS)))
+        node.map_source.take(map_message(rooms, grid, next(NUMBERS)))
         blocked = rooms.copy()
         x, y = grid.world_to_cell(*poses[len(poses) // 2, :2])
         blocked[y, x] = 100
-        node._map.take(map_message(blocked, grid, next(NUMBERS)))
+        node.map_source.take(map_message(blocked, grid, next(NUMBERS)))
         assert not is_valid(path)
     finally:
         node.destroy_node()
