@@ -41,7 +41,10 @@ class Places:
         return cls(weight, sum_of_log, passages, waited, predicted, position)
 
     def table(self) -> Float64:
-        """Return the places as the rows of a table, (N, 7), which files hold."""
+        """Return the places as the rows of a table, (N, 7), which files hold.
+
+        The last two columns are x and y of the position; the class tells the others.
+        """
         columns = (
             self.weight,
             self.sum_of_log,

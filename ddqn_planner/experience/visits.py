@@ -216,9 +216,10 @@ def averaged(poses: Poses, window: float) -> Poses:
 
 
 def indices_apart(position: Float64, metres: float) -> list[int]:
-    """Return the index 0, and of each position so far from the last one returned.
+    """Return indices of positions, (N, 2), that lie at least so many `metres` apart.
 
-    `position` is (N, 2), and `metres` the distance.
+    The first index is 0. Each further index is that of the next position that is far
+    enough from the position chosen before.
     """
     points = position.tolist()
     indices = [0]

@@ -119,7 +119,7 @@ class FieldDisplay:
     def _publish_on(self, topic: Topic, picture: Picture) -> None:
         """Publish a picture on a topic, unless the topic shows the picture already.
 
-        The topic of the other kind of robot, with or without a body, shows nothing.
+        A topic for robots with a body is empty for a plan of cells, and the reverse.
         """
         has_body = isinstance(picture.outcome.plan, PosePlan)
         is_empty = picture.is_empty or has_body != topic.is_for_bodies

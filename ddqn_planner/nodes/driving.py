@@ -68,6 +68,10 @@ class DrivingRobot:
         name: str,
         on_drive: Callable[[str, Drive], None],
     ) -> None:
+        """Subscribe to the topics of the robot `name`; "" for the node's own robot.
+
+        `on_drive` gets the text " by NAME", or "", and each drive that has ended.
+        """
         self._node = node
         self._frames = frames
         self._name = name

@@ -430,14 +430,16 @@ def outcome_of(
     inputs : PlanInputs
     settings : PlannerSettings
     legs : Legs
-        From stop to stop. Or one leg, from the start to the nearest of several goals.
+        The plans from stop to stop, and the request of the last of them. Or one plan,
+        from the start to the nearest of several goals.
     stops : sequence of MapPose
         The start, and then the goals. There may be fewer legs than goals.
     """
     request, plans = legs
     plan = plans[0] if len(plans) == 1 else joined(plans)
     leg_starts = [stop.message for stop in stops[: len(plans)]]
-    possible_goals = stops[len(plans) :]  # of the last leg, or goals after its goal
+    # Of the last leg; or its goal, and behind it the goals that no leg reaches.
+    possible_goals = stops[len(plans) :]
     goal = possible_goals[nearest_goal(request, plan)].message
     path = NO_PATH
     if len(plan.path):

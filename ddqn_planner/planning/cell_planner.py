@@ -209,7 +209,8 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
         """Return the plan by a field that is grown as far as the start.
 
         None if the start or all goals are occupied, or if the field leads nowhere. Sets
-        the costs of the task.
+        the costs of the task. Without costs of moves, a field can have one goal alone:
+        of several, only the nearest one stays a goal of the task, and None is returned.
         """
         if task.failed_rollout is not None:  # a kept field leads nowhere
             return None

@@ -176,15 +176,20 @@ class FieldCache(Generic[AnyField]):
         return None
 
     def _most(self, fields: list[AnyField]) -> int:
-        """Return how many fields, those at the end of a list, may be kept."""
+        """Return how many fields, those at the end of a list, may be kept.
+
+        They may hold `nbytes`, the limit of the cache, but `ALWAYS_KEPT` of them always
+        stay.
+        """
         held_bytes = 0
         counted_arrays = set[int]()
         for count, field in enumerate(reversed(fields)):
             held_bytes += OBJECTS + field.nbytes
-            for array, nbytes in field.map_arrays:
-                if array not in counted_arrays:
-                    counted_arrays.add(array)
-                    held_bytes += nbytes
+            # Fields of one map share its arrays, which count once.
+            for array_id, array_bytes in field.map_arrays:
+                if array_id not in counted_arrays:
+                    counted_arrays.add(array_id)
+                    held_bytes += array_bytes
             is_too_much = held_bytes > self.nbytes or count >= MOST_KEPT
             if is_too_much and count >= ALWAYS_KEPT:
                 return count

@@ -37,9 +37,9 @@ MAPS: Final = 512
 
 
 def random_scenarios(seed: int, maps: int = MAPS) -> list[Scenario]:
-    """Draw as many `maps` to train on, half for each move rule, with start and goal.
+    """Draw maps to train on, half of them for each move rule, with a start and a goal.
 
-    A path leads from each start to its goal.
+    `maps` is their number. A path leads from each start to its goal.
     """
     random = np.random.default_rng(as_seed(seed))
     scenarios = []
@@ -47,7 +47,7 @@ def random_scenarios(seed: int, maps: int = MAPS) -> list[Scenario]:
         rule = MOVE_RULES[number % len(MOVE_RULES)]
         # High fill rates show 3x3 patches that are rare otherwise.
         occupancy = random.random((10, 10)) < random.uniform(0.1, 0.6)
-        # A map has one of four kinds of costs. All four are drawn for each map: fewer
+        # A map has one of four kinds of costs. All kinds are drawn for each map: fewer
         # draws would change all later maps of the seed.
         constant = np.full(occupancy.shape, random.integers(100), dtype=np.int8)
         partly_unknown = unknown_costs(occupancy, 0.3, random)
