@@ -155,7 +155,8 @@ class MapServerNode(BaseNode):
     def _on_scatter_obstacles(self) -> tuple[bool, str]:
         """Serve the loaded map with new obstacles, without those of earlier calls.
 
-        Obstacles fall off the path of `known_path`. Return success and a message.
+        Obstacles fall on or beside the path of `known_path`, but not on its ends.
+        Return success and a message.
         """
         loaded = self._loaded
         try:

@@ -36,7 +36,7 @@ NO_PATH: Final = ExactPath(np.empty((0, 2)), 0.0)
 def exact_path(
     legs: Sequence[Path], grid: GridMap, points: Sequence[Point]
 ) -> ExactPath:
-    """Return the path along the cells of legs that leads through exact points.
+    """Return the path along the cells of legs, through exact points, and its length.
 
     Parameters
     ----------
@@ -51,18 +51,16 @@ def exact_path(
     Returns
     -------
     ExactPath
-        Where a straight piece from or to an exact point would touch an occupied cell,
-        or leave a cell as the cell forbids, the path also passes the centre of that
-        point's cell.
+        Its length is in cells. Where a straight piece from or to an exact point would
+        touch an occupied cell, or leave a cell as the cell forbids, the path also
+        passes the centre of that point's cell.
     """
     begin = _point_in(grid, legs[0][0], points[0])
     parts = [begin]
     for path, point in zip(legs, points[1:], strict=True):
         end = _point_in(grid, path[-1], point)
-        corners = _corners_between(
-            path, grid, _in_cells(begin, grid), _in_cells(end, grid)
-        )
-        parts += [grid.centres(corners), end]
+        cells = _cells_between(path, grid, _in_cells(begin, grid), _in_cells(end, grid))
+        parts += [grid.centres(cells), end]
         begin = end
     path_points = np.vstack(parts)
     is_new = np.append(True, np.diff(path_points, axis=0).any(axis=1))
@@ -111,7 +109,7 @@ def _in_cells(points: Float64, grid: GridMap) -> Float64:
     return grid.in_cells(points) - 0.5
 
 
-def _corners_between(path: Path, grid: GridMap, begin: Float64, end: Float64) -> Path:
+def _cells_between(path: Path, grid: GridMap, begin: Float64, end: Float64) -> Path:
     """Return the cells of a leg (N, 2) through whose centres a path leads.
 
     The points `begin` and `end`, in cells, lie in the first and in the last cell of the

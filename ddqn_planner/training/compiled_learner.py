@@ -528,7 +528,8 @@ def play(
 
     It ends when an episode ends, at step `last_step`, or after so many steps as take
     some milliseconds. The generators `exploration` and `sampling` draw actions and
-    batches. Of the counters, `replayed` counts the transitions that were put into the replay buffer.
+    batches. Of the counters, `replayed` counts the transitions that were put into the
+    replay buffer.
     """
     game, learning, robots = training
     settings = learning.settings
