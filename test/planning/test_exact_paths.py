@@ -226,5 +226,5 @@ def test_a_piece_to_a_centre_is_not_direct_if_it_touches_an_obstacle() -> None:
         (leg, (start, goal), [0.5, 0.5]),
         (leg[::-1], (goal, start), [0.5, 0.5]),
     ):
-        path = exact_path([cells], grid, MoveRule.ROBOT_SAFE, ends)
+        path = exact_path([cells], grid, ends)
         assert path.points.tolist() == [[*ends[0]], centre, [*ends[1]]]
