@@ -100,6 +100,21 @@ def test_a_long_pause_ends_a_drive_and_the_next_begins_there(robot: Robot) -> No
     assert robot.drives[1].positions[0] == pytest.approx([2.1, 2], abs=0.1)
 
 
+@pytest.mark.parametrize("metres", [0.925, 0.95, 0.975, 1.0])
+def test_the_pose_may_shift_after_a_drive_until_the_next_begins(
+    robot: Robot, metres: float
+) -> None:
+    robot.move(metres)
+    robot.recorder.end()
+    robot.move(0.075)
+    robot.stand(30)
+    robot.move(1)
+    robot.recorder.end()
+    assert robot.outcomes == ["stopped", "stopped"]
+    seconds = robot.drives[1].seconds
+    assert seconds[-1] - seconds[0] == pytest.approx(2, abs=0.2)  # no stand before
+
+
 def test_who_gives_up_ends_a_drive_also_before_it_moved(robot: Robot) -> None:
     nowhere = Robot()
     nowhere.recorder.abort()
