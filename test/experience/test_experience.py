@@ -200,6 +200,19 @@ def test_what_cannot_be_true_is_not_believed(fault: str) -> None:
     assert visited[20, 10:22].all()
 
 
+@pytest.mark.parametrize("pause", [600.0, 3600.0])
+def test_a_long_pause_makes_no_far_pose_believable(pause: float) -> None:
+    here = straight((2, 5), (12, 5))
+    far = straight((202, 5), (212, 5), began=here[0][-1] + pause)
+    back = straight((12, 5), (14, 5), began=far[0][-1] + 1)
+    seconds, positions = map(np.concatenate, zip(here, far, back, strict=True))
+    long_hall = GridMap(np.zeros((40, 900), dtype=bool), 0.25)
+    uncertainty = driven((seconds, positions)).uncertainty(long_hall)
+    assert at(long_hall, uncertainty, 207, 5) == uncertainty.max()
+    for x in (7, 13):
+        assert at(long_hall, uncertainty, x, 5) < 0.7 * uncertainty.max()
+
+
 def test_a_move_faster_than_the_robot_tells_nothing_of_the_places_on_its_way() -> None:
     # Twice a second a pose, and one correction ahead so small that it is no jump.
     seconds, positions = straight((2, 5), (11.4, 5), rate=2.0)
@@ -346,7 +359,8 @@ def test_every_broken_file_is_named(path: Path) -> None:
         ("driven", np.zeros(2)),
         ("driven", np.array("a")),
         ("driven", -1.0),
-        ("evidence", -np.ones((1, 7))),
+        # Neither a weight nor passages nor seconds waited are negative.
+        *[("evidence", -np.eye(1, 7, column)) for column in (0, 2, 3)],
         ("evidence", np.zeros((39, 5))),
         ("evidence", np.zeros((39, 7))),
         ("evidence", np.full((1, 7), 1e9)),
