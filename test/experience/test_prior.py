@@ -47,6 +47,13 @@ def test_features_tell_walls_and_narrow_ways_and_a_wall_stands_around_the_map() 
     assert narrow[20, 10] > 4 * np.delete(narrow[:, 10], 20).max()
 
 
+def test_a_passage_has_the_length_between_its_walls_up_to_6_metres() -> None:
+    for cells, metres in ((8, 2), (16, 4), (22, 5.5), (24, 6), (40, 6), (400, 6)):
+        passage = GridMap(np.zeros((4, cells), dtype=bool), 0.25)
+        log_length = map_features(passage)[..., 6]
+        assert np.exp(log_length) == pytest.approx(metres)
+
+
 def test_a_robots_body_moves_no_wall() -> None:
     grid = GridMap(np.arange(400).reshape(20, 20) % 37 == 0, 0.25)
     assert (map_features(inflate(grid, 0.5)) == map_features(grid)).all()
