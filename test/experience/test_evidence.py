@@ -83,6 +83,18 @@ def test_evidence_where_an_obstacle_stands_now_counts_beside_it() -> None:
     assert max(at(grid, slowness, 7, 4.9), at(grid, slowness, 7, 5.4)) > 2
 
 
+@pytest.mark.parametrize(("thickness", "counts"), [(0.6, True), (1.2, False)])
+def test_evidence_in_a_wall_counts_beside_it_if_that_is_a_place_away(
+    thickness: float, counts: bool
+) -> None:
+    rows = round(thickness / 2 / 0.05)  # of the wall, on each side of the drive
+    occupancy = np.zeros((200, 300), dtype=bool)
+    occupancy[100 - rows : 100 + rows] = True
+    unsure = driven(straight((2, 5), (12, 5))).uncertainty(GridMap(occupancy, 0.05))
+    beside_wall = unsure[[99 - rows, 100 + rows], 140]
+    assert (beside_wall.min() < 0.5 * unsure.max()) == counts
+
+
 def test_a_map_is_the_same_while_nothing_was_learned() -> None:
     experience = driven(*[straight((2, 5.1), (12, 5.1), 3)] * 6)
     first = experience.apply(HALL, exploration=0.1)
@@ -103,14 +115,18 @@ def test_a_map_is_the_same_while_nothing_was_learned() -> None:
 def test_a_map_in_another_resolution_and_frame_keeps_it(
     resolution: float, yaw: float
 ) -> None:
-    experience = driven(*[straight((4, 4), (11, 6), 3)] * 3)
+    slow = straight((4, 4), (11, 6), 6)
+    fast = straight((4, 6), (11, 8), 1.5)
+    experience = driven(*[slow, fast] * 3)
     shape = int(20 / resolution), int(20 / resolution)
     grid = GridMap(
         np.zeros(shape, dtype=bool), resolution, (0.0, 0.0 if yaw == 0 else -8.0, yaw)
     )
+    slowness = experience.slowness(grid)
     for share in (0.2, 0.5, 0.8):
         x, y = 4 + 7 * share, 4 + 2 * share
-        assert at(grid, experience.slowness(grid), x, y) == pytest.approx(3, rel=0.1)
+        assert at(grid, slowness, x, y) == pytest.approx(6, rel=0.25)
+        assert at(grid, slowness, x, y + 2) == pytest.approx(1.5, rel=0.25)
 
 
 def test_a_map_without_a_free_cell_has_nowhere_to_be_slow() -> None:
@@ -265,6 +281,15 @@ def test_where_robots_wait_at_several_places_waits_are_expected_elsewhere_too() 
     assert several > 1.1 * open_way
 
 
+def test_two_waits_close_by_say_nothing_of_the_places_elsewhere() -> None:
+    open_way = driven(*[waited(0.0)] * 4)
+    queue = driven(*[waited(20.0), waited(19.0, 7.5)] * 2)
+    elsewhere = np.s_[:10]  # rows of the hall, far from the drives
+    without_waits = open_way.slowness(HALL)[elsewhere].mean()
+    with_waits = queue.slowness(HALL)[elsewhere].mean()
+    assert with_waits == pytest.approx(without_waits, rel=0.02)
+
+
 def test_a_failure_costs_as_a_wait_and_is_forgotten_where_the_robot_succeeds() -> None:
     experience = driven(straight((2, 5), (12, 5)))
     experience.record_failure((7, 5))
@@ -301,6 +326,15 @@ def test_nine_of_ten_drives_take_a_time_within_their_interval(noise: float) -> N
     assert 0.8 < np.mean(inside[50:]) <= 1
     assert expected.low < expected.seconds < expected.high
     assert expected.seconds == pytest.approx(actual, rel=0.3)
+
+
+def test_a_move_is_as_sure_as_the_place_to_which_it_leads() -> None:
+    experience = driven(*[straight((2, 5), (7, 5))] * 3)
+    grid = GridMap(np.zeros((10, 15), dtype=bool), 1.0)
+    driven_place = 4, 5
+    away = experience.expected_time(grid, [driven_place, (4, 6)])
+    back = experience.expected_time(grid, [(4, 6), driven_place])
+    assert away.high / away.low > 1.5 * back.high / back.low
 
 
 @pytest.mark.parametrize("origin", [(-3.0, 2.0, 0.0), (5.0, -8.0, 0.7)])
