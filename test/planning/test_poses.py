@@ -712,3 +712,56 @@ def test_a_wide_body_of_short_steps_drives_around_what_comes_beside_its_path(
         fresh = plan(PosePlanner(network), grid, start, goal, bound=1.0)
         assert after.cost == pytest.approx(fresh.cost, rel=1e-5)
         assert after.cost > before.cost
+
+
+@pytest.mark.parametrize("motion", sorted(BODIES))
+def test_cells_that_no_robot_may_leave_any_more_are_driven_around(motion: str) -> None:
+    forbidden = np.zeros((24, 80), np.uint8)
+    forbidden[0, 0] = 255  # so that both maps have the layer and can be compared
+    hall = GridMap(np.zeros((24, 80)), CELL, forbidden=forbidden)
+    forbidden[10:15, 30] = 255
+    changed = hall.with_layers(forbidden=forbidden)
+    start, goal = (pose_of(hall, (x, 12, 0)) for x in (5, 70))
+    body = planner(motion)
+    straight = plan(body, hall, start, goal, bound=1.0)
+    around = plan(body, changed, start, goal, bound=1.0)
+    fresh = plan(planner(motion), changed, start, goal, bound=1.0)
+    assert around.cost == pytest.approx(fresh.cost, rel=1e-5)
+    assert around.cost > straight.cost
+    assert not any(x == 30 and 10 <= y < 15 for x, y in around.cells)
+
+
+def test_a_robot_that_stands_drives_around_a_box_though_all_else_was_searched() -> None:
+    hall = GridMap(np.zeros((24, 60)), CELL).with_patch(np.ones((24, 1)), 44, 0)
+    boxed = hall.with_patch(np.ones((3, 3)), 17, 11)
+    start, goal, outside = (
+        pose_of(hall, state) for state in ((8, 12, 0), (36, 12, 0), (52, 12, 0))
+    )
+    body = planner("differential")
+    # It searches all states from which paths lead to the goal.
+    assert plan(body, hall, outside, goal).status is PlanStatus.NO_PATH
+    straight = plan(body, hall, start, goal, bound=1.0)
+    around = plan(body, boxed, start, goal, bound=1.0)
+    fresh = plan(planner("differential"), boxed, start, goal, bound=1.0)
+    assert around.status is PlanStatus.SUCCEEDED
+    assert around.cost == pytest.approx(fresh.cost, rel=1e-5)
+    assert around.cost > straight.cost
+
+
+def test_a_search_under_way_does_not_see_the_map_of_a_later_request() -> None:
+    walled = GridMap(np.zeros((76, 120)), CELL).with_patch(np.ones((64, 2)), 50, 0)
+    closed = walled.with_patch(np.ones((12, 2)), 50, 64)
+    start, goal, start_of_other, goal_of_other = (
+        pose_of(walled, state)
+        for state in ((45, 5, 0), (115, 5, 0), (10, 10, 0), (20, 10, 0))
+    )
+    body = planner("differential")
+    steps = body.steps(PoseRequest(walled, start, (goal,), bound=1.0))
+    while not body.fields.kept:
+        assert next(steps) is None  # a pause: other requests have a turn
+    other = plan(body, closed, start_of_other, goal_of_other)
+    assert other.status is PlanStatus.SUCCEEDED
+    found = last_step(steps)
+    fresh = plan(planner("differential"), walled, start, goal, bound=1.0)
+    assert found.status is PlanStatus.SUCCEEDED
+    assert found.cost == pytest.approx(fresh.cost, rel=1e-5)
