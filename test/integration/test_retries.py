@@ -22,6 +22,7 @@ from rclpy.utilities import try_shutdown
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import GridMap
+from ddqn_planner.nodes.active_goal import ActiveGoal
 from ddqn_planner.nodes.base_node import FAREWELL
 from ddqn_planner.nodes.nav2 import CANCELED
 from ddqn_planner.nodes.outcome import NOT_ACTIVE, STOPPING, Outcome, PathQuery
@@ -144,6 +145,20 @@ def test_a_retry_waits_for_the_cleared_costmap_and_no_other_request_does(
     # After a successful plan a failure is answered at once.
     asked.send(RING)
     assert asked.answer(asked.ask()) == "NO_PATH"
+
+
+def test_a_request_for_the_active_goal_that_failed_is_a_retry(asked: Asked) -> None:
+    asked.send(RING)
+    asked.set_period(1000.0)
+    asked.node.poses.receive(pose(GRID, START))
+    active = ActiveGoal([pose(GRID, GOAL)], period=0.0)
+    planning = asked.executor.create_task(asked.node.requests.plan_for, active)
+    asked.executor.spin_until_future_complete(planning, TIMEOUT)
+    assert planning.result().status == "NO_PATH"
+    retry = asked.ask()
+    assert asked.is_waiting(retry)
+    asked.send(FREE)
+    assert asked.answer(retry) == "SUCCEEDED"
 
 
 def test_a_retry_waits_whatever_the_stamps_of_costmaps(

@@ -22,8 +22,13 @@ from visualization_msgs.msg import Marker, MarkerArray
 from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.nodes.conversions import grid_from_message
 from ddqn_planner.nodes.outcome import PathQuery
+from ddqn_planner.nodes.parameters import PlannerSettings
 from ddqn_planner.nodes.planner_node import PlannerNode
 from ddqn_planner.nodes.quality import LATCHED
+from ddqn_planner.nodes.requests import MapPose, PlanInputs, request_to
+from ddqn_planner.planning import Planner, PlanStatus
+from ddqn_planner.planning.path_finder import last_step
+from ddqn_planner.planning.pose_planner import PoseRequest
 
 CELL, ORIGIN = 0.1, (-1.0, 2.0, 0.5)
 START, BESIDE, BEYOND = (
@@ -300,3 +305,24 @@ def test_actions_lead_through_poses_and_paths_are_checked(
     finally:
         node.destroy_node()
         try_shutdown()
+
+
+def test_the_heading_of_a_single_goal_alone_may_turn(model: FilePath) -> None:
+    # In a corridor as wide as the body is at most, no body stands across.
+    corridor = GridMap(np.ones((20, 40)), CELL).with_patch(np.zeros((5, 40)), 0, 8)
+    planner = Planner.load(model)
+    inputs = PlanInputs(Header(frame_id="map"), corridor, planner)
+    settings = PlannerSettings(yaw_tolerance=1.6)
+    start = MapPose(pose(corridor, (5, 10)), (5, 10))
+    across = [
+        MapPose(pose(corridor, cell, yaw=math.pi / 2), cell)
+        for cell in ((20, 10), (30, 10))
+    ]
+    for goals, tolerance, status in (
+        (across[:1], (0.3, 1.6), PlanStatus.SUCCEEDED),
+        (across, (0.0, 0.0), PlanStatus.GOAL_OCCUPIED),
+    ):
+        request = request_to(inputs, settings, start, goals, tolerance=0.3)
+        assert isinstance(request, PoseRequest)
+        assert request.tolerance == tolerance
+        assert last_step(planner.steps(request)).status is status
