@@ -126,9 +126,9 @@ class Posterior:
         return math.hypot(DRIVE_NOISE, UNKNOWN_NOISE * unknown)
 
     def places_at(self, position: Float64) -> Int64:
-        """Return the place of each position (N, 2), the nearest within a place's side.
+        """Return the place of each position (N, 2): the nearest one.
 
-        The place is NO_PLACE where no place is so near.
+        It is NO_PLACE off the map, and where no place is within 1.5 sides of a place.
         """
         cells, is_inside = cells_of(position, self.grid)
         x, y = cells.T
