@@ -34,7 +34,7 @@ def map_features(grid: GridMap) -> Float32:
         whether the passage is narrower, from 0 to 1; and the logarithm of the passage's
         length in metres.
     """
-    occupied = grid.occupancy if grid.obstacles is None else grid.obstacles
+    occupied = grid.uninflated
     with_wall = np.pad(occupied, 1, constant_values=True)
     # From the middle of each cell to that of the nearest occupied one.
     cells_to_wall = clearance(with_wall)[1:-1, 1:-1].astype(np.float32)

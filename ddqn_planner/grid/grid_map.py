@@ -519,8 +519,15 @@ class GridMap:
         A cell outside the map is a ValueError.
         """
         x, y = arguments.cell_inside(cell, self.occupancy.shape)
-        obstacles = self.occupancy if self.obstacles is None else self.obstacles
-        return bool(obstacles[y, x])
+        return bool(self.uninflated[y, x])
+
+    @property
+    def uninflated(self) -> Occupancy:
+        """The cells that are obstacles, and not only too near to one: (H, W) bool.
+
+        A robot with a body of its own may touch none of these cells.
+        """
+        return self.occupancy if self.obstacles is None else self.obstacles
 
     def free_cells(self) -> list[Cell]:
         """Return the free cells as (x, y), row by row from y = 0."""

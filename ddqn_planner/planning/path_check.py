@@ -10,7 +10,6 @@ from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.planning.paths import obstacles_in_the_way
 from ddqn_planner.planning.pose_paths import BodyPoints, Float64, in_cells, touches
-from ddqn_planner.planning.pose_world import occupied_for_body
 
 LETHAL: Final = 254  # Nav2's cost of an obstacle
 INSCRIBED: Final = 253  # Nav2's cost of a free cell where a disc touches an obstacle
@@ -102,7 +101,7 @@ def _closed_cells(
     grid: GridMap, has_body: bool, unknown: Occupancy | None, max_cost: int
 ) -> Occupancy:
     """Return the cells that are not free, (H, W): see `invalid_poses`."""
-    closed = occupied_for_body(grid) if has_body else grid.occupancy
+    closed = grid.uninflated if has_body else grid.occupancy
     if unknown is not None:
         closed = closed | unknown
     if max_cost < LETHAL:

@@ -180,7 +180,7 @@ def obstacles_in_the_way(
     These are the map's obstacles without inflation. If the start is an obstacle itself,
     no obstacle within the clearing radius, in cells, of the start counts.
     """
-    obstacles = grid.occupancy if grid.obstacles is None else grid.obstacles
+    obstacles = grid.uninflated
     if clearing_radius > 0 and grid.is_obstacle(start):
         x, y = _cells_within(obstacles, start, clearing_radius * ROUNDING).T
         obstacles = obstacles.copy()

@@ -20,7 +20,6 @@ from ddqn_planner.planning.pose_world import (
     UNSEEN,
     State,
     World,
-    occupied_for_body,
 )
 from ddqn_planner.planning.queues import make_heap
 from ddqn_planner.planning.wavefront import DONE, Progress, Target
@@ -314,7 +313,7 @@ class PoseField(Field[Search]):
         is_near = self._tiles_near(changed)
         near_tiles = np.flatnonzero(is_near.ravel() & search.touched)
         most_opened = len(tiles) << pose_space.TILE_BITS  # states that a repair opens
-        occupied = occupied_for_body(self.grid)
+        occupied = self.grid.uninflated
         has_freed_cell = not occupied[changed[:, 1], changed[:, 0]].all()
         # A path may have become cheaper where a cell is free: then the lower bounds are
         # void. Otherwise what is open stays in order, and `_lower_bound` a lower bound.

@@ -11,7 +11,7 @@ from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.layers import multipliers_of
 from ddqn_planner.grid.moves import ACTION_OF_STEP
 from ddqn_planner.planning.plan import PlanStatus, PosePlan
-from ddqn_planner.planning.pose_world import body_costs, occupied_for_body
+from ddqn_planner.planning.pose_world import body_costs
 from ddqn_planner.robot.footprint import inside, outline
 from ddqn_planner.robot.motions import BEHIND, TURN, turn_between
 
@@ -136,7 +136,7 @@ def is_free(poses: Float64, grid: GridMap, body: BodyPoints) -> bool:
     The poses are in metres and radians, in the map's frame.
     """
     path = in_cells(poses, grid)
-    occupied = occupied_for_body(grid).view(np.uint8)
+    occupied = grid.uninflated.view(np.uint8)
     height, width = occupied.shape
     cells = cells_of(path)
     if not ((cells >= 0) & (cells < (width, height))).all():

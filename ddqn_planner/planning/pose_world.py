@@ -246,14 +246,6 @@ def _passed_cells(poses: NDArray[np.float64]) -> PassedCells:
     return PassedCells(cells, actions, shares)
 
 
-def occupied_for_body(grid: GridMap) -> NDArray[np.bool_]:
-    """Return the cells (H, W) that no body may touch: the obstacles.
-
-    Cells that are occupied only because a disc's body would touch an obstacle are free.
-    """
-    return grid.occupancy if grid.obstacles is None else grid.obstacles
-
-
 def body_costs(grid: GridMap) -> NDArray[np.int8] | None:
     """Return the costs of cells (H, W) for a body, or None for a map without costs.
 
@@ -333,7 +325,7 @@ def _write_rows(
     columns = 64 * occupied_bits.shape[1]
     # The border on both sides of the map counts as occupied.
     is_occupied = np.ones((end - begin, columns), dtype=np.bool_)
-    is_occupied[:, BORDER : BORDER + grid.width] = occupied_for_body(grid)[begin:end]
+    is_occupied[:, BORDER : BORDER + grid.width] = grid.uninflated[begin:end]
     # (end - begin, words): bit b of word w is the cell in column 64 w + b.
     words = np.packbits(is_occupied, axis=1, bitorder="little").view("<u8")
     occupied_bits[BORDER + begin : BORDER + end] = words
@@ -351,8 +343,8 @@ def differences(old: GridMap, new: GridMap) -> NDArray[np.int64] | None:
 
     It is None where the maps are better not compared, see `changed_cells`.
     """
-    old_occupied = occupied_for_body(old)
-    new_occupied = occupied_for_body(new)
+    old_occupied = old.uninflated
+    new_occupied = new.uninflated
 
     def differs(box: Box) -> NDArray[np.bool_]:
         """Return which cells of a box differ."""
