@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,10 +16,12 @@ import numpy as np
 from processes import claim_ros_domain, executable, run_script, running
 from tables import table
 
+SIGNALS = (signal.SIGINT, signal.SIGTERM)  # in turn
 RUNS = 10  # of each node
 FIRST_SECONDS = 8.0  # of a node, in which the signal comes
-SETTLE = 3.0  # seconds until a load is one
+SETTLE = 3.0  # seconds until busy processes have filled the processors
 LIMIT = 2.0  # seconds that an exit may take
+COLUMNS = "node | stopped | runs | exit codes | median (s) | slowest (s)"
 NODES: Mapping[str, Mapping[str, object]] = {
     "map_server_node": {"yaml_filename": "office"},
     "planner_node": {},
@@ -46,32 +49,45 @@ def busy_processes(number: int) -> Iterator[None]:
         yield
 
 
-def catches(process: int, number: signal.Signals) -> bool:
+def handles(process: int, number: signal.Signals) -> bool:
     """Return whether a process has a handler for a signal."""
     status = Path(f"/proc/{process}/status").read_text(encoding="utf-8")
-    return bool(int(status.split("SigCgt:")[1].split()[0], 16) >> (number - 1) & 1)
+    # A line "SigCgt: 0000000180004002": bit 0 is signal 1.
+    _, _, caught = status.partition("SigCgt:")
+    hexadecimal = caught.split()[0]
+    mask = int(hexadecimal, 16)
+    return bool(mask & 1 << (number - 1))
 
 
-def stop_node(
-    name: str, delay: float, number: signal.Signals, code_folder: Path, n_busy: int
-) -> Exit:
-    """Start a node, send it a signal after its first line, await its end."""
-    words = [
-        word for key, value in NODES[name].items() for word in ("-p", f"{key}:={value}")
-    ]
+class Stop(NamedTuple):
+    """How a node is stopped: by which signal, when, and beside what."""
+
+    delay: float  # seconds after the node handles signals
+    number: signal.Signals
+    n_busy: int  # processes that keep the processors busy
+
+
+def stop_node(name: str, code_folder: Path, stop: Stop) -> Exit:
+    """Start a node, stop it, and await its end.
+
+    Its compiled code is in a folder, and its log beside that folder.
+    """
+    words = []
+    for parameter, value in NODES[name].items():
+        words += ["-p", f"{parameter}:={value}"]
     command = [executable(name), "--ros-args", "--log-level", "fatal", *words]
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(code_folder)}
     log = code_folder.with_suffix(".log")
     with log.open("ab") as file:
-        output: Any = {"stdout": file, "stderr": file, "env": environment}
-        with running(*command, **output) as child:
+        options: Any = {"stdout": file, "stderr": file, "env": environment}
+        with running(*command, **options) as child:
             # Before that, Python itself starts, and a signal ends it as any program.
-            while not catches(child.pid, signal.SIGTERM):
+            while not handles(child.pid, signal.SIGTERM):
                 time.sleep(0.001)
-            time.sleep(delay)
-            with busy_processes(n_busy):
+            time.sleep(stop.delay)
+            with busy_processes(stop.n_busy):
                 began = time.monotonic()
-                child.send_signal(number)
+                child.send_signal(stop.number)
                 code = child.wait()
                 seconds = time.monotonic() - began
     if code:
@@ -79,12 +95,32 @@ def stop_node(
     return Exit(code, seconds)
 
 
+def stop_early(
+    name: str, runs: int, n_busy: int, folder: Path, random: np.random.Generator
+) -> list[Exit]:
+    """Stop a node while it starts and compiles, at a random moment of each run."""
+    exits = []
+    for run, number in zip(range(runs), cycle(SIGNALS), strict=False):
+        stop = Stop(random.uniform(0, FIRST_SECONDS), number, n_busy)
+        exits.append(stop_node(name, folder / f"{name}_{run}", stop))
+    return exits
+
+
+def stop_late(name: str, runs: int, n_busy: int, folder: Path) -> list[Exit]:
+    """Stop a node that has started, with compiled code."""
+    exits = []
+    for _, number in zip(range(runs), cycle(SIGNALS), strict=False):
+        stop = Stop(FIRST_SECONDS, number, n_busy)
+        exits.append(stop_node(name, folder / "warm", stop))
+    return exits
+
+
 def summary(exits: Sequence[Exit]) -> list[object]:
     """Return the exit codes, the median and the greatest time."""
-    codes = Counter(each.code for each in exits)
-    seconds = [each.seconds for each in exits]
-    counts = ", ".join(f"{code} ({count})" for code, count in codes.items())
-    return [len(exits), counts, f"{np.median(seconds):.2f}", f"{max(seconds):.2f}"]
+    count_by_code = Counter(end.code for end in exits)
+    codes = ", ".join(f"{code} ({count})" for code, count in count_by_code.items())
+    seconds = [end.seconds for end in exits]
+    return [len(exits), codes, f"{np.median(seconds):.2f}", f"{max(seconds):.2f}"]
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -97,23 +133,16 @@ def main(arguments: Sequence[str]) -> int:
     random = np.random.default_rng(0)
     rows: list[list[object]] = []
     exits: list[Exit] = []
-    with claim_ros_domain(), tempfile.TemporaryDirectory() as name:
-        warm = Path(name, "warm")
+    with claim_ros_domain(), tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
         for node in NODES:
-            for when in ("while it starts and compiles", "later"):
-                stopped = []
-                for run in range(runs):
-                    is_late = when == "later"
-                    delay = (
-                        FIRST_SECONDS if is_late else random.uniform(0, FIRST_SECONDS)
-                    )
-                    folder = warm if is_late else Path(name, f"{node}_{run}")
-                    number = (signal.SIGINT, signal.SIGTERM)[run % 2]
-                    stopped.append(stop_node(node, delay, number, folder, n_busy))
-                exits += stopped
-                rows.append([node, when, *summary(stopped)])
-    print(table("node | stopped | runs | exit codes | median (s) | slowest (s)", rows))
-    return int(any(each.code or each.seconds > LIMIT for each in exits))
+            early_exits = stop_early(node, runs, n_busy, folder, random)
+            late_exits = stop_late(node, runs, n_busy, folder)
+            rows.append([node, "while it starts and compiles", *summary(early_exits)])
+            rows.append([node, "later", *summary(late_exits)])
+            exits += early_exits + late_exits
+    print(table(COLUMNS, rows))
+    return int(any(end.code or end.seconds > LIMIT for end in exits))
 
 
 if __name__ == "__main__":
