@@ -1,10 +1,12 @@
 """Boxes of cells: rows and columns of an array."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 MAX_GAP = 16  # rows or columns without a set cell within one box
 MAX_BOXES = 8  # each box takes as long as some thousand cells
@@ -18,6 +20,15 @@ class Box(NamedTuple):
 
 
 ORIGIN = Box(slice(0, 0), slice(0, 0))
+
+
+def replaced(
+    array: NDArray[Scalar], box: Box, values: NDArray[Scalar]
+) -> NDArray[Scalar]:
+    """Return a copy of an array with other values in a box."""
+    copy: NDArray[Scalar] = array.copy()
+    copy[box] = values
+    return copy
 
 
 def boxes_of(is_set: NDArray[np.bool_], max_gap: int = MAX_GAP) -> list[Box]:

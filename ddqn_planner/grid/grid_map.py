@@ -21,8 +21,7 @@ from ddqn_planner.grid.arguments import (
     Occupancy,
     as_number,
 )
-from ddqn_planner.grid.boxes import ORIGIN, Box
-from ddqn_planner.grid.copies import replaced
+from ddqn_planner.grid.boxes import ORIGIN, Box, replaced
 from ddqn_planner.grid.flood import flood
 from ddqn_planner.grid.layers import (
     NO_COST,

@@ -19,8 +19,7 @@ from ddqn_planner.grid import (
     MoveRule,
     legal_moves,
 )
-from ddqn_planner.grid.boxes import ORIGIN, Box, relative_to, wider
-from ddqn_planner.grid.copies import replaced
+from ddqn_planner.grid.boxes import ORIGIN, Box, relative_to, replaced, wider
 from ddqn_planner.grid.grid_map import LAYERS
 
 # Shapes: C = cells of the padded map, P = patches, S = sets of actions, A = 8 actions,

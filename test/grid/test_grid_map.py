@@ -1,8 +1,6 @@
 import copy
-import gc
 import json
 import math
-import os
 import pickle
 import re
 import reprlib
@@ -23,13 +21,11 @@ from ddqn_planner.grid import (
     GridMap,
     MoveRule,
     clearance,
-    copies,
     grid_map,
     inflate,
 )
 from ddqn_planner.grid.arguments import as_cell
 from ddqn_planner.grid.boxes import MAX_BOXES, Box, boxes_of, cells_in
-from ddqn_planner.grid.copies import replaced
 from ddqn_planner.grid.inflation import Inflation, grid_from_costmap
 
 ZEROS = np.zeros((2, 3))
@@ -431,65 +427,6 @@ def test_unknown_inscribed_lethal_cells_are_closed(
         assert (grid.cost_multiplier[unknown] == 5).all()
     free = ~grid.occupancy & ~unknown
     assert ((grid.cost_multiplier[free] == 1) == (values[free] <= 1)).all()
-
-
-@pytest.fixture(autouse=True)
-def shared(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let small arrays share their memory, too."""
-    monkeypatch.setattr(copies, "SMALL", 0)
-    monkeypatch.setattr(copies, "CELLS_PER_CHANGE", 1)
-    monkeypatch.setattr(copies, "CELLS_PER_BOX", 1)
-
-
-BOXES = st.tuples(
-    st.integers(0, 9), st.integers(1, 10), st.integers(0, 9), st.integers(1, 10)
-)
-SHAPES = st.sampled_from([(10, 20), (20, 10)])
-FATES = st.sampled_from(["kept", "dropped", "viewed"])
-CHANGES = st.lists(st.tuples(st.integers(0, 100), BOXES, SHAPES, FATES), max_size=80)
-
-
-@given(CHANGES)
-def test_each_copy_keeps_what_it_was_given_whatever_comes_after(
-    changes: list[Any],
-) -> None:
-    copied = [np.arange(200, dtype=np.int16).reshape(10, 20)]
-    expected, views = [copied[0].copy()], []
-    for origin, (y, height, x, width), shape, fate in changes:
-        before = origin % len(copied)  # any of the copies may be changed again
-        box = Box(slice(y, y + height), slice(x, x + width))
-        changed = expected[before].reshape(shape).copy()
-        changed[box] = len(copied)
-        copied.append(replaced(copied[before].reshape(shape), box, changed[box]))
-        expected.append(changed)
-        if fate == "viewed":
-            views.append((copied[before].T[1:], expected[before].T[1:]))
-        if fate != "kept":  # others may use its memory, unless there is a view
-            del copied[before], expected[before]
-        for ours, right in [*zip(copied, expected, strict=True), *views]:
-            np.testing.assert_array_equal(ours, right)
-
-
-def open_files() -> int:
-    gc.collect()
-    return len(os.listdir("/proc/self/fd"))
-
-
-def test_maps_that_are_patched_or_kept_leave_files_for_others() -> None:
-    before, grid = (
-        open_files(),
-        GridMap(np.zeros((20, 20)), cost=np.zeros((20, 20), np.int8)),
-    )
-    kept = [grid]
-    for step in range(2000):
-        grid = grid.with_patch([[step % 2]], step % 20, step // 20 % 20)
-        if step % 5 == 0:
-            kept.append(grid)
-    assert open_files() - before <= 2 * copies.MAX_ALIVE
-    kept.clear()
-    assert open_files() - before <= 4  # of this map: its occupancy and its costs
-    del grid
-    assert open_files() == before
 
 
 def test_a_patched_map_is_copied_whole_and_shares_nothing_with_its_origin() -> None:

@@ -29,7 +29,7 @@ from strategies import (
 )
 
 from ddqn_planner import GridMap, MoveRule, Plan, Planner, PlanStatus
-from ddqn_planner.grid import Cell, copies, grid_map, map_changes
+from ddqn_planner.grid import Cell, grid_map, map_changes
 from ddqn_planner.grid.grid_map import LAYERS
 from ddqn_planner.grid.layers import legal_moves, move_costs
 from ddqn_planner.grid.moves import MOVES
@@ -222,12 +222,6 @@ def any_share(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(map_changes, "CHANGED_SHARE", 1.0)
     monkeypatch.setattr(fields, "REPAIRED_SHARE", 1.0)
     monkeypatch.setattr(fields, "REPAIRED", fields.REPAIRED)  # tests change it
-    for name, value in {
-        "SMALL": 0,
-        "CELLS_PER_BOX": 1,
-        "CELLS_PER_CHANGE": 1,
-    }.items():  # copies share memory
-        monkeypatch.setattr(copies, name, value)
     monkeypatch.setattr(grid_map, "MAX_PATCHES", 3)
 
 
