@@ -10,7 +10,6 @@ import client as ros
 import numpy as np
 import processes
 from nav_msgs.srv import GetPlan
-from std_srvs.srv import Trigger
 from tables import report
 
 from ddqn_planner import Planner
@@ -87,11 +86,11 @@ def measure_reloads() -> Iterator[bool]:
     """Measure by how much reloads of the model make the planner node grow."""
     quiet = processes.running_node("planner_node", "--log-level", "error")
     with ros.Client() as client, quiet as node:
-        reload_model = client.service(Trigger, "planner/reload_model")
         memory = []
         for count in (FIRST_RELOADS, RELOADS):
             for _ in range(count):
-                assert ros.ask(reload_model, Trigger.Request()).success
+                (result,) = client.set_parameters("planner", model="any_map")
+                assert result.successful
             time.sleep(SETTLED)
             memory.append(processes.memory(node.pid, "RssAnon"))
     yield report(

@@ -19,7 +19,8 @@ import processes
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
 from nav_msgs.srv import GetPlan
-from rcl_interfaces.srv import GetParameters, ListParameters
+from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters
+from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 from tables import report
 
@@ -190,7 +191,12 @@ def measure_large_map(client: ros.Client) -> Iterator[bool]:
         "get_parameters": (GetParameters, GetParameters.Request(names=["model"])),
         "list_parameters": (ListParameters, ListParameters.Request()),
         "get_plan": (GetPlan, known),
-        "reload_model": (Trigger, Trigger.Request()),
+        "set_parameters": (
+            SetParameters,
+            SetParameters.Request(
+                parameters=[Parameter("model", value="any_map").to_parameter_msg()]
+            ),
+        ),
     }
     with processes.running_node("planner_node") as planner:
         client.publish("map", fixture.message(), LATCHED)

@@ -132,7 +132,7 @@ class Work:
         self._client.call(Trigger, f"map_server/{service}")
 
     def _reload_model(self) -> None:
-        self._client.call(Trigger, "planner/reload_model")
+        self._client.set_parameters("planner", model="any_map")
 
     def _set_any_parameters(self) -> None:
         move_rule = self._random.choice([*MoveRule])

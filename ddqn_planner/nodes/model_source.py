@@ -120,16 +120,6 @@ class ModelSource:
         self.diagnostics.change()
         self._node.get_logger().info(f"planning with the model {file}")
 
-    def on_reload(self) -> tuple[bool, str]:
-        """Load the file of the model again; return success and a message."""
-        # To set the parameter loads the model, also if it has that value already.
-        result = self._node.set_parameters([self._node.get_parameter("model")])[0]
-        if not result.successful:
-            reason = f"the model was not loaded again: {result.reason}"
-            self._node.get_logger().error(reason)
-            return False, result.reason
-        return True, f"loaded {self.file}"
-
     def describe(self, rule: str) -> dict[str, str]:
         """Return the diagnostics' values about the model.
 

@@ -149,7 +149,6 @@ class PlannerNode(ManagedNode):
         self.create_service(
             GetPlan, "~/get_plan", self._on_get_plan, callback_group=reentrant
         )
-        self.create_trigger("~/reload_model", self.model_source.on_reload)
         self.navigation = NavigationServer(
             refusal=lambda: self._refusal,
             plan=self._plan_for_action,
@@ -231,7 +230,8 @@ class PlannerNode(ManagedNode):
     def check_parameters(self, new: dict[str, Any]) -> None:
         """Check new values as `BaseNode` does, whether TF can be used, and load files.
 
-        If ROS then sets the parameters, `_apply_parameters` uses the loaded files.
+        A file is loaded again if its parameter has that value already. If ROS then sets
+        the parameters, `_apply_parameters` uses the loaded files.
         """
         super().check_parameters(new)
         source = new.get("start_source", "")

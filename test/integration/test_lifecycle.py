@@ -34,7 +34,7 @@ from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.nodes.trainer_node import TrainerNode
 
 LABELS = ("configure", "activate", "deactivate", "cleanup", "shutdown")
-OF_CONFIGURED = {"planner/get_plan", "planner/reload_model", "plan", "map", "goal_pose"}
+OF_CONFIGURED = {"planner/get_plan", "plan", "map", "goal_pose"}
 
 
 def start(robot: Robot) -> None:

@@ -38,7 +38,6 @@ from nav_msgs.srv import GetPlan
 from rcl_interfaces.srv import ListParameters
 from rclpy.qos import QoSProfile
 from std_msgs.msg import UInt8MultiArray
-from std_srvs.srv import Trigger
 
 from ddqn_planner.model import find_model
 from ddqn_planner.nodes.conversions import bytes_message, rotation
@@ -105,27 +104,24 @@ def whole_model(robot: Robot) -> Iterator[FilePath]:
     robot.set(model=str(robot.model))
 
 
-def test_reload_plans_again_with_what_the_file_holds(
+def test_the_same_model_set_again_plans_with_what_the_file_holds_now(
     robot: Robot, whole_model: FilePath
 ) -> None:
     constant_model(whole_model, 6, 7)
-    response = robot.client.call(Trigger, "planner/reload_model")
-    assert response.success, response.message
-    assert str(whole_model) in response.message
+    robot.set(model=str(whole_model))
     robot.plans.wait(lambda path: not path.poses)
     said = {"status": "ROLLOUT_TRAPPED", "model training steps": "7"}
     reason = "greedy steps do not find it.*cell \\(0, 0\\).*train the model"
     assert robot.wait_for_reason(reason, said).level == WARN
     # What cannot be loaded is refused, and the model before it stays.
     whole_model.write_bytes(whole_model.read_bytes()[:-9])
-    response = robot.client.call(Trigger, "planner/reload_model")
-    assert not response.success
-    assert f"{whole_model}: cannot be read as safetensors" in response.message
+    reason = robot.refuse(model=str(whole_model))
+    assert f"{whole_model}: cannot be read as safetensors" in reason
     robot.clear()
     robot.get_plan(robot.pose(START), robot.pose(GOAL))
     robot.wait_for_reason("greedy", {"model training steps": "7"})
     shutil.copy(find_model("any_map"), whole_model)
-    assert robot.client.call(Trigger, "planner/reload_model").success
+    robot.set(model=str(whole_model))
     robot.wait_for_path(START, GOAL)
 
 
@@ -403,7 +399,7 @@ def test_all_else_is_answered_while_a_plan_takes_long(slow_robot: Any) -> None:
     assert client.get_parameter("planner", "model") == str(robot.model)
     assert client.call(ListParameters, "planner/list_parameters").result.names
     assert robot.refuse(model="no_model")
-    assert client.call(Trigger, "planner/reload_model").success
+    robot.set(model=str(robot.model))
     # The map grows by the robot's body, in another thread than that of the plan.
     robot.set(robot_radius=0.6)
     assert robot.get_plan(outside, robot.pose((0, 5))).poses == []
@@ -473,7 +469,8 @@ def test_says_what_it_waits_for(
         assert robot.wait_for_reason(f"no model is loaded: .*{no_model}").level == ERROR
         node.wait_for_log(f"model refused: .*{no_model}")
         shutil.copy(model, path)
-        assert client.call(Trigger, "router/reload_model").success
+        (loaded,) = client.set_parameters("router", model=str(path))
+        assert loaded.successful, loaded.reason
 
         robot.wait_for_reason("the start is unknown; set it on /initialpose")
         request = GetPlan.Request(goal=robot.pose(GOAL))
