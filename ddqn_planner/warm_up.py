@@ -1,13 +1,11 @@
 """Compile all code of a planner, before a node is active or at an installation."""
 
-import math
 from collections.abc import Iterator
 
 import numpy as np
 
 from ddqn_planner.experience import Experience
 from ddqn_planner.grid import GridMap
-from ddqn_planner.model.move_costs import LARGE
 from ddqn_planner.planning import Planner
 from ddqn_planner.planning.exact_paths import exact_path
 from ddqn_planner.planning.paths import rest_of_path
@@ -52,10 +50,6 @@ def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
     for forbidden in (None, some_forbidden):
         blocked = GridMap(obstacle, forbidden=forbidden)
         planner.plan(blocked, start, goal, start_clearing_radius=1.0)
-    if "height" not in sizes:
-        # Patches of a large map are read where its field grows, in other code.
-        side = 1 + math.isqrt(LARGE)
-        planner.plan(GridMap(np.zeros((side, side), np.bool_)), start, goal)
     yield
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
@@ -36,23 +35,6 @@ OCCUPIED_CODE = COST_CODES - 1
 # model may predict any multiplier.
 MAX_MULTIPLIER = 20 * MAX_COST_MULTIPLIER
 PATCH_OUTSIDE = 512  # the patch number of cells outside the map, which no move leaves
-LARGE = 2**21  # cells of a map whose patches are read where a field grows
-MARGIN = 64  # rows beyond those of a start and goals that are read at first
-SEEN = 2  # rows beyond those that a field closes cells in, of which it looks at patches
-
-
-class RowsRead:
-    """Which rows of a large map were read; several threads may use it."""
-
-    def __init__(self, grid: GridMap) -> None:
-        self.grid = grid
-        self.first = 0  # the rows read are first to end - 1
-        self.end = 0
-        self.lock = threading.Lock()
-
-    def __reduce__(self) -> tuple[type[RowsRead], tuple[GridMap]]:
-        """Let a copy begin without rows, under a lock of its own."""
-        return RowsRead, (self.grid,)
 
 
 class MoveCosts(NamedTuple):
@@ -73,7 +55,6 @@ class MoveCosts(NamedTuple):
     cheapest_diagonal: float  # no diagonal move costs less
     least_by_cost_code: Array  # (L,): least multiplier by a map's least code; or empty
     least_multiplier: float = 1.0  # no multiplier on the map is less
-    rows_read: RowsRead | None = None  # None if all rows were read
 
     @classmethod
     def of_table(cls, table_PA: Array) -> MoveCosts:
@@ -108,11 +89,6 @@ class MoveCosts(NamedTuple):
         if grid.forbidden is not None:  # the patch numbers depend on all cells
             return None
         costs = self
-        # A map that changes is read completely, once: its fields are repaired, and each
-        # repair may need cells anywhere.
-        if self.rows_read is not None:
-            self.read_rows(0, self.rows_read.grid.height)
-            costs = costs._replace(rows_read=None)
         for box in boxes:
             costs = costs._with_box_of(grid, box)
         return costs
@@ -127,7 +103,7 @@ class MoveCosts(NamedTuple):
             layer = getattr(grid, name)
             if layer is not None:
                 layers[name] = layer[region].copy()  # in C order, as numba expects
-        part = self.on_map(grid.with_layers(**layers), reads_all=True)
+        part = self.on_map(grid.with_layers(**layers))
         cells_of_part = relative_to(region, cells, border=1)
         cells_of_map = relative_to(ORIGIN, cells, border=1)
 
@@ -151,10 +127,7 @@ class MoveCosts(NamedTuple):
         )
 
     def on_map(
-        self,
-        grid: GridMap,
-        patch_number: NDArray[Any] | None = None,
-        reads_all: bool = False,
+        self, grid: GridMap, patch_number: NDArray[Any] | None = None
     ) -> MoveCosts:
         """Return the costs on a map with all of its layers.
 
@@ -164,59 +137,26 @@ class MoveCosts(NamedTuple):
         patch_number : (C,), optional
             The row of the table for each cell of the padded map. By default the patches
             of the map are read.
-        reads_all : bool
-            Whether the patches are read at once, also those of a large map.
         """
-        is_large = grid.occupancy.size > LARGE and grid.forbidden is None
         if patch_number is not None:
-            costs = self._replace(
-                patch_number=patch_number, width=grid.width + 2, rows_read=None
-            )
-        elif is_large and not reads_all:
-            costs = self._on_large_map(grid)
+            costs = self._replace(patch_number=patch_number, width=grid.width + 2)
         else:
             cost = grid.cost if self.terms.size else None
             cells = read_cells(grid.occupancy, cost)
+            least_multiplier = 1.0
+            if cost is not None:
+                least_multiplier = float(self.least_by_cost_code[cells.least_cost + 1])
             costs = self._replace(
                 patch_number=cells.patch_number,
                 cost_code=cells.cost_code,
                 width=grid.width + 2,
-                least_multiplier=self._least_multiplier(cost, cells.least_cost),
-                rows_read=None,
+                least_multiplier=least_multiplier,
             )
         if grid.slowness is not None:
             costs = costs._with_multiplier(grid.cost_multiplier)
         if grid.forbidden is not None:
             costs = costs._without_forbidden(grid.forbidden)
         return costs
-
-    def _on_large_map(self, grid: GridMap) -> MoveCosts:
-        """Return the costs on a large map, of which `read_rows` reads rows later."""
-        cost = grid.cost if self.terms.size else None
-        padded_shape = grid.height + 2, grid.width + 2
-        # Pages of memory that no field needs are never touched.
-        patch_number = np.zeros(padded_shape, np.uint16)
-        patch_number[[0, -1]] = PATCH_OUTSIDE
-        cost_code = np.empty(0, np.uint8)
-        if cost is not None:
-            cost_code = np.zeros(padded_shape, np.uint8)
-            cost_code[[0, -1]] = OCCUPIED_CODE
-        least_cost = _least_cost(grid.occupancy, cost)
-        return self._replace(
-            patch_number=patch_number.ravel(),
-            cost_code=cost_code.ravel(),
-            width=grid.width + 2,
-            least_multiplier=self._least_multiplier(cost, least_cost),
-            rows_read=RowsRead(grid),
-        )
-
-    def _least_multiplier(
-        self, cost: NDArray[np.int8] | None, least_cost: int
-    ) -> float:
-        """Return a bound that no multiplier on a map is below, by its least cost."""
-        if cost is None:
-            return 1.0
-        return float(self.least_by_cost_code[least_cost + 1])
 
     def _with_multiplier(self, multiplier: Array) -> MoveCosts:
         """Return the costs times the multipliers of a map's cells, (H, W)."""
@@ -258,62 +198,6 @@ class MoveCosts(NamedTuple):
         patch_number += self.patch_number.astype(dtype, copy=False)
         return self._replace(patch_number=patch_number, table=tables_SPA.ravel())
 
-    def read_rows(self, first_row: int, end_row: int) -> tuple[int, int] | None:
-        """Write patch numbers and cost codes of more rows of a large map.
-
-        These are rows `first_row` to `end_row` - 1 of the map, which may lie outside,
-        and the rows between them and the rows that were read before.
-
-        Returns
-        -------
-        (int, int) or None
-            The first cell of the padded map that a field may close now, and the cell
-            after the last one; None if all rows were read from the beginning.
-        """
-        rows = self.rows_read
-        if rows is None:
-            return None
-        height = rows.grid.height
-        first_row = max(first_row, 0)
-        end_row = min(end_row, height)
-        with rows.lock:
-            if rows.first == rows.end:  # none was read yet
-                rows.first = min(first_row, height - 1)
-                rows.end = rows.first
-            self._write_rows(rows.grid, first_row, rows.first)
-            self._write_rows(rows.grid, rows.end, end_row)
-            rows.first = min(first_row, rows.first)
-            rows.end = max(end_row, rows.end)
-            # Row y of the map is row y + 1 of the padded map, which ends with row
-            # height + 1. Before a field closes a cell, it looks at rows beside it.
-            first_closable = 0 if rows.first == 0 else rows.first + 1 + SEEN
-            end_closable = height + 2
-            if rows.end < height:
-                end_closable = max(rows.end + 1 - SEEN, 0)
-        return first_closable * self.width, end_closable * self.width
-
-    def _write_rows(self, grid: GridMap, first_row: int, end_row: int) -> None:
-        """Write the patch numbers and cost codes of rows first_row to end_row - 1."""
-        if first_row >= end_row:
-            return
-        # With one row before and one row after; all is occupied outside the map.
-        row_before = first_row - 1
-        occupied = np.ones((end_row + 1 - row_before, self.width), np.bool_)
-        first_inside = max(row_before, 0)
-        end_inside = min(end_row + 1, grid.height)
-        rows_inside = slice(first_inside - row_before, end_inside - row_before)
-        occupied[rows_inside, 1:-1] = grid.occupancy[first_inside:end_inside]
-        cost = None
-        if self.cost_code.size > 0 and grid.cost is not None:
-            cost = grid.cost[first_row:end_row]
-        cells = _read_padded(occupied, cost)
-        rows_of_padded_map = slice(first_row + 1, end_row + 1)
-        patch_number = self.patch_number.reshape(-1, self.width)
-        patch_number[rows_of_padded_map] = cells.patch_number[1:-1]
-        if self.cost_code.size > 0:
-            cost_code = self.cost_code.reshape(-1, self.width)
-            cost_code[rows_of_padded_map] = cells.cost_code[1:-1]
-
 
 @in_place
 def _mark_occurring(bit_set_C: NDArray[np.uint8], occurs: NDArray[np.bool_]) -> None:
@@ -331,60 +215,32 @@ def _with_border(inside: NDArray[Number], value: int) -> NDArray[Number]:
 
 
 class CellsRead(NamedTuple):
-    """The numbers for the cells of a map: all cells, or (H + 2, W + 2) of some rows."""
+    """The numbers for the cells of a map with a border of one cell."""
 
     # Bit 3 y + x of a patch number is set where cell (x, y) of the 3x3 patch around the
     # cell is occupied; cells outside the map have `PATCH_OUTSIDE`.
-    patch_number: NDArray[np.uint16]
-    cost_code: NDArray[np.uint8]  # empty without costs
+    patch_number: NDArray[np.uint16]  # (C,)
+    cost_code: NDArray[np.uint8]  # (C,), or empty without costs
     least_cost: int  # 0 to 100: an occupied cell counts as 100, an unknown cell as 255
 
 
 def read_cells(
     occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None
 ) -> CellsRead:
-    """Return the patch number and, with costs, the cost code of each cell: (C,)."""
-    cells = _read_padded(_with_border(occupancy, 1), cost)
-    return cells._replace(
-        patch_number=cells.patch_number.ravel(), cost_code=cells.cost_code.ravel()
-    )
-
-
-def _read_padded(padded: NDArray[np.bool_], cost: NDArray[np.int8] | None) -> CellsRead:
-    """Read cells of an occupancy with a border, (H + 2, W + 2), and costs (H, W)."""
-    occupied = padded.view(np.uint8)
+    """Read the cells of a map, of its occupancy and its costs (H, W)."""
+    occupied = _with_border(occupancy, 1).view(np.uint8)
     occupied.flags.writeable = False  # as costs are: numba compiles once for both
     patch_number = np.full(occupied.shape, PATCH_OUTSIDE, np.uint16)
     if cost is None:
         # Arrays of the same types stand for the costs and codes, which are not used.
         unused_code = patch_number.view(np.uint8)
         _read_cells(occupied, occupied, patch_number, unused_code, False)
-        return CellsRead(patch_number, np.empty(0, np.uint8), OCCUPIED)
+        return CellsRead(patch_number.ravel(), np.empty(0, np.uint8), OCCUPIED)
     cost_code = np.full(occupied.shape, OCCUPIED_CODE, np.uint8)
     # As uint8 the cost of an unknown cell is 255 instead of -1.
     unsigned_cost = cost.view(np.uint8)
     least_cost = _read_cells(occupied, unsigned_cost, patch_number, cost_code, True)
-    return CellsRead(patch_number, cost_code, int(least_cost))
-
-
-def _least_cost(occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None) -> int:
-    """Return the least cost of a map's cells, see `CellsRead`; 100 without costs.
-
-    On most maps a few rows tell it, so it is quick on large maps.
-    """
-    if cost is None:
-        return OCCUPIED
-    least_cost = OCCUPIED
-    rows_at_once = max(1, LARGE // occupancy.shape[1] // 8)
-    for first in range(0, len(occupancy), rows_at_once):
-        rows = slice(first, first + rows_at_once)
-        # As uint8 the cost of an unknown cell is 255 instead of -1. The costs of
-        # occupied cells are 0.
-        costs = cost[rows].view(np.uint8) + occupancy[rows] * np.uint8(OCCUPIED)
-        least_cost = min(least_cost, int(costs.min()))
-        if least_cost == 0:
-            break
-    return least_cost
+    return CellsRead(patch_number.ravel(), cost_code.ravel(), int(least_cost))
 
 
 @in_place

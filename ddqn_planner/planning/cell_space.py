@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ddqn_planner.compiled import in_place, inlined, inner, specialised
 from ddqn_planner.grid import MOVES
 from ddqn_planner.grid.moves import NO_ACTION
-from ddqn_planner.model.move_costs import COST_CODES, MARGIN, MoveCosts
+from ddqn_planner.model.move_costs import COST_CODES, MoveCosts
 from ddqn_planner.planning.queues import (
     Buckets,
     advance_buckets,
@@ -27,11 +27,9 @@ from ddqn_planner.planning.queues import (
 )
 from ddqn_planner.planning.wavefront import (
     DONE,
-    NOT_CLOSABLE,
     OPEN,
-    OUT_OF_VISITS,
+    QUEUE_FULL,
     UNREACHED,
-    Closable,
     Progress,
     Target,
     spread,
@@ -242,8 +240,6 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
     buckets = 1 << int(highest_step + 2).bit_length()
     capacity = 9 + int(CAPACITY * math.sqrt(known.distance.size))
     opened = known.opened
-    first_row, end_row = _rows_around(opened, start, costs)
-    closable = _read_rows(costs, first_row, end_row)
     visits_left = limit + 1
     while True:
         queue = _queue_of(known, opened, space, buckets, capacity, per_unit)
@@ -252,21 +248,13 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
             known.mark,
             queue,
             Target(start, TIES, 0.0, max(visits_left, 1)),
-            closable,
             space,
         )
         opened = states_in_buckets(queue)
         visits_left -= progress.visits
-        if progress.reason == NOT_CLOSABLE:  # twice as many more rows are read
-            opened = np.append(opened, np.int32(progress.state))
-            rows_read = end_row - first_row
-            first_row -= rows_read
-            end_row += rows_read
-            closable = _read_rows(costs, first_row, end_row)
-        elif progress.reason in (DONE, OUT_OF_VISITS):
+        if progress.reason != QUEUE_FULL:
             break
-        else:  # a bucket was full
-            capacity *= 4
+        capacity *= 4  # of each bucket
     is_known = progress.reason == DONE or not opened.size
     grown = Known(known.distance, known.mark, opened, known.closed_is_final)
     return grown, is_known
@@ -361,28 +349,6 @@ def _number_buckets(
     for index in range(count):
         mark[opened[index]] = OPEN
     return count
-
-
-def _rows_around(
-    opened: NDArray[np.int32], start: int, costs: MoveCosts
-) -> tuple[int, int]:
-    """Return the first row of the map to read before a field grows, and the rows' end.
-
-    Without a start, or if no rows need be read, these are all rows of the map. Else
-    they reach from the open cells (K,) to the start, and `MARGIN` rows beyond.
-    """
-    height = costs.patch_number.size // costs.width - 2  # without the border
-    if not start or costs.rows_read is None or not opened.size:
-        return 0, height
-    cells = start, int(opened.min()), int(opened.max())
-    rows = [cell // costs.width - 1 for cell in cells]  # the border's row is -1
-    return min(rows) - MARGIN, max(rows) + 1 + MARGIN
-
-
-def _read_rows(costs: MoveCosts, first_row: int, end_row: int) -> Closable | None:
-    """Read rows of the map; return the cells that may be closed, None for all."""
-    cells = costs.read_rows(first_row, end_row)
-    return None if cells is None else Closable(*cells)
 
 
 # The repair

@@ -233,8 +233,6 @@ class DistanceField(QField):
         most_repaired = max(REPAIRED, int(REPAIRED_SHARE * self.grid.occupancy.size))
         limit = most_repaired if start is None else REPAIRED
         with older._lock:
-            # A repair may look at any cell, also where the older field read no rows.
-            self.costs.read_rows(0, self.grid.height)
             known = older._take_known()
             repaired = cell_space.take_back(known, self.costs, cells_to_judge, limit)
             while repaired is None:

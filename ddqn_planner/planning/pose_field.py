@@ -201,7 +201,7 @@ class PoseField(Field[Search]):
         share = 1.0 if aim.weight > 1 else 1 / bound
         target = Target(aim.number, share, bound * self._lower_bound, most_visits)
         progress: Progress = pose_space.spread_over_poses(
-            search.distance, search.mark, search.heap, target, None, search
+            search.distance, search.mark, search.heap, target, search
         )
         self.visits += progress.visits
         is_proved = self._proved_bound() <= bound * SAME

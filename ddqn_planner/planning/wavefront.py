@@ -4,8 +4,6 @@ from typing import Any, Final, NamedTuple
 
 from ddqn_planner.planning.queues import NEXT_KEY, NONE_WAITS
 
-NO_STATE: Final = -1
-
 # Marks. The cost of an open state may fall; that of a closed one is the least that its
 # wavefront could find. A state waits that became cheaper after it was closed, where a
 # wavefront closes each state once: the next wavefront opens it again.
@@ -15,7 +13,6 @@ UNREACHED, OPEN, WAITING, CLOSED = 0, 1, 2, 3
 DONE: Final = 0  # the target's cost is known, or no path leads from it to a goal
 OUT_OF_VISITS: Final = 1
 QUEUE_FULL: Final = 2
-NOT_CLOSABLE: Final = 3  # the next state lies where the map was not read
 
 
 class Target(NamedTuple):
@@ -30,21 +27,11 @@ class Target(NamedTuple):
     most_visits: int  # how many states may be closed
 
 
-class Closable(NamedTuple):
-    """The states from `first` on, and before `end`, are those that may be closed."""
-
-    first: int
-    end: int
-
-
 class Progress(NamedTuple):
     """What became of a wavefront."""
 
     visits: int  # how many states it closed
-    reason: int  # why it stopped: DONE, OUT_OF_VISITS, QUEUE_FULL or NOT_CLOSABLE
-    # After NOT_CLOSABLE the state that may not be closed, which is no longer in the
-    # queue; else NO_STATE.
-    state: int
+    reason: int  # why it stopped: DONE, OUT_OF_VISITS or QUEUE_FULL
 
 
 # What differs between cells and poses, the queue and the space, is handed in when a
@@ -83,7 +70,7 @@ def expand(state: int, distance: Any, mark: Any, queue: Any, space: Any) -> None
 
 
 def spread(
-    distance: Any, mark: Any, queue: Any, target: Target, closable: Any, space: Any
+    distance: Any, mark: Any, queue: Any, target: Target, space: Any
 ) -> Progress:
     """Close states in the order of a queue, until the cost of a target is known.
 
@@ -99,8 +86,6 @@ def spread(
     queue : Buckets or Heap
         The open states. A state may be in it more than once.
     target : Target
-    closable : Closable, optional
-        None if all states may be closed: then numba compiles no test of it.
     space : CellSpace or Search
         The map, as `expand` needs it.
     """
@@ -117,16 +102,14 @@ def spread(
                 if cost <= target.cost_enough or is_past(queue, cost * target.share):
                     break
             if visits >= target.most_visits:
-                return Progress(visits, OUT_OF_VISITS, NO_STATE)
+                return Progress(visits, OUT_OF_VISITS)
         if is_full(queue, space):
-            return Progress(visits, QUEUE_FULL, NO_STATE)
+            return Progress(visits, QUEUE_FULL)
         state = pop(queue)
         # It was queued more than once and is closed by now, or a repair took it back.
         if mark[state] != OPEN:
             continue
-        if closable is not None and not closable.first <= state < closable.end:
-            return Progress(visits, NOT_CLOSABLE, state)
         mark[state] = CLOSED
         visits += 1
         expand(state, distance, mark, queue, space)
-    return Progress(visits, DONE, NO_STATE)
+    return Progress(visits, DONE)

@@ -22,20 +22,17 @@ from strategies import (
     Data,
     Place,
     cells_of,
-    grids_with_costs,
-    grids_with_free_cell,
     patched,
     shapes,
 )
 
-from ddqn_planner import GridMap, MoveRule, Plan, Planner, PlanStatus
+from ddqn_planner import GridMap, MoveRule, PlanStatus
 from ddqn_planner.grid import Cell, grid_map, map_changes
 from ddqn_planner.grid.grid_map import LAYERS
 from ddqn_planner.grid.layers import legal_moves, move_costs
 from ddqn_planner.grid.moves import MOVES
 from ddqn_planner.grid.noise import random_requests
 from ddqn_planner.grid.oracle import shortest_distances
-from ddqn_planner.model import move_costs as move_costs_module
 from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning import cell_space, field_cache, queues, wavefront
 from ddqn_planner.planning import field as fields
@@ -531,104 +528,6 @@ def test_threads_ask_a_field_for_what_others_compute() -> None:
 
     with ThreadPoolExecutor(4) as threads:
         assert all(threads.map(ask, range(4)))
-
-
-def grown_by_rows(
-    planner: Planner, grid: GridMap, start: Cell, goal: Cell, rule: MoveRule
-) -> Plan:
-    """A plan for which patches are read row by row, as on a large map."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(move_costs_module, "LARGE", 0)
-        patch.setattr(cell_space, "MARGIN", 0)
-        return planner.plan(grid, start, goal, rule)
-
-
-@settings(max_examples=150)
-@given(grids_with_costs() | grids_with_free_cell(), RULES, st.data())
-def test_where_patches_are_read_as_a_field_grows_plans_are_the_same(
-    place: Place, rule: MoveRule, data: Data
-) -> None:
-    grid, goal = place
-    at_once, by_rows = new_planner(), new_planner()
-    for _ in range(3):
-        start = data.draw(cells_of(place[0]))
-        plan = grown_by_rows(by_rows, grid, start, goal, rule)
-        assert plan == at_once.plan(grid, start, goal, rule)
-        grid = data.draw(patched(grid))  # its field is repaired
-
-
-@pytest.mark.parametrize("margin", [0, 1, 3])
-def test_where_rows_are_read_ends_lie_in_the_first_and_the_last_rows(
-    margin: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    height, width = 24, 5
-    random = np.random.default_rng(margin)
-    cells = random.random((height, width)) < 0.15
-    grid = GridMap(cells, cost=random.integers(0, 100, (height, width)))
-    rows = 0, 1, 2, height // 2, height - 3, height - 2, height - 1
-    ends = [(x, y) for x, y in grid.free_cells() if y in rows]
-    at_once = [new_planner().q_field(grid, goal) for goal in ends]
-    monkeypatch.setattr(move_costs_module, "LARGE", 0)
-    monkeypatch.setattr(cell_space, "MARGIN", margin)
-    for goal, field_at_once in zip(ends, at_once, strict=True):
-        by_rows = new_planner().q_field(grid, goal)
-        for start in ends[::-1]:
-            assert by_rows.rollout(start) == field_at_once.rollout(start)
-        np.testing.assert_array_equal(by_rows.value, field_at_once.value)
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_where_rows_are_read_several_patches_lie_between_two_requests(
-    seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # Rows that the costs of a map read for its second patch must be in what the first
-    # one changed.
-    height, width, goal = 60, 12, (0, 0)
-    random = np.random.default_rng(seed)
-    monkeypatch.setattr(cell_space, "MARGIN", 0)
-    for _ in range(20):
-        cells = random.random((height, width)) < 0.3
-        cells[0, 0] = False
-        grid, by_rows = GridMap(cells), new_planner()
-        with monkeypatch.context() as patch:
-            patch.setattr(move_costs_module, "LARGE", 0)
-            by_rows.plan(grid, goal, goal)  # the first rows alone are read
-            for _ in range(3):
-                x, y = random.integers((width - 2, height - 2)).tolist()
-                box = random.random((2, 2)) < 0.3
-                if (x, y) == goal:
-                    box[0, 0] = False
-                grid = grid.with_patch(box, x, y)
-            starts = random.choice(grid.free_cells(), size=4).tolist()
-            plans = [by_rows.plan(grid, start, goal) for start in starts]
-        assert plans == [new_planner().plan(grid, start, goal) for start in starts]
-
-
-def test_few_rows_of_a_large_map_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(move_costs_module, "LARGE", 2**16)
-    side = 1000
-    cost = np.zeros((side, side), np.int8)
-    grid, planner = GridMap(np.zeros((side, side)), cost=cost), new_planner()
-    assert planner.plan(grid, (500, 500), (560, 500)).path.size
-    (field,) = planner.fields.kept
-    assert isinstance(field, DistanceField)
-    rows = field.costs.rows_read
-    assert rows is not None
-    assert 0 < rows.first < 500 < rows.end < side
-    assert rows.end - rows.first < 300
-    # A map that changes is read as a whole.
-    planner.plan(grid.with_patch([[True]], 505, 500), (500, 500), (560, 500))
-    (field,) = planner.fields.kept
-    assert isinstance(field, DistanceField)
-    assert field.costs.rows_read is None
-    # Around a wall, it has to look on.
-    wall = np.zeros((side, side), np.bool_)
-    wall[1:, 530] = True
-    walled = GridMap(wall, cost=cost)
-    plan = planner.plan(walled, (500, 500), (560, 500))
-    monkeypatch.setattr(move_costs_module, "LARGE", side**2)
-    assert plan == new_planner().plan(walled, (500, 500), (560, 500))
-    assert plan.path[:, 1].min() == 0
 
 
 def new_maps(side: int, kind: str) -> Iterator[GridMap]:
