@@ -49,7 +49,7 @@ class TorchLearner:
         self._online, self._target = (
             PaperModule(**trainer.network.sizes) for _ in range(2)
         )
-        online, target, *moments = trainer._parts
+        online, target, *moments = trainer.learned
         for module, part in ((self._online, online), (self._target, target)):
             for name, weight in module.named_parameters():
                 weight.data.copy_(torch.from_numpy(part[name]))
@@ -62,7 +62,7 @@ class TorchLearner:
                 state[key] = torch.from_numpy(part[name].copy())
                 part[name] = state[key].numpy()
             self._adam.state[weight] = state
-        trainer._learner = self
+        trainer.learner = self
 
     def _observe(self, scenario: NDArray[np.int64], cell: NDArray[np.int64]) -> Tensor:
         return torch.from_numpy(self.environment.observe(scenario, cell))

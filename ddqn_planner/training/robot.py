@@ -113,7 +113,7 @@ class RobotTrainer:
         self._tabulate_moves(motions)
         self._list_starts()
         self._tabulate_places(side)
-        self._replay = ReplayBuffer(self.parameters.replay_capacity)
+        self.replay = ReplayBuffer(self.parameters.replay_capacity)
         self.steps = 0
         self.updates = 0
         tensors = self.network.tensors
@@ -244,7 +244,7 @@ class RobotTrainer:
         reward = np.where(legal, self.reward_KC[action, pose], collision)
         continues = legal & (next_pose != self.goal_M[scenario])
         discount = np.where(continues, p.gamma, 0.0).astype(np.float32)
-        self._replay.add(
+        self.replay.add(
             Transitions(scenario, pose, action, reward, next_pose, discount)
         )
         self.steps += robots
@@ -252,7 +252,7 @@ class RobotTrainer:
     def _update(self) -> None:
         """Change weights and thresholds by the Double DQN gradient of a batch."""
         p = self.parameters
-        batch = self._replay.sample(p.batch_size, self._sampling)
+        batch = self.replay.sample(p.batch_size, self._sampling)
         # The states, and after them the next states: 2B.
         scenario = np.tile(batch.scenario, 2)
         pose = np.concatenate([batch.cell, batch.next_cell])

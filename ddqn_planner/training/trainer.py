@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import safetensors.numpy
@@ -49,6 +49,15 @@ class CheckpointError(ValueError):
     """A checkpoint cannot be resumed; the message says why and what to do."""
 
 
+class Learned(NamedTuple):
+    """All that an update changes: tensors by name, of the same names in each."""
+
+    online: dict[str, NDArray[np.float32]]  # θ
+    target: dict[str, NDArray[np.float32]]  # θ⁻
+    mean: dict[str, NDArray[np.float32]]  # Adam's moments of the gradient
+    square: dict[str, NDArray[np.float32]]
+
+
 class Learner(Protocol):
     """Updates the network of a trainer, and evaluates it; B = a batch."""
 
@@ -86,26 +95,24 @@ class Trainer:
         initial, self._exploration, self._sampling = self._generators
         self.environment = GridVectorEnvironment(self.scenarios, parameters, initial)
         self.network = self._initial_network(int(weight_seed.generate_state(1)[0]))
-        # All that an update changes: the tensors of the networks θ and θ⁻, and of
-        # Adam's two moments of the gradient.
         tensors = self.network.tensors
-        self._parts = (
-            tensors,
-            {name: np.copy(tensor) for name, tensor in tensors.items()},
-            {name: np.zeros_like(tensor) for name, tensor in tensors.items()},
-            {name: np.zeros_like(tensor) for name, tensor in tensors.items()},
+        self.learned = Learned(
+            online=tensors,
+            target={name: np.copy(tensor) for name, tensor in tensors.items()},
+            mean={name: np.zeros_like(tensor) for name, tensor in tensors.items()},
+            square={name: np.zeros_like(tensor) for name, tensor in tensors.items()},
         )
-        self._replay = ReplayBuffer(parameters.replay_capacity)
+        self.replay = ReplayBuffer(parameters.replay_capacity)
         self.environment.reset()
         # The paper's network learns in compiled code, and has no learner.
-        self._learner: Learner | None = None
+        self.learner: Learner | None = None
         if isinstance(self.network, PropagationQNetwork):
-            self._learner = PropagationLearner(
-                self.network, self._parts, self.environment, self.next_q
+            self.learner = PropagationLearner(
+                self.network, self.learned, self.environment, self.next_q
             )
         else:
             self._training = training_of(
-                self._parts, self.environment, self._replay, self.next_q
+                self.learned, self.environment, self.replay, self.next_q
             )
 
     def _initial_network(self, seed: int) -> QNetwork:
@@ -140,19 +147,19 @@ class Trainer:
         while self.steps < until:
             next_multiple = (self.steps // every + 1) * every
             pause = min(until, next_multiple)
-            if self._learner is None:
+            if self.learner is None:
                 self._play(pause)
             else:
-                self._step(self._learner)
+                self._step(self.learner)
             yield self._end_episodes()
 
     def _play(self, last_step: int) -> None:
         """Make some steps in compiled code, until an episode ends or to `last_step`."""
-        counters = Counters(self.steps, self.updates, self._replay.added)
+        counters = Counters(self.steps, self.updates, self.replay.added)
         counters = play(
             self._training, self._exploration, self._sampling, counters, last_step
         )
-        self.steps, self.updates, self._replay.added = counters
+        self.steps, self.updates, self.replay.added = counters
 
     def _step(self, learner: Learner) -> None:
         """Make a step, and the updates that are due after it."""
@@ -174,7 +181,7 @@ class Trainer:
             next_cell=environment.cell,
             discount=np.where(outcome.terminated, 0.0, p.gamma).astype(np.float32),
         )
-        self._replay.add(transitions)
+        self.replay.add(transitions)
         # An update is due for each multiple of the interval that the steps pass.
         passed_multiples = self.steps // p.update_interval
         self.steps += p.environments
@@ -182,7 +189,7 @@ class Trainer:
         if self.steps > p.learning_starts:
             for _ in range(updates_due):
                 self.updates += 1
-                batch = self._replay.sample(p.batch_size, self._sampling)
+                batch = self.replay.sample(p.batch_size, self._sampling)
                 learner.update(batch, self.updates)
 
     def _end_episodes(self) -> list[Episode]:
@@ -252,7 +259,7 @@ class Trainer:
     def _description(self) -> dict[str, Any]:
         """Return the JSON object of a checkpoint.
 
-        Its arrays are in `_tensors`. The keys are those of the first version, so that
+        Its arrays are in `arrays`. The keys are those of the first version, so that
         old checkpoints load.
         """
         environment = self.environment
@@ -271,7 +278,7 @@ class Trainer:
             "parameters": asdict(self.parameters),
             "scenarios": scenarios,
             # In the order in which `_restore_arrays` reads them.
-            "counters": [self.steps, self.updates, self.episodes, self._replay.added],
+            "counters": [self.steps, self.updates, self.episodes, self.replay.added],
             "walked": paths,
             "generators": states,
         }
@@ -281,7 +288,7 @@ class Trainer:
         # The file has arrays in the order of C alone.
         tensors = {
             name: np.asarray(tensor, order="C")
-            for name, tensor in self._tensors().items()
+            for name, tensor in self.arrays().items()
         }
         text = json.dumps(self._description())
         metadata = {CHECKPOINT_KEY: text, DIGEST_KEY: _digest(text, tensors)}
@@ -305,13 +312,11 @@ class Trainer:
                 description = json.loads(metadata[CHECKPOINT_KEY])
                 self._check_training(description)
                 self._restore_arrays(file, description["counters"])
-            if metadata[DIGEST_KEY] != _digest(
-                metadata[CHECKPOINT_KEY], self._tensors()
-            ):
+            if metadata[DIGEST_KEY] != _digest(metadata[CHECKPOINT_KEY], self.arrays()):
                 raise ValueError("its digest is another")
             self._restore_episodes(description)
-            if self._learner is not None:
-                self._learner.settle()
+            if self.learner is not None:
+                self.learner.settle()
         except CheckpointError as error:
             raise CheckpointError(
                 f"{path}: {error}, or train into another folder"
@@ -346,8 +351,8 @@ class Trainer:
     def _restore_arrays(self, file: Any, counters: list[int]) -> None:
         """Set the counters, and read the arrays of an open file of safetensors."""
         # First the counters, as they tell how many transitions there are.
-        self.steps, self.updates, self.episodes, self._replay.added = counters
-        tensors = self._tensors()
+        self.steps, self.updates, self.episodes, self.replay.added = counters
+        tensors = self.arrays()
         shapes = {name: [*tensor.shape] for name, tensor in tensors.items()}
         # Before any is read: a small sparse file can claim tensors of any size.
         saved_shapes = {
@@ -368,9 +373,9 @@ class Trainer:
         for generator, state in states:
             generator.bit_generator.state = state
 
-    def _tensors(self) -> dict[str, NDArray[Any]]:
+    def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the arrays of a checkpoint; they share the trainer's memory."""
-        online, target, mean, square = self._parts
+        learned = self.learned
         environment = self.environment
         tensors: dict[str, NDArray[Any]] = {
             "environment.scenario": environment.scenario,
@@ -378,18 +383,18 @@ class Trainer:
             "environment.steps": environment.steps,
             "total_reward": environment.total_reward,
         }
-        for name in online:
-            tensors[f"network.{name}"] = online[name]
-            tensors[f"target.{name}"] = target[name]
-        for name, values in self._replay.transitions._asdict().items():
-            tensors[f"replay.{name}"] = values[: len(self._replay)]
+        for name in learned.online:
+            tensors[f"network.{name}"] = learned.online[name]
+            tensors[f"target.{name}"] = learned.target[name]
+        for name, values in self.replay.transitions._asdict().items():
+            tensors[f"replay.{name}"] = values[: len(self.replay)]
         if self.updates:
             # As torch's optimisers name them.
-            for number, name in enumerate(online):
+            for number, name in enumerate(learned.online):
                 optimiser = f"optimiser.{number}"
                 tensors[f"{optimiser}.step"] = np.array(self.updates, np.float32)
-                tensors[f"{optimiser}.exp_avg"] = mean[name]
-                tensors[f"{optimiser}.exp_avg_sq"] = square[name]
+                tensors[f"{optimiser}.exp_avg"] = learned.mean[name]
+                tensors[f"{optimiser}.exp_avg_sq"] = learned.square[name]
         return tensors
 
 

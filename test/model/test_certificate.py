@@ -76,9 +76,11 @@ def right_network(name: str, move_rule: MoveRule | None = None) -> PropagationQN
 
 
 def logits(network: PropagationQNetwork, feature_BI: np.ndarray) -> np.ndarray:
-    hidden_BF = np.maximum(network._layer("convolution", feature_BI), 0)
-    hidden_BF = np.maximum(network._layer("hidden", hidden_BF), 0)
-    return network._layer("moves", hidden_BF)
+    tensors, output_BF = network.tensors, feature_BI
+    for layer in ("convolution", "hidden", "moves"):
+        input_BF = np.maximum(output_BF, 0)  # the features are 0 or more
+        output_BF = input_BF @ tensors[f"{layer}.weight"].T + tensors[f"{layer}.bias"]
+    return output_BF
 
 
 CERTIFICATE = certify(any_map())

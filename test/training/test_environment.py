@@ -179,13 +179,17 @@ def test_a_move_that_succeeds_is_rewarded_for_the_goal_only_beside_it(
 def test_what_is_no_action_is_refused_and_changes_nothing(
     paper: Scenario, action: Any
 ) -> None:
-    environment = GridEnvironment(paper, PARAMETERS)
-    before, _ = environment.reset(seed=0)
+    environment, other = (GridEnvironment(paper, PARAMETERS) for _ in range(2))
+    for each in (environment, other):
+        each.reset(seed=0)
     with pytest.raises(
         ValueError, match=r"the action is .*; give a whole number, 0 to 7"
     ):
         environment.step(action)
-    np.testing.assert_array_equal(environment._observe(), before)
+    observation, *outcome = environment.step(2)
+    expected, *expected_outcome = other.step(2)
+    np.testing.assert_array_equal(observation, expected)
+    assert outcome == expected_outcome
     with pytest.raises(ValueError, match="the actions"):
         environment.vector.move(np.array([-1]))
 

@@ -81,9 +81,9 @@ def test_a_robot_bumps_where_its_body_touches_an_obstacle() -> None:
     motions, width = trainer.network.motions, trainer.width
     swept = trainer.network.of_primitives(trainer.network.swept_by_unit)
     reach, collisions = swept.shape[1] // 2, 0
-    for _ in range(20):
-        trainer._step(trainer.parameters.environments)
-    made = (values[: trainer.steps] for values in trainer._replay.transitions)
+    for _ in trainer.run(20 * trainer.parameters.environments):
+        pass
+    made = (values[: trainer.steps] for values in trainer.replay.transitions)
     for number, cell, action, reward, after, discount in zip(*made, strict=True):
         (y, x), heading = divmod(cell // 16, width), cell % 16
         primitive = trainer.primitive_KN[action, heading]
@@ -138,7 +138,7 @@ def test_a_training_makes_as_many_transitions_as_it_may() -> None:
     for steps in (1000, 1001):
         for _ in trainer.run(steps):
             pass
-        assert trainer.steps == len(trainer._replay) == steps
+        assert trainer.steps == len(trainer.replay) == steps
     for wrong in (0, -5, 0.5, True, 1e300, None):
         with pytest.raises(
             ValueError, match=r"number of steps is .* give a whole number, 1 to"

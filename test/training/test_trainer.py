@@ -167,8 +167,9 @@ def test_learning_starts_and_targets_are_copied_when_the_parameters_say(
     train(trainer, 5)
     assert trainer.updates == 0
     for _ in trainer.run(13, every=1):
-        online, target, *_ = trainer._parts
-        assert same_weights(online, target) == (trainer.updates % 3 == 0)
+        learned = trainer.learned
+        is_copied = same_weights(learned.online, learned.target)
+        assert is_copied == (trainer.updates % 3 == 0)
     assert trainer.updates == 8
 
 

@@ -2,7 +2,6 @@
 equations.
 """
 
-import copy
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +26,7 @@ from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions
 from ddqn_planner.training.environment import Scenario, paper_scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.robot import RobotTrainer
-from ddqn_planner.training.trainer import Trainer
+from ddqn_planner.training.trainer import Learner, Trainer
 
 TARGETS = {
     "double_dqn": (Trainer, "double_dqn"),
@@ -59,8 +58,21 @@ def test_the_buffer_holds_the_last_transitions_whole(
 def part(trainer: Trainer) -> None:
     """Let the two networks of a trainer differ, so that the targets do."""
     random = np.random.default_rng(0)
-    for tensor in trainer._parts[1].values():
+    for tensor in trainer.learned.target.values():
         tensor += random.normal(0, 0.3, tensor.shape).astype(np.float32)
+
+
+class Recording:
+    """A learner that keeps the batches of its updates."""
+
+    def __init__(self, learner: Learner | None) -> None:
+        assert learner is not None
+        self.q_values, self.settle = learner.q_values, learner.settle
+        self.learner, self.batches = learner, list[Transitions]()
+
+    def update(self, batch: Transitions, number: int) -> None:
+        self.batches.append(batch)
+        self.learner.update(batch, number)
 
 
 def mean_squared_error(
@@ -88,8 +100,8 @@ def check_update(trainer: Trainer, loss: Tensor, before: dict[str, Tensor]) -> N
     expected = torch.autograd.grad(loss, list(before.values()))
     rate = trainer.parameters.learning_rate
     scale = max(float(gradient.abs().max()) for gradient in expected)
-    parts = map(in_torch, trainer._parts)
-    weights, _, mean, square = (tensors.values() for tensors in parts)
+    learned = map(in_torch, trainer.learned)
+    weights, _, mean, square = (tensors.values() for tensors in learned)
     for *found, gradient, old in zip(
         weights, mean, square, expected, before.values(), strict=True
     ):
@@ -141,8 +153,8 @@ def test_compiled_training_is_that_of_torch(
 
 
 def check_same(compiled: Trainer, of_torch: Trainer) -> None:
-    expected = of_torch._tensors()
-    for name, tensor in compiled._tensors().items():
+    expected = of_torch.arrays()
+    for name, tensor in compiled.arrays().items():
         # The mean: Adam makes much of the rounding of a gradient that is nearly 0.
         error = np.abs(tensor - expected[name]).mean(dtype=np.float64)
         assert error <= 1e-3 * np.abs(expected[name]).mean(dtype=np.float64), name
@@ -191,12 +203,12 @@ def test_an_update_is_the_equations_and_counts_each_reward_once(
     trainer = trainer_class(scenarios, parameters, seed=1)
     list(trainer.run(60))
     part(trainer)
-    assert trainer._learner is not None
-    trainer._learner.settle()
+    trainer.learner = learner = Recording(trainer.learner)
+    learner.settle()
     trainer.network.tensors["prices.bias"][
         ::2
     ] = -1.0  # a multiplier below 1 is clipped
-    before, target_weights = map(in_torch, trainer._parts[:2])
+    before, target_weights = map(in_torch, trainer.learned[:2])
     for weight in before.values():
         weight.requires_grad_()
     lengths = torch.from_numpy(LENGTHS.astype(np.float32))
@@ -227,10 +239,10 @@ def test_an_update_is_the_equations_and_counts_each_reward_once(
                 value[scenario.goal] = 0.0
             by_target[scenario] = q_of(target_weights, scenario, value)
         by_online[scenario] = q_of(before, scenario, value)
-    random = copy.deepcopy(trainer._sampling)
     list(trainer.run(65))
     assert trainer.updates == 1
-    batch = trainer._replay.sample(parameters.batch_size, random)
+    (batch,) = learner.batches
+    assert len(batch.cell) == parameters.batch_size
     assert {0, 1} == set(batch.scenario)
     selection = by_target if target == "dqn" else by_online
     evaluation = by_online if target == "printed" else by_target
