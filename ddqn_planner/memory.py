@@ -41,12 +41,12 @@ def give_back() -> None:
     with suppress(AttributeError, OSError):  # another system or C library
         c_library = ctypes.CDLL(None)
         c_library.malloc_trim(0)
-        for first, end in _unwritten_mappings(LLVM):
+        for first, end in unwritten_mappings(LLVM):
             size = ctypes.c_size_t(end - first)
             c_library.madvise(ctypes.c_void_p(first), size, mmap.MADV_DONTNEED)
 
 
-def _unwritten_mappings(file: str) -> Iterator[tuple[int, int]]:
+def unwritten_mappings(file: str) -> Iterator[tuple[int, int]]:
     """Yield first address and end of the unchanged mappings of a file.
 
     The end of the file's path is `file`. Changed pages would be lost by MADV_DONTNEED;

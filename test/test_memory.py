@@ -10,7 +10,7 @@ from networks import new_planner
 
 from ddqn_planner import GridMap
 from ddqn_planner.compiled import compiled
-from ddqn_planner.memory import LLVM, _unwritten_mappings, give_back, llvm_was_used
+from ddqn_planner.memory import LLVM, give_back, llvm_was_used, unwritten_mappings
 from ddqn_planner.warm_up import warm_up
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
@@ -49,7 +49,7 @@ def test_no_mapping_with_written_pages_is_given_back() -> None:
             first = int(header[1], 16)
         elif re.match(r"Anonymous: +[1-9]", line):
             written.add(first)
-    given_back = {first for first, _ in _unwritten_mappings("")}
+    given_back = {first for first, _ in unwritten_mappings("")}
     assert written
     assert given_back
     assert not written & given_back

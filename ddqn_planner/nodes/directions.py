@@ -1,7 +1,6 @@
 """The one-way zones of a map server, which hold on every map of their frame."""
 
 import math
-import time
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -45,6 +44,8 @@ class Directions:
         Where refused messages are reported.
     on_change
         Called after each message that is not refused.
+    clock
+        Returns seconds of a steady clock.
     """
 
     def __init__(
@@ -52,10 +53,12 @@ class Directions:
         node: BaseNode,
         diagnostics: PlannerDiagnostics,
         on_change: Callable[[], None],
+        clock: Callable[[], float],
     ) -> None:
         self._node = node
         self._diagnostics = diagnostics
         self._on_change = on_change
+        self._clock = clock
         self._was_received = False  # whether a message was, since the node's start
         self._frame = ""  # of the zones
         self._zones: GridMap | None = None  # None if nothing is forbidden
@@ -93,7 +96,7 @@ class Directions:
         if not self._publishers() - self._known_publishers:
             self.awaited_since = -math.inf
             return ""
-        now = time.monotonic()
+        now = self._clock()
         if self.awaited_since == -math.inf:
             self.awaited_since = now
         if now - self.awaited_since < PUBLISHER_WAIT:

@@ -116,7 +116,7 @@ class MapSource:
         self._prepared: Future | None = None
         # Before the subscription of the map: directions that come with a map are taken
         # first.
-        self.directions = Directions(node, diagnostics, self._on_directions)
+        self.directions = Directions(node, diagnostics, self._on_directions, clock)
         subscription = node.create_subscription(
             OccupancyGrid, "map", self.take, LATCHED
         )

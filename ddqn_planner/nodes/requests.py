@@ -67,6 +67,7 @@ class Requests:
     check_soon: Callable[[], None]  # lets the node call `wake_waiting` soon
     next_wake: Future = field(default_factory=Future)  # done by `wake_waiting`
     retries: Retries = field(default_factory=Retries)
+    clock: Callable[[], float] = time.monotonic  # returns seconds of the steady clock
 
     def wake_waiting(self) -> None:
         """Wake the requests that wait for a map or a pose: it may have come."""
@@ -86,14 +87,14 @@ class Requests:
         outcome = await self.plan_once(query, current)
         if self._may_succeed_soon(query, costmap, outcome):
             first_costmap = costmap
-            deadline = time.monotonic() + self.map.retry_wait
+            deadline = self.clock() + self.map.retry_wait
             is_in_time = True
             while outcome.has_failed and is_in_time:
                 if not await self._wait_for_costmap(costmap, deadline):
                     # Until a costmap comes, the next query does not wait.
                     self.map.arrivals.number_at_vain_wait = first_costmap
                     break
-                is_in_time = time.monotonic() < deadline
+                is_in_time = self.clock() < deadline
                 costmap = self.map.arrivals.number
                 outcome = await self.plan_once(query, current)
         self.retries.note(query.goals, costmap, outcome)
@@ -119,7 +120,7 @@ class Requests:
             Seconds of the steady clock.
         """
         while self.map.arrivals.number == last:
-            if time.monotonic() >= deadline:
+            if self.clock() >= deadline:
                 return False
             self.check_soon()
             await self.next_wake
@@ -263,7 +264,7 @@ class Requests:
             In any frame.
         """
         frame: str = inputs.header.frame_id
-        deadline = time.monotonic() + self.settings.transform_tolerance
+        deadline = self.clock() + self.settings.transform_tolerance
         try:
             to_map = partial(self.poses.to_map, name, stamped, frame)
             pose = await self._wait_for(to_map, deadline)
@@ -306,7 +307,7 @@ class Requests:
             try:
                 return get()
             except RequestError as error:
-                if not error.may_come and time.monotonic() >= deadline:
+                if not error.may_come and self.clock() >= deadline:
                     raise
             self.check_soon()
             await self.next_wake

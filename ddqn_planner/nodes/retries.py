@@ -58,7 +58,8 @@ class Failure(NamedTuple):
 class Retries:
     """The last requests that failed."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
         self._failures: deque[Failure] = deque(maxlen=MOST_FAILURES)
 
     def is_retry(
@@ -77,7 +78,7 @@ class Retries:
             Metres: two goals that are no farther from each other are the same.
         """
         for failure in self._failures:
-            is_recent = time.monotonic() - failure.seconds < RETRY_WITHIN
+            is_recent = self._clock() - failure.seconds < RETRY_WITHIN
             may_have_been_cleared = failure.costmap == costmap or is_recent
             is_near = _distance(failure.last_goal, goals[-1]) <= resolution
             if may_have_been_cleared and is_near:
@@ -109,7 +110,7 @@ class Retries:
         ]
         self._failures = deque(failures, MOST_FAILURES)
         if outcome.has_failed:
-            self._failures.append(Failure(last_goal, costmap, time.monotonic()))
+            self._failures.append(Failure(last_goal, costmap, self._clock()))
 
 
 def _distance(goal: PoseStamped, other: PoseStamped) -> float:

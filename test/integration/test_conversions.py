@@ -8,7 +8,7 @@ from functools import partial
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
+from unittest.mock import MagicMock, Mock
 
 import numpy as np
 import pytest
@@ -376,12 +376,16 @@ def new_poses(node: Mock) -> Poses:
 def listening(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Frames]:
     """Return what makes frames that know the transforms of some seconds."""
 
-    def make(*seconds: int) -> Frames:
-        tf2_ros = Mock(Buffer=lambda: Buffer(*seconds), TransformException=KeyError)
+    def make(*seconds: int, node: Mock | None = None) -> Frames:
+        tf2_ros = MagicMock(
+            Buffer=lambda: Buffer(*seconds), TransformException=KeyError
+        )
+        listener = tf2_ros.TransformListener.return_value
+        for subscription in (listener.tf_sub, listener.tf_static_sub):
+            subscription.handle.take_message.return_value = None  # no message waits
         tf2_ros.__spec__ = object  # it is installed
         monkeypatch.setitem(sys.modules, "tf2_ros", tf2_ros)
-        monkeypatch.setattr(Frames, "_receive_transforms", lambda _: None)
-        return Frames(new_node(), lambda: 20.0)
+        return Frames(node or new_node(), lambda: 20.0)
 
     return make
 
@@ -443,10 +447,11 @@ def test_a_newest_transform_beyond_the_tolerance_is_not_used(listening: Any) -> 
 def test_transforms_from_before_the_clock_jumped_back_are_forgotten(
     listening: Any,
 ) -> None:
-    frames = listening(100)
+    node = new_node()
+    frames = listening(100, node=node)
     assert frames.origin_of("odom", "map").pose.position.x == 1.0
     frames.listening_since -= 60
-    for forget in frames._node.jump_back_callbacks:  # as the node does
+    for forget in node.jump_back_callbacks:  # as the node does
         forget()
     with pytest.raises(ValueError, match="does not exist"):
         frames.origin_of("odom", "map")

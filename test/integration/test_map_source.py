@@ -6,6 +6,7 @@ map_msgs.
 """
 
 import array
+import re
 import threading
 import time
 from collections.abc import Callable, Coroutine, Iterator
@@ -28,6 +29,7 @@ from std_msgs.msg import Header, UInt8MultiArray
 
 from ddqn_planner import Experience, GridMap, MoveRule, Planner
 from ddqn_planner.grid import inflate
+from ddqn_planner.grid.inflation import Inflation
 from ddqn_planner.nodes.base_node import BaseNode
 from ddqn_planner.nodes.conversions import (
     MapRules,
@@ -70,14 +72,19 @@ class Source(MapSource):
     """
 
     def __init__(self, node: BaseNode) -> None:
-        self.heard, self.diagnostics = 0, PlannerDiagnostics(node)
+        self.heard, self.worker = 0, Worker(node)
+        self.changing_threads = set[int]()  # in which the diagnostics changed
+        self.diagnostics = PlannerDiagnostics(node, self._change_diagnostics)
         self.now = 100.0  # seconds of its clock
         super().__init__(
-            node, self.diagnostics, Worker(node), self._hear, lambda: self.now
+            node, self.diagnostics, self.worker, self._hear, lambda: self.now
         )
 
     def _hear(self) -> None:
         self.heard += 1
+
+    def _change_diagnostics(self) -> None:
+        self.changing_threads.add(threading.get_ident())
 
     def grid(self) -> GridMap:
         future = self.ready()
@@ -347,16 +354,13 @@ def test_the_first_map_waits_for_directions_that_are_published(source: Source) -
 
 @pytest.mark.usefixtures("published")
 def test_a_map_waits_a_second_for_a_publisher_that_sends_nothing(
-    source: Source, monkeypatch: pytest.MonkeyPatch
+    source: Source,
 ) -> None:
-    now = [100.0]
-    clock = SimpleNamespace(monotonic=lambda: now[0])
-    monkeypatch.setattr("ddqn_planner.nodes.directions.time", clock)
     for stamp, age in ((1, 0.0), (2, 0.5), (3, 0.49)):  # a live map
-        now[0] += age
+        source.now += age
         assert source.on_map(stamp) == NOTHING
         assert source.is_settling
-    now[0] += 0.02
+    source.now += 0.02
     source.use_waiting_map()
     assert source.used() == (3, None)
     assert not source.is_settling
@@ -438,25 +442,29 @@ OTHERS = [
 ]
 
 
+LOGGED_PROBLEM = r"\[(WARN|ERROR)\]"
+
+
 def test_why_a_map_waits_for_directions_is_logged_once(
-    source: Source, set_parameters: SetParameters, monkeypatch: pytest.MonkeyPatch
+    source: Source, set_parameters: SetParameters, capfd: Any
 ) -> None:
-    logged = list[str]()
-    logger = SimpleNamespace(
-        warning=logged.append, error=logged.append, info=lambda _: None
-    )
-    monkeypatch.setattr(source._node, "get_logger", lambda: logger)
+    def logged() -> list[str]:
+        """Return the warnings and errors that were logged since the last call."""
+        lines = capfd.readouterr().err.splitlines()
+        return [
+            line.partition("]: ")[2] for line in lines if re.match(LOGGED_PROBLEM, line)
+        ]
 
     def reasons_for(*changes: dict[str, Any]) -> list[str]:
         """Return what is logged while maps come for 3 s, and then none for 2 s."""
-        logged.clear()
+        logged()
         for stamp in range(10, 16):
             source.on_map(stamp, **changes[stamp % len(changes)])
             assert "map" in source.diagnostics.refused
             source.now += 0.5
         source.now += 2.0
         source.use_waiting_map()
-        return logged
+        return logged()
 
     set_parameters(require_directions=True)
     (late,) = reasons_for({})
@@ -472,17 +480,17 @@ def test_why_a_map_waits_for_directions_is_logged_once(
     assert "give both one yaw, or set require_directions to false" in turned
     assert source.on_map(20) == (20, EAST)
     # Directions that come moments after their map are no reason to warn.
-    logged.clear()
+    logged()
     assert source.on_map(21, frame="odom") == (20, EAST)
     source.now += 0.5
     source.use_waiting_map()
     assert source.on_map(22) == (22, EAST)
     source.now += 5.0
     assert source.on_map(23, frame="odom") == (22, EAST)
-    assert not logged
+    assert not logged()
     source.now += 1.0
     source.use_waiting_map()
-    assert len(logged) == 1
+    assert len(logged()) == 1
 
 
 @pytest.mark.parametrize(("changes", "reason"), OTHERS)
@@ -660,10 +668,10 @@ def test_what_no_memory_was_left_for_is_refused_or_tried_again(
     changed.data[0] = 100
     source.take(map_of(1))
     with monkeypatch.context() as patch:
-        patch.setattr(source, "_inflate", fail)
+        patch.setattr(Inflation, "__call__", fail)
         with pytest.raises(MemoryError):
             source.grid()
-        patch.setattr(source, "_patched", fail)
+        patch.setattr(GridMap, "with_patch", fail)
         source.take(changed)
         patch.setattr(source.times, "load", fail)
         finished(source.times.on_message())
@@ -693,35 +701,43 @@ def test_a_map_that_grows_keeps_its_times(times: ExpectedTimes) -> None:
     np.testing.assert_allclose(after[5:35, 10:130], before[:30], rtol=0.021)
 
 
+def planned_on(grid: GridMap) -> Outcome:
+    """The outcome of a request across a map with expected times."""
+    planner = Planner.load("any_map")
+    request = PlanRequest(grid, (22, 20), ((98, 20),), MoveRule.ROBOT_SAFE)
+    plan = planner.plan(grid, request.start, request.goals[0])
+    return Outcome("SUCCEEDED", "", planner, request, plan)
+
+
 def test_the_expected_time_is_told_as_soon_as_the_worker_has_it(
-    source: Source, driven: UInt8MultiArray, monkeypatch: pytest.MonkeyPatch
+    source: Source, driven: UInt8MultiArray
 ) -> None:
-    threads, gate, told = set[int](), threading.Event(), {"expected time (s)": "1.0"}
-    monkeypatch.setattr(
-        source.diagnostics, "_on_change", lambda: threads.add(threading.get_ident())
-    )
-    monkeypatch.setattr(source.times, "describe", lambda _: gate.wait() and told)
-    outcome = Outcome("SUCCEEDED", "a path")
+    threads, gate = source.changing_threads, threading.Event()
+    source.take(MESSAGE)
+    finished(source.times.on_message(driven))
+    outcome = planned_on(source.grid())
+    assert source.times.describe(outcome)
+    finished(source.times.on_message())  # the file that is set: none
     assert source.times.diagnostics_of(outcome) == {}  # without drives
     finished(source.times.on_message(driven))
+    assert source.grid().slowness is not None
     threads.clear()
+    source.worker.call(gate.wait)  # the worker is busy
     assert source.times.diagnostics_of(outcome) == {}
     assert threads == {threading.get_ident()}  # it looks again soon
     gate.set()
-    assert (
-        wait_for("expected time", lambda: source.times.diagnostics_of(outcome)) == told
-    )
+    lines = wait_for("expected time", lambda: source.times.diagnostics_of(outcome))
+    assert lines == source.times.describe(outcome)
     assert threads == {threading.get_ident()}  # the executor's alone
-    finished(source.times.on_message())  # the file that is set: none
+    finished(source.times.on_message())
     assert source.times.diagnostics_of(outcome) == {}
 
 
 def test_the_plan_goes_round_and_its_time_is_told(times: ExpectedTimes) -> None:
-    planner = Planner.load("any_map")
-    timed = times.apply(GRID)
-    plan = planner.plan(timed, (22, 20), (98, 20))
-    request = PlanRequest(timed, (22, 20), ((98, 20),), MoveRule.ROBOT_SAFE)
-    told = times.describe(Outcome("SUCCEEDED", "", planner, request, plan))
+    outcome = planned_on(times.apply(GRID))
+    plan, request = outcome.plan, outcome.request
+    assert request is not None
+    told = times.describe(outcome)
     seconds = float(told["expected time (s)"])
     low, high = map(float, told["expected time, 90 % interval (s)"].split(" to "))
     assert plan.cost is not None
@@ -731,8 +747,8 @@ def test_the_plan_goes_round_and_its_time_is_told(times: ExpectedTimes) -> None:
     small = np.zeros((10, 10), dtype=np.bool_)
     of_old_map = GridMap(small, slowness=np.ones(small.shape), seconds_per_cell=1.0)
     for grid in (of_old_map, GRID):  # the second one is from before the drives
-        outcome = Outcome("SUCCEEDED", "", planner, replace(request, grid=grid), plan)
-        assert times.describe(outcome) == {}
+        older = replace(outcome, request=replace(request, grid=grid))
+        assert times.describe(older) == {}
 
 
 def test_a_first_map_is_waited_for_as_long_as_it_takes_on_a_loaded_machine() -> None:

@@ -35,6 +35,7 @@ from rclpy.utilities import try_shutdown
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import GridMap
+from ddqn_planner.grid.inflation import Inflation
 from ddqn_planner.nodes import nav2
 from ddqn_planner.nodes.base_node import unless_refused
 from ddqn_planner.nodes.nav2 import (
@@ -448,7 +449,9 @@ def test_the_services_of_actions_have_queues_as_others(
     )
 
 
-def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() -> None:
+def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The node is asked as its actions ask it, which need nav2_msgs."""
     rclpy.init(
         args=["--ros-args", "-p", "use_map_costs:=true", "-p", "field_cache_bytes:=0"]
@@ -518,7 +521,7 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one() ->
 
         # A path that cannot be checked is not valid, and the node lives.
         request, validity = SimpleNamespace(path=PathMessage()), SimpleNamespace()
-        node.map_source._inflate = fail
+        monkeypatch.setattr(Inflation, "__call__", fail)
         node.map_source.change()
         assert not run(node.navigation.on_is_path_valid(request, validity)).is_valid
     finally:

@@ -161,12 +161,9 @@ def test_a_request_for_the_active_goal_that_failed_is_a_retry(asked: Asked) -> N
     assert asked.answer(retry) == "SUCCEEDED"
 
 
-def test_a_retry_waits_whatever_the_stamps_of_costmaps(
-    asked: Asked, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_retry_waits_whatever_the_stamps_of_costmaps(asked: Asked) -> None:
     late = [0.0]
-    clock = SimpleNamespace(monotonic=lambda: time.monotonic() + late[0])
-    monkeypatch.setattr("ddqn_planner.nodes.requests.time", clock)
+    asked.node.requests.clock = lambda: time.monotonic() + late[0]
     failed_before(asked)
     for shift in (None, -100.0, -1.0, -0.1, 0.0, 0.1, 1.0, 100.0):
         retry = asked.ask()
@@ -192,8 +189,7 @@ def test_the_last_costmap_in_time_counts_though_it_is_planned_on_later(
     asked: Asked, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     late = [0.0]
-    clock = SimpleNamespace(monotonic=lambda: time.monotonic() + late[0])
-    monkeypatch.setattr("ddqn_planner.nodes.requests.time", clock)
+    asked.node.requests.clock = lambda: time.monotonic() + late[0]
     failed_before(asked)
     plan_once, costmaps = asked.node.requests.plan_once, [RING, FREE]
 
@@ -278,12 +274,8 @@ def test_the_period_is_that_of_the_last_arrivals() -> None:
     assert arrivals.number == 14
 
 
-def test_a_retry_has_the_goal_of_a_recent_failure(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_retry_has_the_goal_of_a_recent_failure() -> None:
     now = [100.0]
-    clock = SimpleNamespace(monotonic=lambda: now[0])
-    monkeypatch.setattr("ddqn_planner.nodes.retries.time", clock)
     request = PlanRequest(GRID, START, (GOAL,), "robot_safe")  # type: ignore[arg-type]
 
     def outcome(status: str) -> Outcome:
@@ -295,7 +287,7 @@ def test_a_retry_has_the_goal_of_a_recent_failure(
         stamped.header.frame_id = frame
         return stamped
 
-    retries, resolution = Retries(), 0.1
+    retries, resolution = Retries(clock=lambda: now[0]), 0.1
     retries.note([at(9.0), at(1.0)], 7, outcome("NO_PATH"))
     for goals, costmap, is_retry in (
         ([at(1.0)], 7, True),
