@@ -21,7 +21,6 @@ from ddqn_planner.grid import (
     GridMap,
     MoveRule,
     clearance,
-    grid_map,
     inflate,
 )
 from ddqn_planner.grid.arguments import as_cell
@@ -297,16 +296,14 @@ def test_maps_tell_their_patches_where_all_else_is_the_same(
         )
 
 
-def test_a_map_knows_so_many_patches_and_no_more(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(grid_map, "MAX_PATCHES", 3)
-    maps = [GridMap(ZEROS)]
-    for x, y in ((0, 0), (1, 0), (2, 0), (0, 1), (1, 1)):
+def test_a_map_knows_512_patches_and_no_more() -> None:
+    cells = [(x, y) for y in range(2) for x in range(257)]
+    maps = [GridMap(np.zeros((2, 257)))]
+    for x, y in cells:
         maps.append(maps[-1].with_patch([[1]], x, y))
-    boxes = [(slice(y, y + 1), slice(x, x + 1)) for x, y in ((2, 0), (0, 1), (1, 1))]
+    boxes = [(slice(y, y + 1), slice(x, x + 1)) for x, y in cells]
     since = [maps[-1].patches_since(older) for older in maps]
-    assert since == [None, None, boxes, boxes[1:], boxes[2:], []]
+    assert since == [None, None, *(boxes[number:] for number in range(2, 515))]
     assert maps[0].patches_since(maps[1]) is None
     assert not any(maps[-1].same_cells(older) for older in maps[:-1])
 

@@ -10,7 +10,7 @@ from networks import random_network
 from strategies import Place, grids_with_costs, grids_with_free_cell
 from torch_layers import in_torch, papers_layers, propagation_layers
 
-from ddqn_planner.grid import OCCUPIED, UNKNOWN, Cell, GridMap, MoveRule
+from ddqn_planner.grid import LENGTHS, OCCUPIED, UNKNOWN, Cell, GridMap, MoveRule
 from ddqn_planner.model import AnyMapQNetwork, PropagationQNetwork, networks
 from ddqn_planner.model.move_costs import (
     every_patch,
@@ -135,19 +135,19 @@ def q_values(network: PropagationQNetwork, grid: GridMap, goal: Cell) -> np.ndar
     return network_field(network, grid, goal, MoveRule.ROBOT_SAFE).q
 
 
-def test_many_unique_patches_are_evaluated_in_batches(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    cost = np.random.default_rng(0).integers(0, 99, (8, 9)).astype(np.int8)
-    grid, network = (
-        GridMap(np.zeros((8, 9)), cost=cost),
-        random_network("any_map", filters=4),
-    )
-    at_once = q_values(network, grid, (3, 3))
-    assert np.isfinite(at_once).any()
-    monkeypatch.setattr(networks, "BATCH", 7)
-    in_batches = q_values(network, grid, (3, 3))
-    np.testing.assert_allclose(in_batches, at_once, rtol=1e-5)
+def test_many_unique_patches_are_evaluated_in_batches() -> None:
+    cost = np.random.default_rng(0).integers(0, 99, (100, 90)).astype(np.int8)
+    grid = GridMap(np.zeros(cost.shape), cost=cost)
+    network, rule = random_network("any_map", filters=4), MoveRule.ROBOT_SAFE
+    assert isinstance(network, PropagationQNetwork)
+    costs = network.believed_costs(grid, rule)
+    table_PA = costs.table.reshape(-1, 8)
+    assert len(table_PA) > 2 * networks.BATCH
+    number_C = costs.patch_number.reshape(102, 92)[1:-1, 1:-1].ravel()
+    feature_CI = network.features(patches(grid.occupancy, grid.cost), rule)
+    expected_CA = LENGTHS * network.tries(feature_CI) * network.multiplier(feature_CI)
+    assert np.isfinite(expected_CA).any()
+    np.testing.assert_allclose(table_PA[number_C], expected_CA, rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["propagation", "any_map"])

@@ -23,6 +23,7 @@ from ddqn_planner import GridMap, MoveRule, Plan, inflate
 from ddqn_planner.grid import Cell, legal_moves, path_length, shortest_distances
 from ddqn_planner.grid.grid_map import Exploration
 from ddqn_planner.model import AnyMapQNetwork, ModelMetadata
+from ddqn_planner.model.move_costs import MoveCosts
 from ddqn_planner.planning import (
     PlanMethod,
     Planner,
@@ -158,16 +159,18 @@ def test_a_request_off_the_free_cells_or_on_a_map_of_another_size_is_told_apart(
         planner.q_field(larger, (1, 1))
 
 
-def test_a_plan_tells_how_long_field_and_rollout_took(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def slow(*arguments: Any) -> Any:
-        time.sleep(0.05)
-        return move_costs(*arguments)
+class SlowNetwork(AnyMapQNetwork):
+    """A network that takes 50 ms for the costs of a map."""
 
-    move_costs = AnyMapQNetwork.move_costs
-    monkeypatch.setattr(AnyMapQNetwork, "move_costs", slow)
-    planner, grid = new_planner(), GridMap(np.zeros((5, 5)))
+    def move_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts | None:
+        time.sleep(0.05)
+        return super().move_costs(grid, move_rule)
+
+
+def test_a_plan_tells_how_long_field_and_rollout_took() -> None:
+    network, grid = ANY_MAP.network, GridMap(np.zeros((5, 5)))
+    slow_network = SlowNetwork(network.sizes, network.tensors)
+    planner = Planner(slow_network, ANY_MAP.metadata)
     ANY_MAP.plan(GridMap(np.zeros((2, 2))), (0, 0), (1, 1))
     plan, again = (
         planner.plan(grid, (0, 0), (4, 2), simplified=True) for _ in range(2)
@@ -177,7 +180,7 @@ def test_a_plan_tells_how_long_field_and_rollout_took(
     assert plan.rollout_ms > 0
     # The time between two steps does not count.
     steps, began = (
-        planner.steps(PlanRequest(grid, (0, 0), ((3, 3),), "corner_cutting")),
+        planner.steps(PlanRequest(grid, (0, 0), ((3, 3),), MoveRule.CORNER_CUTTING)),
         time.perf_counter(),
     )
     assert next(steps) is None
@@ -186,28 +189,27 @@ def test_a_plan_tells_how_long_field_and_rollout_took(
     assert found.field_ms + found.rollout_ms < waited - 200
 
 
-def test_a_field_grows_in_steps_and_others_are_answered(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    grid = GridMap(np.zeros((40, 40))).with_patch(np.ones((1, 39)), 0, 20)
-    whole = new_planner().plan(grid, (0, 0), (0, 39))
-    monkeypatch.setattr("ddqn_planner.planning.cell_planner.VISITS", 20)
+def test_a_field_grows_in_steps_and_others_are_answered() -> None:
+    side, end = 1000, 999
+    grid = GridMap(np.zeros((side, side))).with_patch(np.ones((1, end)), 0, 500)
+    whole = new_planner().plan(grid, (0, 0), (0, end))
     planner = new_planner()
-    steps = planner.steps(PlanRequest(grid, (0, 0), ((0, 39),), MoveRule.ROBOT_SAFE))
+    steps = planner.steps(PlanRequest(grid, (0, 0), ((0, end),), MoveRule.ROBOT_SAFE))
     waited = 0
     for plan in steps:
         waited += plan is None
         assert (
             planner.plan(grid, (waited % 40, 0), (5, 5)).status is PlanStatus.SUCCEEDED
         )
-    assert waited > 10
+    assert waited > 1
     assert plan == whole
-    given_up = planner.steps(PlanRequest(grid, (0, 0), ((1, 39),), MoveRule.ROBOT_SAFE))
+    request = PlanRequest(grid, (0, 0), ((1, end),), MoveRule.ROBOT_SAFE)
+    given_up = planner.steps(request)
     assert next(given_up) is next(given_up) is None
     given_up.close()  # type: ignore[attr-defined]
-    assert planner.plan(grid, (0, 0), (1, 39)).status is PlanStatus.SUCCEEDED
-    closed = GridMap(grid.with_patch([[True]], 39, 20).occupancy)
-    assert planner.plan(closed, (0, 0), (0, 39)).status is PlanStatus.NO_PATH
+    assert planner.plan(grid, (0, 0), (1, end)).status is PlanStatus.SUCCEEDED
+    closed = GridMap(grid.with_patch([[True]], end, 500).occupancy)
+    assert planner.plan(closed, (0, 0), (0, end)).status is PlanStatus.NO_PATH
 
 
 def test_a_field_is_computed_once_per_map_goal_and_rule() -> None:

@@ -11,11 +11,10 @@ from hypothesis import strategies as st
 from ddqn_planner import GridMap, MoveRule
 from ddqn_planner.grid import path_length
 from ddqn_planner.model import load_model
-from ddqn_planner.training import run as run_module
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.episodes import Episode, read_cells
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.run import TrainingRun
+from ddqn_planner.training.run import SAVE_INTERVAL, TrainingRun
 from ddqn_planner.training.trainer import CheckpointError
 
 PARAMETERS = HyperParameters(steps=400, filters=4, learning_starts=50)
@@ -138,24 +137,20 @@ def test_a_folder_is_of_one_run_at_a_time(small: Scenario, tmp_path: Path) -> No
     assert len(finish(open_run(tmp_path, small))) == len(rows(tmp_path)) > 0
 
 
-def test_a_failed_save_is_tried_again_later(
-    small: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(run_module, "SAVE_INTERVAL", 100)
-    run = open_run(tmp_path / "run", small, steps=10**6)
+def test_a_failed_save_is_tried_again_later(small: Scenario, tmp_path: Path) -> None:
+    run = open_run(tmp_path / "run", small, steps=10**6, environments=50)
     steps = run.steps()
     (tmp_path / "run").rename(tmp_path / "moved")
     (tmp_path / "run").touch()
-    while run.trainer.steps < 100:
+    while run.trainer.steps < SAVE_INTERVAL:
         next(steps)
     assert str(tmp_path / "run") in run.save_error
     assert "make room" in run.save_error
     (tmp_path / "run").unlink()
     (tmp_path / "moved").rename(tmp_path / "run")
-    while run.trainer.steps < 199:
-        next(steps)
+    while run.trainer.steps < 2 * SAVE_INTERVAL:
         assert not run.checkpoint_path.exists()
-    next(steps)
+        next(steps)
     assert run.checkpoint_path.exists()
     assert run.save_error == ""
     run.close()
