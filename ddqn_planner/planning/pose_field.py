@@ -142,7 +142,7 @@ class PoseField(Field[Search]):
                     if self._proved_bound() == math.inf and not self._can_leave():
                         return math.inf
                     aim = self.known.aim
-                    self._begin_round(self._with_look_at_map(aim, aim.shift - 1))
+                    self._begin_round(self.with_look_at_map(aim, aim.shift - 1))
                 else:
                     most_visits = min(visits_left, UNGUIDED)
                     visits_left -= self._visit(finite_bound, most_visits)
@@ -234,7 +234,7 @@ class PoseField(Field[Search]):
         count = pose_space.count_reachable(search.aim.number, mark, queue, self.world)
         return bool(count == queue.size)
 
-    def _with_look_at_map(self, aim: Aim, shift: int) -> Aim:
+    def with_look_at_map(self, aim: Aim, shift: int) -> Aim:
         """Return an aim with a lower bound of the cost to it from each corner of tiles.
 
         A tile has a side of 2**shift cells. R rows of C tiles have (R + 1) x (C + 1)

@@ -30,6 +30,7 @@ from ddqn_planner.planning.pose_world import (
     State,
     body_of,
     has_room,
+    move_free_to_front,
     rows_of,
     world_of,
 )
@@ -76,9 +77,18 @@ def plan(
     return last_step(planner.steps(PoseRequest(grid, start, goals, **how)))
 
 
-def state_at(planner: PosePlanner, grid: GridMap, pose: Pose) -> Any:
-    """The state of a pose, or None where the body has no room."""
-    return planner._state_at(grid, pose, planner._world(grid))
+def state_at(planner: PosePlanner, grid: GridMap, state: State) -> State | None:
+    """The state in which a path from a state begins, or None where the body has no
+    room: without room in the heading it has the next one.
+    """
+    x, y, heading = state
+    angles = planner.motions.angles
+    turn = np.abs(turn_between(angles, angles[heading]))
+    for nearest in np.argsort(turn, kind="stable")[:2].tolist():
+        states = np.array([(x, y, nearest)])
+        if move_free_to_front(states, world_of(grid, planner.body)):
+            return x, y, nearest
+    return None
 
 
 def last_field(planner: PosePlanner) -> pose_field.PoseField:
@@ -167,29 +177,26 @@ def test_plans_cost_the_least_within_their_bound_also_after_repairs(
             grid = grid.with_patch(patch_of, x, y)
 
 
-@pytest.mark.parametrize("goals", [1, 6])
-@pytest.mark.parametrize("seed", range(3))
-def test_what_the_map_tells_changes_no_least_path(
-    seed: int, goals: int, monkeypatch: Any
-) -> None:
+@pytest.mark.parametrize("seed", [0, 5])
+def test_what_the_map_tells_changes_no_least_path(seed: int) -> None:
     random = np.random.default_rng(seed)
     occupancy = np.zeros((120, 120), np.bool_)
     for x, y in random.integers(0, 110, (40, 2)):
         occupancy[y : y + 8, x : x + 8] = True
     grid = GridMap(occupancy, CELL)
     cells = random.permutation(np.argwhere(~occupancy))[:12].tolist()
-    poses = [pose_of(grid, (x, y, heading)) for heading, (y, x) in enumerate(cells)]
-    costs: dict[int, list[float]] = {}
-    for looks in (2**8, 2**30):
-        monkeypatch.setattr(pose_field, "UNGUIDED", looks)
-        body = planner("differential")
-        for number, start in enumerate(
-            poses[:6]
-        ):  # toward one goal: all from one field
-            found = plan(body, grid, start, poses[6 + number % goals], bound=1.0)
-            costs.setdefault(looks, []).append(found.cost or 0.0)
-    few, many = costs.values()
-    assert few == pytest.approx(many, rel=1e-5)
+    states = [(x, y, heading) for heading, (y, x) in enumerate(cells)]
+    body, visits = planner("differential"), []
+    starts = [state for state in states if state_at(body, grid, state) == state]
+    for goal in (starts.pop(), starts.pop()):
+        best = least_costs(grid, *robot("differential"), goal)
+        for x, y, heading in starts:
+            start, end = pose_of(grid, (x, y, heading)), pose_of(grid, goal)
+            found = plan(body, grid, start, end, bound=1.0)
+            least = best[y, x, heading]
+            assert (found.cost or math.inf) == pytest.approx(least, rel=1e-5)
+            visits.append(last_field(body).visits)
+    assert min(visits) < pose_field.UNGUIDED < max(visits)  # some looked at the map
 
 
 @pytest.mark.parametrize("motion", sorted(BODIES))
@@ -246,7 +253,7 @@ def test_what_the_map_tells_is_left_at_least(motion: str, seed: int) -> None:
     aim = pose_field.NOWHERE._replace(x=x, y=y)
     best = least_costs(grid, *robot(motion), (x, y, heading))
     for shift in (2, 1):  # tiles of 4 cells, and of 2
-        aim = field._with_look_at_map(aim, shift)
+        aim = field.with_look_at_map(aim, shift)
         for row, column, _ in np.argwhere(np.isfinite(best)):
             left = remaining_cost(column, row, aim)
             assert left <= best[row, column].min() + 1e-3
@@ -279,22 +286,17 @@ def test_requests_that_share_a_field_prove_their_own_bounds(seed: int) -> None:
         assert sum(threads.map(is_asked, starts, [1.0, 2.0] * 30)) > 40
 
 
-def test_a_second_look_sees_a_wall_that_is_thinner_than_a_tile(
-    monkeypatch: Any,
-) -> None:
+def test_a_second_look_sees_a_wall_that_is_thinner_than_a_tile() -> None:
     grid = GridMap(np.zeros((120, 120)), CELL).with_patch(np.ones((1, 120)), 0, 51)
     start, goal = (pose_of(grid, state) for state in ((60, 20, 0), (60, 100, 0)))
-    monkeypatch.setattr(pose_field, "UNGUIDED", 2**8)
     body = planner("differential")
     assert plan(body, grid, start, goal).status is PlanStatus.NO_PATH
-    assert last_field(body).visits == 2**11
+    assert last_field(body).visits == 8 * pose_field.UNGUIDED
 
 
-@pytest.mark.parametrize("unguided", [2**4, 2**30])
 def test_what_was_far_from_obstacles_is_looked_at_again_when_one_comes(
-    unguided: int, monkeypatch: Any
+    monkeypatch: Any,
 ) -> None:
-    monkeypatch.setattr(pose_field, "UNGUIDED", unguided)
     monkeypatch.setattr(pose_field, "KEPT_SHARE", 0)
     occupancy = np.zeros((160, 260), np.bool_)
     occupancy[[50, 90], 60:160] = True  # a lane, which a block closes on its left
@@ -393,21 +395,19 @@ def test_a_concave_body_or_one_beside_its_origin_takes_the_cheapest_free_path(
     )
     body = planner(motion, FORMS[form])
     states = random.integers((width, height, 16), size=(60, 3)).tolist()
-    free = [state for state in states if state_at(body, grid, pose_of(grid, state))]
+    free = [state for state in states if state_at(body, grid, state)]
     shape = shapely.Polygon(read_footprint(FORMS[form])).buffer(
         -1e-6, join_style="mitre"
     )
     y, x = np.nonzero(np.pad(occupancy, 1, constant_values=True))
     cells = shapely.STRtree(shapely.box(*np.array([x - 1, y - 1, x, y]) * CELL))
     goal = free[0]
-    best = least_costs(
-        grid,
-        motions,
-        swept,
-        state_at(body, grid, pose_of(grid, goal)),
-    )
+    end = state_at(body, grid, goal)
+    assert end is not None
+    best = least_costs(grid, motions, swept, end)
     for start in free[1:4]:
-        own = state_at(body, grid, pose_of(grid, start))
+        own = state_at(body, grid, start)
+        assert own is not None
         found = plan(
             planner(motion, FORMS[form]),
             grid,
@@ -542,15 +542,16 @@ def test_an_occupied_goal_moves_to_where_the_way_costs_the_least(
     for row, column, turned in np.column_stack(
         [random.integers(n, size=5) for n in best.shape]
     ):
-        start = pose_of(grid, (int(column), int(row), int(turned)))
+        state = int(column), int(row), int(turned)
+        start = pose_of(grid, state)
         found = plan(body, grid, start, goal, tolerance=(metres, radians), bound=1.0)
         least = best[row, column, turned]
         if found.poses.size and abs(turn_between(found.poses[0, 2], start[2])) < 1e-6:
             assert found.cost == pytest.approx(least, rel=1e-5)
         elif not found.poses.size and found.status is not PlanStatus.START_OCCUPIED:
             # Without room in its own heading, it starts in the next one.
-            _, _, own = state_at(body, grid, start)
-            assert least == math.inf or own != turned
+            own = state_at(body, grid, state)
+            assert least == math.inf or own != state
 
 
 def test_a_body_that_cannot_leave_its_place_has_no_path() -> None:
