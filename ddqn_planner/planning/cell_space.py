@@ -47,7 +47,7 @@ SAME: Final = 1 + 1e-12  # paths cost the same up to this factor: sums are round
 # Cells that cost as much as the start, up to this factor, are closed too: so a rollout
 # does not depend on the requests before.
 TIES: Final = 1 + 1e-6
-TOO_MANY: Final = -1  # what `_lose_unsupported` returns where a limit is exceeded
+TOO_MANY: Final = -1  # what `lose_unsupported` returns where a limit is exceeded
 
 MOVE_X, MOVE_Y = MOVES.T.copy()
 
@@ -408,14 +408,12 @@ def take_back(
     waiting = np.empty(changed.size + 8 * limit, np.int32)
     waiting[: changed.size] = changed
     distance, mark = known.distance, known.mark
-    lost_count = _lose_unsupported(
-        distance, waiting, changed.size, lost, costs_of_steps
-    )
+    lost_count = lose_unsupported(distance, waiting, changed.size, lost, costs_of_steps)
     if lost_count == TOO_MANY:
         return None
     to_reopen = np.concatenate([lost[:lost_count], changed])
     opened = np.empty(to_reopen.size, np.int32)
-    opened_count = _reopen(distance, mark, to_reopen, opened, costs_of_steps)
+    opened_count = reopen(distance, mark, to_reopen, opened, costs_of_steps)
     return Known(
         distance,
         mark,
@@ -425,7 +423,7 @@ def take_back(
 
 
 @in_place
-def _lose_unsupported(
+def lose_unsupported(
     distance: Any, waiting: Any, waiting_end: int, lost: Any, costs: Any
 ) -> int:
     """Make the distance of each cell negative that no neighbour supports any more.
@@ -479,7 +477,7 @@ def _lose_unsupported(
 
 
 @in_place
-def _reopen(distance: Any, mark: Any, cells: Any, opened: Any, costs: Any) -> int:
+def reopen(distance: Any, mark: Any, cells: Any, opened: Any, costs: Any) -> int:
     """Open each of some cells (N,) whose neighbours lead to a goal at a lower cost.
 
     A cell of which a repair took back the distance, which is then negative, has no cost
