@@ -1,14 +1,11 @@
 """Digests of functions, which differ if their compiled code may differ."""
 
 import hashlib
-import pickle
 from collections.abc import Iterator, Mapping
-from enum import Enum
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 MISSING = object()  # in place of the value of an attribute that does not exist
 
@@ -38,7 +35,8 @@ def global_names(code: CodeType) -> set[str]:
 class _Describer:
     """Describes values by tuples, lists and texts, whose `repr` tells values apart.
 
-    The description of a value is the same in each process.
+    The description of a value is the same in each process. Constants of types that
+    numba cannot compile, such as sets, need no description of their own.
     """
 
     def __init__(self) -> None:
@@ -52,14 +50,12 @@ class _Describer:
         """
         kind = _name_of(type(value))
         match value:
-            case Enum():
-                return kind, value.name, self.describe(value.value)
-            case None | bool() | int() | float() | complex() | str() | bytes():
-                return kind, repr(value)
             case np.ndarray() | np.generic():
-                return kind, self._array(value)
-            case tuple() | list() | set() | frozenset() | dict():
-                return kind, self._container(value)
+                content = hashlib.sha256(value.tobytes()).hexdigest()
+                return kind, repr(value.dtype), value.shape, content
+            case tuple() | list():
+                items = [self.describe(item) for item in value]
+                return kind, getattr(value, "_fields", ()), items
             case CodeType():
                 return kind, self._code(value)
             case FunctionType():
@@ -68,37 +64,11 @@ class _Describer:
                 fields = getattr(value, "_fields", ())  # of a NamedTuple
                 attributes = list(self._attributes(value, names))
                 return kind, _name_of(value), fields, attributes
-        return kind, self._object(value)
-
-    def _array(self, array: NDArray[Any] | np.generic) -> object:
-        """Describe an array, or a NumPy number."""
-        if array.dtype.hasobject:
-            return array.shape, self.describe(array.tolist())
-        content = hashlib.sha256(array.tobytes()).hexdigest()
-        return repr(array.dtype), array.shape, content
-
-    def _container(self, container: Any) -> object:
-        """Describe a tuple, list, set or dictionary by its items."""
-        if isinstance(container, dict):
-            return [
-                (self.describe(key), self.describe(item))
-                for key, item in container.items()
-            ]
-        items = [self.describe(item) for item in container]
-        if isinstance(container, (set, frozenset)):
-            return sorted(map(repr, items))  # a set has another order in each process
-        return getattr(container, "_fields", ()), items
-
-    def _object(self, value: Any) -> object:
-        """Describe a value of any other type, if that is possible."""
         if hasattr(value, "py_func"):  # compiled
-            return self.describe(value.py_func)
+            return kind, self.describe(value.py_func)
         if hasattr(value, "__name__"):  # built in, or of NumPy
-            return _name_of(value)
-        try:
-            return pickle.dumps(value)
-        except Exception:  # then numba can hardly make a constant of it
-            return None
+            return kind, _name_of(value)
+        return kind, repr(value)
 
     def _attributes(self, owner: Any, names: frozenset[str]) -> Iterator[object]:
         """Yield name and description of the attributes that a module or class has."""
@@ -129,9 +99,10 @@ class _Describer:
             (name, self.describe(scope[name], names))
             for name in sorted(names & scope.keys())
         ]
+        defaults_by_name = function.__kwdefaults__ or {}
         defaults = (
             self.describe(function.__defaults__),
-            self.describe(function.__kwdefaults__),
+            self.describe(tuple(defaults_by_name.items())),
         )
         closure = function.__closure__ or ()
         enclosed = [self.describe(cell.cell_contents) for cell in closure]
