@@ -28,6 +28,8 @@ from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.conversions import (
     MapRules,
     along,
+    bytes_message,
+    bytes_of,
     cell_from_pose,
     centres,
     check_pose,
@@ -36,6 +38,7 @@ from ddqn_planner.nodes.conversions import (
     path_bytes,
     path_message,
     pose_of,
+    poses_of,
     quaternion,
     rotation,
     with_unit_quaternion,
@@ -75,6 +78,29 @@ def test_a_map_survives_the_way_to_a_message_and_back(yaw: float, sign: int) -> 
     )
     grid = grid_from_message(message, MapRules(64, allow_unknown=True))
     assert grid.occupancy.tolist() == [[False, True, False], [True, True, False]]
+
+
+def test_the_message_of_a_map_says_when_it_was_made() -> None:
+    header = Header(frame_id="map", stamp=Stamp(sec=5, nanosec=77))
+    message = occupancy_message(np.zeros((2, 3)), 0.5, (0.0, 0.0, 0.0), header)
+    assert message.header.stamp == message.info.map_load_time == header.stamp
+
+
+def test_the_pose_of_a_path_that_is_not_finite_is_named() -> None:
+    points = np.zeros((5, 2))
+    points[3] = 1.0, math.nan
+    with pytest.raises(ValueError, match=r"pose 3 of the path is \[ ?1"):
+        poses_of(path_message(points, np.zeros(5), HEADER))
+
+
+def test_the_remedy_tells_damaged_bytes_from_those_of_another_version() -> None:
+    message = bytes_message("model", b"weights")
+    assert bytes_of("model", message) == b"weights"
+    with pytest.raises(ValueError, match="let trainer and planner have one version"):
+        bytes_of("experience", message)
+    message.data[0] += 1
+    with pytest.raises(ValueError, match="save there again"):
+        bytes_of("model", message)
 
 
 def test_a_malformed_map_is_refused() -> None:

@@ -225,6 +225,19 @@ def test_an_update_has_the_maps_frame_and_its_stamp_or_a_later_one_or_none() -> 
             )
 
 
+def test_an_update_of_the_same_second_may_be_no_earlier_than_the_map() -> None:
+    message = map_of(5)
+    message.header.stamp.nanosec = 500
+    for nanoseconds, is_earlier in ((499, True), (500, False), (501, False)):
+        stamp = Time(sec=5, nanosec=nanoseconds)
+        sent = update(header=Header(frame_id="map", stamp=stamp))
+        if is_earlier:
+            with pytest.raises(ValueError, match=r"5\.000000500, is later than"):
+                values_of_update(message, sent)
+        else:
+            assert values_of_update(message, sent).shape == (3, 2)
+
+
 RULES: list[dict[str, Any]] = [
     *({}, {"use_map_costs": True, "allow_unknown": True}, {"map_type": "costmap"}),
     {"map_type": "costmap", "allow_unknown": True},
@@ -365,6 +378,50 @@ def test_a_map_waits_a_second_for_a_publisher_that_sends_nothing(
     assert source.used() == (3, None)
     assert not source.is_settling
     assert source.on_map(4) == (4, None)  # it does not wait again
+
+
+def test_each_new_publisher_is_awaited_for_a_second_whoever_was_awaited_before(
+    node: BaseNode, source: Source, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [100.0]
+    clock = SimpleNamespace(monotonic=lambda: now[0])
+    monkeypatch.setattr("ddqn_planner.nodes.directions.time", clock)
+    for stamp in (1, 2):
+        publisher = node.create_publisher(OccupancyGrid, "map_directions", LATCHED)
+        wait_for("publisher", lambda: node.count_publishers("map_directions") > 0)
+        before = source.used()
+        assert source.on_map(stamp) == before
+        assert source.is_settling
+        node.destroy_publisher(publisher)  # it has sent nothing
+        wait_for(
+            "end of the publisher", lambda: node.count_publishers("map_directions") == 0
+        )
+        assert source.used() == (stamp, None)
+        assert not source.is_settling
+        now[0] += 10.0
+
+
+@pytest.mark.usefixtures("published")
+def test_a_map_that_waits_is_read_by_the_parameters_of_now(
+    source: Source, set_parameters: SetParameters
+) -> None:
+    message = map_of(1)
+    message.data[0] = 50
+    source.take(message)
+    set_parameters(occupied_threshold=40)
+    assert source.used() == NOTHING
+    source.directions.take(directions_of(1, None))
+    assert source.grid().occupancy.sum() == 1
+
+
+def test_a_value_that_ros_accepts_above_a_range_is_the_greatest_of_the_range(
+    source: Source, set_parameters: SetParameters
+) -> None:
+    source.take(map_of(1))
+    set_parameters(robot_radius=0.8, clearance_weight=1.0)
+    expected = source.grid()
+    set_parameters(clearance_weight=1.0 + 1e-7)
+    assert source.grid().fingerprint == expected.fingerprint
 
 
 def test_the_map_of_another_map_server_waits_for_its_directions(
@@ -639,6 +696,9 @@ def test_a_file_is_planned_with_or_refused_or_none_is_set(
     finished(source.times.on_message())
     assert source.slowness() is None
     assert "experience" not in source.diagnostics.refused
+    # The trainer's message counts, also if it comes again after no file was set.
+    finished(source.times.on_message(driven))
+    finished(source.times.on_message())
     finished(source.times.on_message(driven))
     assert source.slowness()[20, 60] > 2
 

@@ -179,7 +179,9 @@ def test_what_people_send_is_judged_by_where_it_lies_and_else_refused(
         path = path_at(ROW)
         path.poses[0].pose.position.y = bad
         assert not asked.check(path).success
-    for path in (Path(), path_at(ROW, "no_such_frame")):
+    elsewhere = path_at(ROW, "")
+    elsewhere.poses[0].header.frame_id = "no_such_frame"  # the path itself has none
+    for path in (Path(), path_at(ROW, "no_such_frame"), elsewhere):
         answer = asked.check(path)
         assert (answer.success, answer.is_valid) == (False, False)
 
