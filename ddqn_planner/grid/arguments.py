@@ -90,12 +90,15 @@ def cells_inside(cells: Any, shape: tuple[int, ...]) -> NDArray[np.int64]:
 
     A ValueError names a cell outside.
     """
-    is_array = (
+    height, width = shape
+    is_right = False
+    if (
         isinstance(cells, np.ndarray)
         and cells.dtype.kind == "i"
         and cells.shape[1:] == (2,)
-    )
-    if not is_array or not ((cells >= 0) & (cells < shape[::-1])).all():
+    ):
+        is_right = bool(((cells >= 0) & (cells < (width, height))).all())
+    if not is_right:  # cell by cell, so that an error names the first wrong one
         cells = [cell_inside(cell, shape) for cell in listed(cells, "the cells")]
     return np.array(cells, dtype=np.int64).reshape(-1, 2)
 

@@ -72,6 +72,7 @@ def hull(boxes: Sequence[Box]) -> Box:
 
 
 def _hull_of_slices(slices: Sequence[slice]) -> slice:
+    """Return the slice from the first start to the last stop."""
     start = min(part.start for part in slices)
     stop = max(part.stop for part in slices)
     return slice(start, stop)
@@ -97,13 +98,14 @@ def wider(box: Box, margin: int, shape: tuple[int, ...]) -> Box:
 
 
 def _wider_slice(part: slice, margin: int, size: int) -> slice:
+    """Return a slice with `margin` more elements at both ends, cut at 0 and `size`."""
     return slice(max(part.start - margin, 0), min(part.stop + margin, size))
 
 
 def relative_to(outer: Box, box: Box, border: int = 0) -> Box:
     """Return where a box lies in an array that holds only the cells of an outer box.
 
-    The array may have a border of so many more cells on each side.
+    The array has `border` more rows and columns on each side.
     """
     first_row = outer.rows.start - border
     first_column = outer.columns.start - border

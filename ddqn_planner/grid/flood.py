@@ -30,10 +30,10 @@ def flood(
     reached : (H, W) bool
         True in the first cells only; it becomes True in all cells that are marked.
     stack : (H * W,) int64
-        The first cells, as numbers y * W + x. Here it holds the cells that are reached,
-        but whose neighbours have not been looked at.
+        Cells by their numbers y * W + x: at first the first cells, then the reached
+        cells whose neighbours have not been looked at.
     count : int
-        The number of first cells.
+        The number of cells on the stack; at first, of first cells.
     """
     height, width = reached.shape
     while count > 0:

@@ -135,7 +135,10 @@ class GridMap:
         self._set(body_radius=as_number("body_radius", self.body_radius, *limits))
 
     def _set(self, **values: object) -> None:
-        """Give the map its values; its arrays are read-only from now on."""
+        """Set attributes of this frozen map by name, and make their arrays read-only.
+
+        The arrays are not copied.
+        """
         for name, value in values.items():
             if isinstance(value, np.ndarray):
                 value.flags.writeable = False
@@ -242,6 +245,7 @@ class GridMap:
             obstacles=patched_obstacles,
             unknown=self._patched_unknown(patch, box, unknown),
         )
+        # With a history, the two maps are compared in the boxes of their patches alone.
         # Where most of the map is new, it is quicker to compare all of it.
         is_small = 2 * patch.size <= self.occupancy.size
         has_same_layers = (patched.cost is None) == (self.cost is None)
@@ -256,9 +260,9 @@ class GridMap:
         """
         x, y = arguments.as_cell((x, y), "the first cell of the patch")
         height, width = shape
-        has_columns = 0 <= x <= self.width - width
-        has_rows = 0 <= y <= self.height - height
-        if not (has_columns and has_rows):
+        last_x = self.width - width  # the last column where the patch may begin
+        last_y = self.height - height
+        if not (0 <= x <= last_x and 0 <= y <= last_y):
             size = f"{self.width} x {self.height}"
             part = f"{width} x {height} cells from {x, y}"
             raise ValueError(
@@ -316,8 +320,8 @@ class GridMap:
     def patches_since(self, older: GridMap) -> list[Box] | None:
         """Return the boxes that `with_patch` replaced since an older map.
 
-        None if this map was not made of the older one by patches, if it has other
-        directions or times, or after more than `MAX_PATCHES` patches.
+        None if this map was not made of the older one by patches, if the two have other
+        arrays `forbidden` or `slowness`, or after more than `MAX_PATCHES` patches.
         """
         if self.forbidden is not older.forbidden or self.slowness is not older.slowness:
             return None
@@ -382,8 +386,8 @@ class GridMap:
 
     @cached_property
     def exploration(self) -> Exploration | None:
-        """The optimistic maps, see `Experience.apply`; None if layers are replaced."""
-        return None
+        """The optimistic maps, added by `Experience.apply` through `with_layers`."""
+        return None  # unless `with_layers` has set the attribute
 
     def labels(self, move_rule: MoveRule | str) -> NDArray[np.int32]:
         """Return the number of each free cell's component, from 1 on: (H, W) int32.
@@ -446,6 +450,7 @@ class GridMap:
 
     @cached_property
     def _history(self) -> History:
+        """The patches that made this map of older maps; none where it was made anew."""
         return History(lineage=object(), versions=(Version(object(), ORIGIN),))
 
     @cached_property
@@ -464,11 +469,13 @@ class GridMap:
 
     @cached_property
     def _sums(self) -> tuple[int, int, float]:
-        """Sums of occupancy, cost and slowness, which differ in most maps that differ.
+        """Sums of occupancy, cost and slowness: maps with other sums have other cells.
 
-        They compare more quickly than the layers.
+        Sums compare more quickly than layers. A layer that the map has not counts as 0.
         """
-        slowness = 0.0 if self.slowness is None else float(self.slowness[::16].sum())
+        slowness = 0.0
+        if self.slowness is not None:
+            slowness = float(self.slowness[::16].sum())  # each 16th row is enough
         cost = 0 if self.cost is None else _sum_of_words(self.cost)
         return _sum_of_words(self.occupancy), cost, slowness
 
@@ -696,10 +703,13 @@ def _slowness(slowness: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32
 
 
 def _costs(cost: ArrayLike, occupancy: Occupancy) -> NDArray[np.int8]:
-    """Return a checked copy of costs (H, W), with 0 in occupied cells."""
-    costs = arguments.numbers("cost", cost, occupancy.shape)
+    """Return a checked copy of costs (H, W): -1 to 99, and 0 in occupied cells.
+
+    The costs given for occupied cells may be any numbers.
+    """
+    costs = arguments.numbers("cost", cost, occupancy.shape)  # of any range
     is_whole = costs.dtype.kind != "f"
-    # A product takes a tenth of the time, but fractions may be infinite.
+    # A product takes a tenth of the time, but infinity times 0 is NaN.
     costs_of_free = costs * ~occupancy if is_whole else np.where(occupancy, 0, costs)
     arguments.numbers("cost", costs_of_free, between=(UNKNOWN, OCCUPIED - 1))
     return costs_of_free.astype(np.int8, order="C", copy=False)

@@ -171,7 +171,8 @@ class Inflation:
         That is possible if `grid` is the last map with patches, for the same body.
         """
         last = self._last
-        if last is None or body != last.body or not any(body):
+        has_size = any(body)  # without radius and weight, no map is inflated
+        if last is None or body != last.body or not has_size:
             return None
         boxes = grid.patches_since(last.grid)
         if boxes is None:
@@ -219,7 +220,8 @@ def _inflated_with_patches(
 def _reach_in_cells(body: Body, resolution: float) -> int:
     """Return a distance in cells beyond which an obstacle adds no cost.
 
-    There the costs of `_clearance_costs`, 99 * weight / root^3, are rounded to 0.
+    There the costs of `_clearance_costs`, 99 * weight / root^3, are below 1/2, and are
+    rounded to 0.
     """
     root = np.cbrt(2 * (OCCUPIED - 1) * body.clearance_weight)
     metres = body.robot_radius + max(root - 1, 0) * CLEARANCE_SCALE

@@ -78,13 +78,13 @@ def legal_moves(
     """
     rule = MoveRule(move_rule)
     is_free = ~occupancy
-    free = np.pad(is_free, 1)  # no cell outside the map is free
+    padded = np.pad(is_free, 1)  # (H + 2, W + 2): no cell outside the map is free
     legal = np.empty((len(MOVES), *occupancy.shape), dtype=np.bool_)
     for action, (dx, dy) in enumerate(MOVES.tolist()):
-        legal[action] = is_free & shifted(free, dx, dy)
+        legal[action] = is_free & shifted(padded, dx, dy)
         is_diagonal = dx != 0 and dy != 0
         if is_diagonal and not rule.cuts_corners:
-            legal[action] &= shifted(free, dx, 0) & shifted(free, 0, dy)
+            legal[action] &= shifted(padded, dx, 0) & shifted(padded, 0, dy)
         if forbidden is not None:
             legal[action] &= (forbidden & 2**action) == 0
     return legal
@@ -156,10 +156,13 @@ def multiplier_at(x: int, y: int, one: Any, layers: Layers) -> Any:
 
 @inlined
 def cost_of_move(x: int, y: int, action: int, layers: Layers) -> Any:
-    """Return what a move costs, legal or not."""
+    """Return what a move from (x, y) to a neighbour on the map costs, legal or not.
+
+    It is the length, in cells, times the mean of the two cells' cost multipliers.
+    """
     dx = MOVES[action, 0]
     dy = MOVES[action, 1]
-    one = np.float64(1)
+    one = np.float64(1)  # so `multiplier_at` computes in float64
     multiplier = multiplier_at(x, y, one, layers)
     multiplier_of_target = multiplier_at(x + dx, y + dy, one, layers)
     return LENGTHS[action] * (multiplier + multiplier_of_target) / 2
@@ -167,7 +170,7 @@ def cost_of_move(x: int, y: int, action: int, layers: Layers) -> Any:
 
 @inlined
 def actions_of_segment(step_x: int, step_y: int, width: float, height: float) -> Any:
-    """Return the actions between whose directions a segment lies, as a bit set.
+    """Return the actions between whose directions a segment lies, a bit for each.
 
     These are the diagonal action and the straight action along the longer side. A
     segment of equal sides, or along an axis, has one action.

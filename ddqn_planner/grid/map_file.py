@@ -104,7 +104,8 @@ class MapFile:
             self._set("goal", cell_inside(self.goal, values.shape, "goal"))
 
     def _set(self, name: str, value: object) -> None:
-        object.__setattr__(self, name, value)  # the dataclass is frozen
+        """Set an attribute of this frozen object."""
+        object.__setattr__(self, name, value)
 
     def grid(
         self,
@@ -212,7 +213,10 @@ def _read_bytes(path: Path, limit: int, error_class: type[MapFileError]) -> byte
 
 
 def _read_moving_ai(path: Path) -> MapFile:
-    """Read a map of the MovingAI benchmark: four lines of header, then the rows."""
+    """Read a map of the MovingAI benchmark: four lines of header, then the rows.
+
+    A row has a character for each cell; the first row has y = 0.
+    """
     # A row of one cell takes up to three bytes: the cell, \r and \n.
     content = _read_bytes(path, 3 * MAX_CELLS, MapDataError)
     pattern = rb"type octile\s+height (\d{1,8})\s+width (\d{1,8})\s+map[ \t]*\r?\n"
@@ -240,7 +244,7 @@ def _read_moving_ai(path: Path) -> MapFile:
             f"{path}: has {rows} rows, {characters.size - rows} cells; {remedy}"
         )
     cells = characters.reshape(height, width + 1)[:, :-1]  # without line breaks
-    is_free = np.isin(cells, list(b".GS"))
+    is_free = np.isin(cells, list(b".GS"))  # ground, twice, and swamp
     return MapFile(np.where(is_free, np.int8(0), np.int8(OCCUPIED)), files=(path,))
 
 
@@ -253,8 +257,10 @@ def _read_ros(path: Path, only_below: bool) -> MapFile:
         )
     image = _image_path(path, document, "image", only_below)
     pixels = _read_image(image, ("PPM", "PNG", "BMP", "JPEG"), LAYOUTS)
-    mode = _choice({"mode": "trinary", **document}, "mode", ("trinary", "scale", "raw"))
-    values = _percent_of_grey(document, mode)[pixels.grey]
+    with_default = {"mode": "trinary", **document}
+    mode = _choice(with_default, "mode", ("trinary", "scale", "raw"))
+    percent_of_grey = _percent_of_grey(document, mode)  # (256,)
+    values = percent_of_grey[pixels.grey]  # (H, W): the first row is the top one
     if mode != "raw":
         values[pixels.is_clear] = UNKNOWN
     resolution = _numbers(document, "resolution")
@@ -270,7 +276,7 @@ def _read_ros(path: Path, only_below: bool) -> MapFile:
         files.append(directions)
         forbidden = _read_directions(directions, scenario["directions"], values.shape)
     return MapFile(
-        values[::-1],
+        values[::-1],  # y = 0 is the bottom row
         resolution,
         origin,
         start=_numbers(scenario, "start") if "start" in scenario else None,
@@ -283,7 +289,11 @@ def _read_ros(path: Path, only_below: bool) -> MapFile:
 def _read_directions(
     file: Path, name: str, shape: tuple[int, ...]
 ) -> NDArray[np.uint8]:
-    """Return the directions, (H, W), of an image that a YAML file calls `name`."""
+    """Return the one-way zones of an image file: (H, W) uint8, y = 0 first.
+
+    `name` is the file's name in the YAML file, for errors; `shape` is the map's shape
+    (H, W), which the image must have.
+    """
     forbidden = _read_image(file, ("PPM", "PNG"), {"L"}).grey
     if forbidden.shape != shape:
         height, width = forbidden.shape
@@ -398,11 +408,11 @@ def _check_layout(image: Any, layouts: set[str]) -> None:
     """Raise a ValueError for an image that is too large, or of another layout."""
     if image.width * image.height > MAX_CELLS:
         raise ValueError(f"{image.width} x {image.height} pixels")
-    # How Pillow will decode the image: the decoder's name, and its arguments, which are
-    # the layout alone or begin with the layout.
+    # How Pillow will decode the image: first the decoder's name, last its arguments,
+    # which are the layout alone or begin with the layout.
     codec, *_, arguments = image.tile[0]
     layout, *options = [arguments] if isinstance(arguments, str) else arguments
-    # For a PPM the greatest value follows, unless that is the greatest of its bytes.
+    # The only option of a PPM is its greatest value; none where that is 255 or 65535.
     greatest = 65535 if image.mode == "I" else 255
     if codec.startswith("ppm") and options not in ([], [greatest]):
         # Versions of map_server disagree on the meaning of other greatest values.
@@ -444,8 +454,9 @@ def _grey(image: Any) -> NDArray[np.integer[Any]]:
     red = channels[0]
     green = channels[1]
     blue = channels[2]
+    # The luma of 16 bits; times 1000, so that the weights are whole numbers.
     luma_times_1000 = 257 * (299 * red + 587 * green + 114 * blue)
-    rounded_luma = (luma_times_1000 + 500) // 1000  # 16 bits
+    rounded_luma = (luma_times_1000 + 500) // 1000
     grey: NDArray[np.int32] = rounded_luma // 257
     return grey
 

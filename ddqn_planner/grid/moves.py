@@ -118,10 +118,11 @@ def cells_along(
         Their positions, see `positions`.
     """
     extents = np.diff(path, axis=0)  # (N - 1, 2)
-    steps = np.abs(extents).max(axis=1)  # that a segment takes from cell to cell
-    position = positions(steps)
+    steps = np.abs(extents).max(axis=1)  # (N - 1,): from cell to cell of each segment
+    position = positions(steps)  # (M,)
     share, whole = np.modf(position)
-    segment = whole.astype(np.int64)  # the last position is that of cell N - 1
+    segment = whole.astype(np.int64)
+    # The last position is N - 1, the path's last cell: the start of an empty segment.
     extents = np.append(extents, [[0, 0]], axis=0)
     offset = np.floor(share[:, None] * extents[segment] + 0.5)  # 0.5 is rounded up
     cells = path[segment] + offset

@@ -34,8 +34,8 @@ def scatter_obstacles(
 ) -> tuple[GridMap, int]:
     """Return the map with 1 to 5 more obstacles, and the number of rejected draws.
 
-    The obstacles lie within `reach` cells of the path. They are drawn again until they
-    leave a path from its start to its goal.
+    The obstacles lie within `reach` cells of `path`, the cells (x, y) from a start to a
+    goal. A draw that leaves no path from the start to the goal is rejected.
     """
     check_grid(grid)
     cells = [as_cell(cell) for cell in listed(path, "the path", "give cells (x, y)")]
@@ -62,7 +62,7 @@ def scatter_obstacles(
 def _free_cells_beside(path: Sequence[Cell], reach: int, grid: GridMap) -> list[Cell]:
     """Return the free cells within `reach` cells of a path except its ends, sorted."""
     offsets = range(-reach, reach + 1)
-    near_path: set[Cell] = set()
+    near_path: set[Cell] = set()  # cells of the squares around all cells of the path
     for x, y in path:
         for dx in offsets:
             near_path.update((x + dx, y + dy) for dy in offsets)

@@ -88,7 +88,8 @@ def _along_axis(
         index, is_inside = _cells_of_centres(count, side, corner, len(zones_by_cell))
         forbidden_by_cell[is_inside] = zones_by_cell[index[is_inside]]
         return forbidden
-    # Each new cell takes all zones' cells whose centres lie in it.
+    # Each new cell takes all zones' cells whose centres lie in it. In units of new
+    # cells, a zone's cell is 1 / side long, and the zones begin at -corner / side.
     index, is_inside = _cells_of_centres(
         len(zones_by_cell), 1 / side, -corner / side, count
     )
@@ -102,28 +103,28 @@ def _along_axis(
 
 
 def _cells_of_centres(
-    centres: int, side: float, corner: float, count: int
+    cells: int, side: float, corner: float, unit_cells: int
 ) -> tuple[Indices, NDArray[np.bool_]]:
-    """Return in which of some cells of length 1 the centres of N other cells lie.
+    """Return in which cells of length 1 the centres of other cells in a row lie.
 
     Parameters
     ----------
-    centres : int
-        The number N of the other cells, which lie in a row.
+    cells : int
+        The number N of the cells with these centres.
     side, corner : float
-        The length of each of these other cells, and where the first one begins.
-    count : int
-        The number of cells of length 1, which lie from 0 to `count`.
+        The length of each of the N cells, and where the first of them begins.
+    unit_cells : int
+        The number of cells of length 1: cell i reaches from i to i + 1.
 
     Returns
     -------
     (N,) int64
-        The cell of each centre; 0 for a centre outside.
+        The index i of the unit cell with each centre; 0 for a centre outside of all.
     (N,) bool
-        Whether each centre lies in one of the cells.
+        Whether each centre lies in a unit cell.
     """
     # A corner may be too far away for a number of cells.
     with np.errstate(all="ignore"):
-        position = corner + (np.arange(centres) + 0.5) * side + ON_EDGE
-    is_inside = (position >= 0) & (position < count)
+        position = corner + (np.arange(cells) + 0.5) * side + ON_EDGE
+    is_inside = (position >= 0) & (position < unit_cells)
     return np.where(is_inside, position, 0).astype(np.int64), is_inside

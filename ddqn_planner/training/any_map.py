@@ -37,23 +37,28 @@ MAPS: Final = 512
 
 
 def random_scenarios(seed: int, maps: int = MAPS) -> list[Scenario]:
-    """Draw maps to train on, half of them for each move rule, with a start and a goal.
+    """Draw scenarios to train on: random maps of 10 x 10 cells, each with two cells.
 
-    `maps` is their number. A path leads from each start to its goal.
+    The cells are a start and a goal that a path joins. `maps` is the number of
+    scenarios; the move rules take turns, and the same seed gives the same scenarios.
     """
     random = np.random.default_rng(as_seed(seed))
     scenarios = []
     for number in range(maps):
         rule = MOVE_RULES[number % len(MOVE_RULES)]
-        # High fill rates show 3x3 patches that are rare otherwise.
-        occupancy = random.random((10, 10)) < random.uniform(0.1, 0.6)
-        # A map has one of four kinds of costs. All kinds are drawn for each map: fewer
+        # High shares of occupied cells show 3x3 patches that are rare otherwise.
+        draws = random.random((10, 10))  # each 0 to 1
+        occupied_share = random.uniform(0.1, 0.6)
+        occupancy = draws < occupied_share
+        # A map has no costs, or one of three kinds of costs, (10, 10) int8 each. The
+        # three are drawn for each map, also those that the map does not get: fewer
         # draws would change all later maps of the seed.
         constant = np.full(occupancy.shape, random.integers(100), dtype=np.int8)
         partly_unknown = unknown_costs(occupancy, 0.3, random)
         random_cost = random_costs(occupancy, random)
         kinds = (None, random_cost, constant, partly_unknown)
-        grid = GridMap(occupancy, cost=kinds[random.integers(len(kinds))])
-        ((start, goal),) = random_requests(occupancy, rule, 1, random)
+        cost = kinds[random.integers(len(kinds))]
+        grid = GridMap(occupancy, cost=cost)
+        ((start, goal),) = random_requests(occupancy, rule, 1, random)  # a list of one
         scenarios.append(Scenario(grid, start, goal, rule))
     return scenarios

@@ -167,7 +167,10 @@ def training_of(
     replay: ReplayBuffer,
     next_q_of: Callable[[Q, Q], NextQ],
 ) -> Training:
-    """Return the arrays of a training, which share their memory with its objects.
+    """Return the arrays of a training, for compiled code.
+
+    They share their memory with `parts`, `environment` and `replay`: what compiled code
+    changes, changes in these objects.
 
     Parameters
     ----------
@@ -177,10 +180,12 @@ def training_of(
     environment, replay
         The robots and the replay buffer that `play` changes.
     next_q_of
-        Returns which Q of the next states the target uses, of that by θ and by θ⁻.
+        Takes Q of the next states by θ and by θ⁻, (B, 8) each, and returns which of
+        them selects the next action and which evaluates that action.
     """
     parameters = environment.parameters
     gradients = {name: np.zeros_like(tensor) for name, tensor in parts[0].items()}
+    # The networks evaluate either a batch or the states of all robots.
     states = max(parameters.batch_size, parameters.environments)
     windows, networks = networks_of(
         environment.background, environment.shape, [*parts, gradients], states
@@ -215,7 +220,7 @@ def training_of(
 
 
 def _settings(parameters: HyperParameters) -> Settings:
-    """Return the hyper-parameters that compiled functions need."""
+    """Return those hyper-parameters that are fields of `Settings`."""
     return Settings(**{name: getattr(parameters, name) for name in Settings._fields})
 
 
@@ -230,12 +235,15 @@ def networks_of(
     Parameters
     ----------
     background_SC
-        What the maps, of shape (H, W), show without a robot. All floats get its type.
+        What a network observes of each of S maps without a robot, a number for each of
+        C cells. All floats get its type.
+    shape
+        (H, W) of the maps; C is H * W.
     parts
         The tensors of each network by name. Each tensor is replaced by one that shares
         the memory of `Network.weights`.
     states
-        How many states the networks can evaluate at once.
+        The number of states that the networks can evaluate at once.
     """
     filters = len(parts[0]["convolution.bias"])
     windows = _windows_of(background_SC, shape, filters, states)
@@ -245,17 +253,22 @@ def networks_of(
 def _windows_of(
     background_SC: Floats, shape: tuple[int, int], filters: int, states: int
 ) -> Windows:
-    """Return the windows of the maps, with buffers for up to `states` states."""
+    """Return the windows of S maps, with buffers for up to `states` states.
+
+    `background_SC` is what a network observes of each of C = H * W cells without a
+    robot, `shape` is (H, W), and `filters` is F, those of the convolution.
+    """
     # `window_cells` gives the number H * W to cells outside a map: they are 0.
-    padded = np.pad(background_SC, [(0, 0), (0, 1)])
+    padded = np.pad(background_SC, [(0, 0), (0, 1)])  # (S, C + 1)
     # The memory is in the order of C for several maps as for one, by `take` and `copy`:
     # all functions would be compiled again for another order.
     by_map = np.take(padded, window_cells(shape), axis=1)  # (S, L, 9)
     common = np.sort(by_map, axis=0)[len(by_map) // 2]  # the median of each cell
     is_different = (by_map != common).any(axis=2)  # (S, L)
+    # The map and the number of each window that differs, ordered by map.
     scenario, differing = np.nonzero(is_different)
     first_differing = np.searchsorted(scenario, np.arange(len(by_map) + 1))
-    # Four windows at most show the robot.
+    # At most four windows of a state show the robot; the others differ on its map.
     changed_windows = states * (4 + int(np.diff(first_differing).max()))
     return Windows(
         common=common,
@@ -273,10 +286,11 @@ def _windows_of(
 def _network_of(tensors: dict[str, Floats], windows: Windows, states: int) -> Network:
     """Return a network of weights, with buffers for up to `states` states.
 
-    The values of `tensors` are replaced by tensors that share the network's memory.
+    `tensors` are the initial weights by name, as torch shapes them: each value of the
+    dictionary is replaced by a tensor that shares the network's memory.
     """
     # Weights and biases of the convolution, of the layer after it, and with a hidden
-    # layer those of the last layer.
+    # layer those of the last layer, each with the inputs as its first axis.
     arrays = [_inputs_first(tensor) for tensor in tensors.values()]
     has_hidden_layer = len(tensors) > 4
     if not has_hidden_layer:
@@ -284,11 +298,13 @@ def _network_of(tensors: dict[str, Floats], windows: Windows, states: int) -> Ne
     weights = np.concatenate(
         [array.ravel() for array in arrays], dtype=windows.common.dtype
     )
+    # Views into `weights`, of the shapes of `arrays`.
     ends = np.cumsum([array.size for array in arrays])
     layers = [
-        row.reshape(array.shape)
-        for row, array in zip(np.split(weights, ends[:-1]), arrays, strict=True)
+        part.reshape(array.shape)
+        for part, array in zip(np.split(weights, ends[:-1]), arrays, strict=True)
     ]
+    # There may be more layers than tensors: the empty ones of the last layer.
     for name, layer in zip(list(tensors), layers, strict=False):
         tensors[name] = layer.T.reshape(tensors[name].shape)
     kernel, kernel_bias, layer, layer_bias, last, last_bias = layers
@@ -356,7 +372,11 @@ def output_count(network: Network) -> int:
 
 @inner_in_place
 def evaluate_common_windows(network: Network, windows: Windows) -> None:
-    """Compute `common_feature` and `common_output` by the network's present weights."""
+    """Compute `common_feature` and `common_output` by the network's present weights.
+
+    `common_feature` (L, F) is the convolution of the L common windows after ReLU, and
+    `common_output` (U,) is the output of the layer after it, before ReLU.
+    """
     feature = network.common_feature
     output = network.common_output
     window_count, filters = feature.shape
@@ -376,9 +396,10 @@ def evaluate_common_windows(network: Network, windows: Windows) -> None:
 def convolve(
     kernel: Floats, bias: Floats, patch: Floats, patch_count: int, convolved: Floats
 ) -> None:
-    """Compute `convolved` (P, F), before ReLU, of the first `patch_count` of P patches.
+    """Write the convolution, before ReLU, of the first `patch_count` patches.
 
-    A patch (P, 9) is the 9 cells of a window.
+    `patch` (P, 9) holds the 9 cells of each of P windows, `kernel` is (9, F), `bias` is
+    (F,), and `convolved` (P, F) is written.
     """
     for row in range(patch_count):
         for f in range(bias.size):
@@ -394,9 +415,11 @@ def convolve(
 def evaluate(
     network: Network, windows: Windows, scenario: Integers, cell: Integers
 ) -> None:
-    """Compute ``network.q`` of B states: a robot in `cell` (B,) on map `scenario` (B,).
+    """Write Q (B, 8) of B states into ``network.q``.
 
-    The common windows must have been evaluated since the weights changed.
+    State n is a robot in cell[n] on map scenario[n]; both arrays are (B,). The common
+    windows must have been evaluated since the weights changed. The changed windows of
+    the states, and their convolutions, are written into `windows`.
     """
     collect_changed_windows(windows, scenario, cell)
     changed_count = windows.first_changed[cell.size]
@@ -418,11 +441,16 @@ def evaluate(
 
 @inlined
 def correct_output(network: Network, windows: Windows, n: int, row: int) -> None:
-    """Add to the output of state n how a changed window, in this row, changes it."""
+    """Correct the output of state n, that of the common windows, for a changed window.
+
+    The changed window is in row `row` of `windows`, where its convolution is known. Its
+    features replace those of the common window of the same number: each difference of
+    a feature, times the weights of this feature, is added to ``network.output[n]``.
+    """
     window = windows.changed[row]
     window_count, filters = network.common_feature.shape
     output = network.output
-    # Most windows have the same features as before, as most filters are off.
+    # Most changed windows have the features of the common one, as most filters give 0.
     difference = np.float32(0)
     for f in range(filters):
         feature = relu(windows.convolved[row, f])
@@ -439,7 +467,7 @@ def correct_output(network: Network, windows: Windows, n: int, row: int) -> None
 
 @inlined
 def apply_last_layer(network: Network, n: int) -> None:
-    """Compute Q of state n from the output of the hidden layer before ReLU."""
+    """Write Q of state n from the hidden layer's output (U,) before ReLU."""
     copy_into(network.q[n], network.last_bias)
     for u in range(network.common_output.size):
         if network.output[n, u] > 0:  # most are not
@@ -451,12 +479,12 @@ def apply_last_layer(network: Network, n: int) -> None:
 def collect_changed_windows(
     windows: Windows, scenario: Integers, cell: Integers
 ) -> None:
-    """Write the changed windows of B states into `windows`.
+    """Write the changed windows of B states into the rows of `windows`.
 
     State n is a robot in cell[n] on map scenario[n]. Its changed windows are those that
-    show the robot, and then those in which the map differs from most maps.
+    show the robot, and then those in which the map differs from the common windows.
     """
-    row_count = 0  # of the rows that have been written
+    row_count = 0  # the number of rows that have been written, and the next row
     for n in range(cell.size):
         row_count = add_windows_of_robot(windows, scenario[n], cell[n], row_count)
         row_count = add_windows_of_map(
@@ -469,15 +497,22 @@ def collect_changed_windows(
 def add_windows_of_robot(
     windows: Windows, scenario: int, cell: int, row_count: int
 ) -> int:
-    """Write the windows that show a robot in a cell; return how many rows are written.
+    """Write the windows of map `scenario` that show a robot in cell y * W + x.
 
-    The windows overlap: up to two rows and two columns of them show one cell.
+    The first window is written into row `row_count` of the changed windows; the result
+    is the number of rows that are written then. The windows have 3x3 cells and the
+    centres (2 * column, 2 * row), so that up to two rows and two columns of windows
+    show the cell.
     """
     height, width = windows.shape
     y, x = divmod(cell, width)
-    for row in range(y // 2, min((y + 1) // 2, (height - 1) // 2) + 1):
-        for column in range(x // 2, min((x + 1) // 2, (width - 1) // 2) + 1):
-            window = row * ((width + 1) // 2) + column
+    window_rows = (height + 1) // 2
+    window_columns = (width + 1) // 2
+    last_row = min((y + 1) // 2, window_rows - 1)
+    last_column = min((x + 1) // 2, window_columns - 1)
+    for row in range(y // 2, last_row + 1):
+        for column in range(x // 2, last_column + 1):
+            window = row * window_columns + column
             copy_window(windows, scenario, window, row_count)
             y_in_window = y + 1 - 2 * row
             x_in_window = x + 1 - 2 * column
@@ -490,16 +525,18 @@ def add_windows_of_robot(
 def add_windows_of_map(
     windows: Windows, scenario: int, first_row: int, row_count: int
 ) -> int:
-    """Write the windows in which a map differs; return how many rows are written.
+    """Write the windows in which map `scenario` differs from the common windows.
 
-    The rows from `first_row` on show the robot, and are not written a second time.
+    The first window is written into row `row_count` of the changed windows; the result
+    is the number of rows that are written then. The rows from `first_row` to before
+    `row_count` hold windows that show the robot; they are not written a second time.
     """
-    row_with_robot_end = row_count
+    end_of_robot = row_count
     first = windows.first_differing[scenario]
     for index in range(first, windows.first_differing[scenario + 1]):
         window = windows.differing[index]
         is_written = False
-        for row in range(first_row, row_with_robot_end):
+        for row in range(first_row, end_of_robot):
             is_written |= windows.changed[row] == window
         if not is_written:
             copy_window(windows, scenario, window, row_count)
@@ -509,7 +546,10 @@ def add_windows_of_map(
 
 @inlined
 def copy_window(windows: Windows, scenario: int, window: int, row: int) -> None:
-    """Make a map's window, without a robot, the changed window of this row."""
+    """Copy a window of map `scenario`, without a robot, into a row of changed windows.
+
+    `window` is the number of the window, 0 to L - 1.
+    """
     windows.changed[row] = window
     for position in range(9):  # a copy of a slice takes three times as long
         cell = windows.by_map[scenario, window, position]
@@ -524,12 +564,26 @@ def play(
     counters: Counters,
     last_step: int,
 ) -> Counters:
-    """Make steps, and the updates due after them; return the new counters.
+    """Let the robots make rounds of one step each, and make the updates that fall due.
 
-    It ends when an episode ends, at step `last_step`, or after so many steps as take
-    some milliseconds. The generators `exploration` and `sampling` draw actions and
-    batches. Of the counters, `replayed` counts the transitions that were put into the
-    replay buffer.
+    The rounds end when an episode ends, when `last_step` steps have been made since the
+    training began, or after a number of rounds that takes milliseconds.
+
+    Parameters
+    ----------
+    training : Training
+        Changed in place: robots, networks, replay buffer.
+    exploration, sampling : Generator
+        Draw the actions and the batches.
+    counters : Counters
+        The steps of all robots, the updates, and the transitions put into the replay
+        buffer, since the training began.
+    last_step : int
+
+    Returns
+    -------
+    Counters
+        Those after the last round.
     """
     game, learning, robots = training
     settings = learning.settings
@@ -537,17 +591,19 @@ def play(
     evaluate_common_windows(learning.online, learning.windows)
     evaluate_common_windows(learning.target, learning.windows)
     robot_count = robots.cell.size
-    most_rounds = max(1, WINDOWS_OF_A_CALL // len(learning.online.common_feature))
-    last_step = min(last_step, steps + robot_count * most_rounds)
+    # A round takes longer, the more windows a map has.
+    window_count = len(learning.windows.common)
+    most_rounds = max(1, WINDOWS_OF_A_CALL // window_count)
+    last_step_of_call = min(last_step, steps + robot_count * most_rounds)
     has_ended = False
-    while steps < last_step and not has_ended:
+    while steps < last_step_of_call and not has_ended:
         choose_actions(learning, robots, exploration, steps)
         has_ended = move_robots(game, learning, robots, replayed)
         replayed += robot_count
-        # An update is due for each multiple of the interval that the steps pass.
-        passed_multiples = steps // settings.update_interval
+        # An update is due for each multiple of the interval that this round passes.
+        multiples_before = steps // settings.update_interval
         steps += robot_count
-        updates_due = steps // settings.update_interval - passed_multiples
+        updates_due = steps // settings.update_interval - multiples_before
         if steps > settings.learning_starts:
             for _ in range(updates_due):
                 updates += 1
@@ -559,15 +615,15 @@ def play(
 def choose_actions(
     learning: Learning, robots: Robots, exploration: Generator, steps: int
 ) -> None:
-    """Set each robot's action: with probability ε any, else the best by θ.
+    """Write each robot's action: with probability ε a random one, else the best by θ.
 
-    `steps` have been made in all; ε falls linearly with them.
+    `steps` is the number of steps that all robots have made since the training began; ε
+    changes linearly over the first `epsilon_steps`.
     """
     settings = learning.settings
     share = min(steps / settings.epsilon_steps, 1.0)
-    epsilon = settings.epsilon_start + share * (
-        settings.epsilon_end - settings.epsilon_start
-    )
+    change_of_epsilon = settings.epsilon_end - settings.epsilon_start
+    epsilon = settings.epsilon_start + share * change_of_epsilon
     robot_count = robots.cell.size
     for n in range(robot_count):
         robots.action[n] = exploration.integers(0, 8)
@@ -579,10 +635,10 @@ def choose_actions(
 
 @inner_in_place
 def move_robots(game: Game, learning: Learning, robots: Robots, replayed: int) -> bool:
-    """Move each robot by its action; return if an episode ended.
+    """Move each robot by its action, and put the transitions into the replay buffer.
 
-    The transitions replace the oldest ones in the replay buffer, into which `replayed`
-    have been put so far.
+    The buffer is a ring, into which `replayed` transitions have been put before: the
+    new transitions replace the oldest ones. The result is whether an episode ended.
     """
     settings = learning.settings
     replay = learning.replay
@@ -618,10 +674,20 @@ def move_robots(game: Game, learning: Learning, robots: Robots, replayed: int) -
 def update(
     learning: Learning, sampling: Generator, updates: int, replayed: int
 ) -> None:
-    """Change θ by Adam with the gradient of a batch, see `double_dqn_gradient`.
+    """Draw a batch, and change θ by Adam with its gradient, see `double_dqn_gradient`.
 
-    `updates` counts this update, too; `replayed` transitions have been put into the
-    replay buffer. Each `target_interval` updates θ⁻ becomes θ.
+    After each `target_interval` updates θ⁻ becomes θ.
+
+    Parameters
+    ----------
+    learning : Learning
+        Changed in place.
+    sampling : Generator
+        Draws the batch.
+    updates : int
+        The number of this update, from 1 on.
+    replayed : int
+        The number of transitions that have been put into the replay buffer.
     """
     settings = learning.settings
     windows = learning.windows
@@ -633,6 +699,7 @@ def update(
     draw_batch(learning, sampling, replayed)
     evaluate(online, windows, batch.scenario, batch.next_cell)
     evaluate(target, windows, batch.scenario, batch.next_cell)
+    # `next_q` are views of Q by θ or θ⁻, which select and evaluate the next action.
     for n in range(batch_size):
         next_action = learning.next_q.selection[n].argmax()
         next_value = learning.next_q.evaluation[n, next_action]
@@ -663,7 +730,8 @@ def update(
 def draw_batch(learning: Learning, sampling: Generator, replayed: int) -> None:
     """Draw the batch from the replay buffer, uniformly and with replacement.
 
-    `replayed` transitions have been put into the ring; the last ones are in it.
+    The buffer is a ring, into which `replayed` transitions have been put: it holds the
+    last of them.
     """
     replay = learning.replay
     batch = learning.batch
@@ -681,11 +749,19 @@ def draw_batch(learning: Learning, sampling: Generator, replayed: int) -> None:
 def differentiate(
     network: Network, windows: Windows, gradient: Network, states: int
 ) -> None:
-    """Add the gradient by all weights to the one in `gradient`: backpropagation.
+    """Add the gradient by all weights to `gradient`: backpropagation.
 
-    The network evaluated as many `states` last, and ``gradient.q`` is the gradient by
-    Q of these states. ``windows.convolved``, the convolution of the changed windows, is
-    overwritten by the gradient by it.
+    Parameters
+    ----------
+    network, windows
+        As `evaluate` has left them for as many states as `states`. The convolutions
+        ``windows.convolved`` are overwritten by the gradient of the loss by them.
+    gradient
+        Each array is the gradient of the loss by that array of `network`. ``q`` holds
+        the gradient by Q of the states; the gradients by weights and biases are added
+        to, and all others are overwritten.
+    states
+        The number B of states.
     """
     gradient.common_output[:] = 0
     # The gradient by the convolution of the common windows before ReLU, although a
@@ -709,7 +785,11 @@ def differentiate(
 
 @inlined
 def differentiate_last_layer(network: Network, gradient: Network, n: int) -> None:
-    """Add the gradient by the last layer of state n; set that by the hidden output."""
+    """Backpropagate from Q of state n through the last layer and the ReLU before it.
+
+    The gradient by the layer's weights and biases is added to; the gradient by the
+    hidden layer's output before ReLU, ``gradient.output[n]``, is written.
+    """
     add_to(gradient.last_bias, gradient.q[n])
     for u in range(network.common_output.size):
         activation = relu(network.output[n, u])
@@ -725,34 +805,43 @@ def differentiate_last_layer(network: Network, gradient: Network, n: int) -> Non
 def differentiate_window(
     network: Network, windows: Windows, gradient: Network, n: int, row: int
 ) -> None:
-    """Add the gradients of what `correct_output` adds to state n for a changed window.
+    """Backpropagate from the output of state n through one of its changed windows.
 
-    ``windows.convolved[row]`` becomes the gradient by the convolution of the window.
+    The changed window is in row `row` of `windows`. For each feature f `correct_output`
+    has added (feature - common feature) times the weights of f to the output. This
+    function adds the gradients by these weights and by the common window's convolution.
+    ``windows.convolved[row]`` (F,), until then the convolution of the changed window
+    before ReLU, is overwritten by the gradient by this convolution.
     """
     window = windows.changed[row]
     window_count, filters = network.common_feature.shape
-    slopes = gradient.output
+    slopes = gradient.output  # (B, U): the gradient by the output of each state
     for f in range(filters):
         feature = relu(windows.convolved[row, f])
         common_feature = network.common_feature[window, f]
         change = feature - common_feature
-        by_feature = np.float32(0)
-        # Most features are 0, with the robot and without.
+        by_feature = np.float32(0)  # the gradient by `feature`
+        # Most features are 0 in both windows: then this one has no gradient.
         if feature != 0 or change != 0:
             weight_row = f * window_count + window
             for u in range(output_count(network)):
                 gradient.layer[weight_row, u] += change * slopes[n, u]
                 by_feature += network.layer[weight_row, u] * slopes[n, u]
-            if common_feature > 0:
+            if common_feature > 0:  # the derivative of ReLU is 0 elsewhere
                 gradient.common_feature[window, f] -= by_feature
         windows.convolved[row, f] = by_feature if feature > 0 else np.float32(0)
 
 
 @inlined
 def differentiate_common_windows(network: Network, gradient: Network) -> None:
-    """Add the gradients of the common output, a part of each state's output."""
+    """Backpropagate from the common output, a part of each state's output.
+
+    Added to are the gradients by the weights of the layer after the convolution, and
+    ``gradient.common_feature`` (L, F), the gradient by the convolution of the common
+    windows before ReLU.
+    """
     window_count, filters = network.common_feature.shape
-    slopes = gradient.common_output
+    slopes = gradient.common_output  # (U,): the gradient by the common output
     for window in range(window_count):
         for f in range(filters):
             feature = network.common_feature[window, f]
@@ -768,9 +857,10 @@ def differentiate_common_windows(network: Network, gradient: Network) -> None:
 def add_kernel_gradient(
     gradient: Network, patch: Floats, patch_count: int, by_convolved: Floats
 ) -> None:
-    """Add the gradient by the kernel and its bias, through the first patches (P, 9).
+    """Add the gradients by the convolution's kernel (9, F) and bias (F,).
 
-    `by_convolved` (P, F) is the gradient by the convolution of the patches.
+    They are those through the first `patch_count` of the windows' cells in `patch`
+    (P, 9). `by_convolved` (P, F) is the gradient by the convolution of the patches.
     """
     filters = gradient.kernel_bias.size
     for row in range(patch_count):
@@ -794,8 +884,9 @@ def adam(
 ) -> None:
     """Change weights (N,) by Adam (Kingma and Ba 2015, with ε where torch has it).
 
-    `slopes` is the gradient, and 0 afterwards. `means` and `squares` are its moments.
-    `updates` is the number of this update, from 1 on.
+    `slopes` (N,) is the gradient by the weights, and 0 afterwards. `means` and
+    `squares` (N,) are its running first and second moments, changed in place. `updates`
+    is the number of this update, from 1 on.
     """
     step = np.float32(learning_rate / (1 - BETA_1**updates))
     inverse_root = np.float32(1 / np.sqrt(1 - BETA_2**updates))

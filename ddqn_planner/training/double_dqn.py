@@ -27,8 +27,9 @@ class ReplayBuffer:
     """The last `capacity` transitions, in a ring."""
 
     def __init__(self, capacity: int) -> None:
+        """Make an empty buffer for `capacity` transitions."""
         self.capacity = capacity
-        self.added = 0
+        self.added = 0  # the number of transitions that were ever added
         self.transitions = Transitions(
             scenario=np.zeros(capacity, np.int64),
             cell=np.zeros(capacity, np.int64),
@@ -76,7 +77,8 @@ def next_q(target: str, online_BA: Q, target_BA: Q) -> NextQ:
 def double_dqn_gradient(batch: Transitions, q_BA: Q, next_q: NextQ) -> Q:
     """Return the gradient of the mean squared temporal-difference error by Q: (B, 8).
 
-    `q_BA` is Q of the batch's states by θ.
+    `q_BA` is Q of the batch's B states by θ, and `next_q` has Q of its next states. The
+    gradient is 0 for actions that were not taken.
     """
     rows = np.arange(len(q_BA))
     next_action_B = next_q.selection.argmax(axis=1)

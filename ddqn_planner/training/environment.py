@@ -42,7 +42,8 @@ class Scenario:
         check_grid(self.grid)
         start = as_cell(self.start, "the start")
         goal = as_cell(self.goal, "the goal")
-        object.__setattr__(self, "start", start)  # as frozen dataclasses do it
+        # The dataclass is frozen.
+        object.__setattr__(self, "start", start)
         object.__setattr__(self, "goal", goal)
         object.__setattr__(self, "move_rule", MoveRule(self.move_rule))
         for name, cell in (("start", start), ("goal", goal)):
@@ -63,7 +64,7 @@ class Scenario:
             )
 
     def _leads_to_goal(self, move_rule: MoveRule) -> bool:
-        """Return if a path of moves that the rule allows joins start and goal."""
+        """Return whether a path of legal moves leads from the start to the goal."""
         reached = self.grid.reachable([self.start], move_rule)
         return bool(reached[self.goal[1], self.goal[0]])
 
@@ -134,6 +135,17 @@ class GridVectorEnvironment:
         parameters: HyperParameters,
         random: np.random.Generator | None = None,
     ) -> None:
+        """Tabulate all moves on the maps; the caller then calls `reset`.
+
+        Parameters
+        ----------
+        scenarios : sequence of Scenario
+            S maps of one size, with their starts and goals.
+        parameters : HyperParameters
+            The number of robots, the rewards, and how episodes begin and end.
+        random : Generator, optional
+            Draws the scenario and the first cell of each episode.
+        """
         _check_scenarios(scenarios)
         if not isinstance(parameters, HyperParameters):
             raise ValueError(f"the parameters are {parameters!r}; give HyperParameters")
@@ -144,7 +156,7 @@ class GridVectorEnvironment:
 
         self._tabulate_moves()
         self._list_cells()
-        robots = parameters.environments
+        robots = parameters.environments  # N
         self.scenario = np.zeros(robots, np.int64)
         self.cell = np.zeros(robots, np.int64)
         self.steps = np.zeros(robots, np.int64)
@@ -154,7 +166,7 @@ class GridVectorEnvironment:
         self.truncated = np.zeros(robots, np.bool_)
 
     def _tabulate_moves(self) -> None:
-        """Set `legal`, `free_reward`, `rewards` and `next_cell`."""
+        """Set `legal`, `free_reward`, `rewards` (S, 8, C), and `next_cell` (8, C)."""
         legal = []
         rewards = []
         for scenario in self.scenarios:
@@ -172,7 +184,10 @@ class GridVectorEnvironment:
         self.next_cell = neighbours(self.shape)
 
     def _list_cells(self) -> None:
-        """Set `start`, `goal` and `background`, and list the free cells of all maps."""
+        """Set `start`, `goal` and `background`, and list the free cells of all maps.
+
+        Cells are numbers y * W + x.
+        """
         _, width = self.shape
         start_xy = np.array([scenario.start for scenario in self.scenarios])  # (S, 2)
         goal_xy = np.array([scenario.goal for scenario in self.scenarios])
@@ -192,7 +207,12 @@ class GridVectorEnvironment:
         self._first_free = np.cumsum(self._free_count) - self._free_count
 
     def reset(self, mask: NDArray[np.bool_] | EllipsisType = ...) -> None:
-        """Start new episodes: of the robots where `mask` (N,) is True, else of all."""
+        """Start new episodes of robots where `mask` (N,) is True; by default of all.
+
+        Each episode draws a scenario, and begins in a random cell with probability p_r,
+        else at the scenario's start.
+        """
+        # Shapes: (M,) for M robots.
         scenario = self.random.integers(len(self.start), size=len(self.cell[mask]))
         cell = initial_cells(
             self.start[scenario],
@@ -211,15 +231,17 @@ class GridVectorEnvironment:
         self.truncated[mask] = False
 
     def move(self, actions: NDArray[np.int64]) -> Outcome:
-        """Move each robot once, by the actions (N,); a robot that collides stays.
+        """Move each robot by its action (N,), 0 to 7; a robot that collides stays.
 
-        The arrays of the result are overwritten by the next move.
+        A ResetNeeded error if an episode has ended. The next move overwrites
+        `terminated` and `truncated` of the result.
         """
         actions = numbers(
             "the actions", actions, self.cell.shape, "iu", (0, len(MOVES) - 1)
         )
         if (self.terminated | self.truncated).any():
             raise ResetNeeded("an episode has ended; call reset before the next step")
+        # Shapes: (N,).
         legal = self.legal[self.scenario, actions, self.cell]
         reward = self.rewards[self.scenario, actions, self.cell]
         self.cell[:] = np.where(legal, self.next_cell[actions, self.cell], self.cell)
@@ -235,7 +257,11 @@ class GridVectorEnvironment:
     def observe(
         self, scenario: NDArray[np.int64], cell: NDArray[np.int64]
     ) -> Observations:
-        """Return the observations (B, H, W) of robots in cells (B,) of maps (B,)."""
+        """Return the observations (B, H, W) of robots in cells (B,) of maps (B,).
+
+        `scenario` has the number of the map of each robot.
+        The values are those of `observation_background`, and ROBOT in the robot's cell.
+        """
         observations = self.background[scenario]
         observations[np.arange(len(cell)), cell] = ROBOT
         return observations.reshape(-1, *self.shape)
@@ -255,9 +281,14 @@ class GridEnvironment(gymnasium.Env[Observations, np.int64]):
         scenario: Scenario | None = None,
         parameters: HyperParameters | None = None,
     ) -> None:
+        """Make an environment of one robot on a map.
+
+        By default it has the paper's scenario and hyper-parameters; of the parameters,
+        `environments` does not count.
+        """
         if parameters is None:
             parameters = HyperParameters()
-        if isinstance(parameters, HyperParameters):
+        if isinstance(parameters, HyperParameters):  # else the vector environment errs
             parameters = replace(parameters, environments=1)
         scenario = paper_scenario() if scenario is None else scenario
         self.vector = GridVectorEnvironment([scenario], parameters)

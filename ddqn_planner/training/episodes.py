@@ -44,8 +44,8 @@ class Episode(NamedTuple):
 def open_record(path: Path, episodes: int) -> Appender:
     """Open an ``episodes.csv`` to append to it; a missing file is made.
 
-    Only the rows of the episodes 1 to `episodes` stay: a checkpoint that is restored is
-    older than later rows.
+    Only the rows of the episodes 1 to `episodes` stay. Later rows are newer than the
+    checkpoint from which the training continues.
     """
     lines = [HEADER]
     if path.exists():

@@ -39,7 +39,7 @@ def length_ratios(
 
 
 def evaluate(field: QField, grid: GridMap, move_rule: MoveRule) -> Evaluation:
-    """Summarise `length_ratios` of a field."""
+    """Return a summary of a field's greedy rollouts, see `length_ratios`."""
     ratios = length_ratios(field, grid, move_rule)
     starts = int((~np.isnan(ratios)).sum())
     solved = ratios[np.isfinite(ratios)]  # (solved,)

@@ -43,16 +43,17 @@ def prior_of(
 ) -> Prior | None:
     """Train a prior on the places that were driven and are free on a map.
 
-    Fewer than FEWEST_PLACES of them change nothing: the result is `older`.
+    `places` has sums of what was seen at N places of the world. Fewer than
+    FEWEST_PLACES places on free cells change nothing: the result is the prior `older`.
     """
     cells, is_inside = cells_of(places.position, grid)
     x, y = cells.T
     is_usable = is_inside & ~grid.occupancy[y, x] & (places.weight > 0)
     if is_usable.sum() < FEWEST_PLACES:
         return older
-    weight = places.weight[is_usable]
+    weight = places.weight[is_usable]  # (M,), as the arrays that follow
     log_slowness = places.sum_of_log[is_usable] / weight
-    features = map_features(grid)[y[is_usable], x[is_usable]]
+    features = map_features(grid)[y[is_usable], x[is_usable]]  # (M, FEATURES)
     rows = np.column_stack(
         [
             places.position[is_usable],
@@ -79,36 +80,45 @@ class _Columns(NamedTuple):
 
 
 def train_prior(new: Float32, older: Prior | None = None, seed: int = 0) -> Prior:
-    """Train a prior on places, in rows as those of `Prior.replay`.
+    """Train a prior on the places of a map, and on those of an older prior again.
 
-    Networks that leave out some places tell how long to train, and how much of the
-    prediction to believe: none of it, if it does not predict the places left out.
+    Several networks are trained, of which all but the last leave out some places. Their
+    errors for the places left out tell how long to train, and by which share to believe
+    the predictions; a prior that cannot predict these places is believed by 0.
 
     Parameters
     ----------
     new
-        Places of one map, in the order in which they were first driven.
+        Places of one map, in the order in which they were first driven: a row for each,
+        as in `Prior.replay`.
     older
-        A prior whose places are replayed, so that the new one predicts other maps, too.
-        On a new map it is returned itself if it predicts the places better.
+        A prior whose places are learned again, so that the new prior predicts other
+        maps, too. If none of its places lies on this map, and it predicts the new
+        places better than the new prior does, it is returned itself.
+    seed
+        Of all random draws.
     """
     random = np.random.default_rng(as_seed(seed))
-    old = new[:0] if older is None else _not_measured_anew(older.replay, new)
-    places = _Columns.of(np.concatenate([old, new]))
+    old = new[:0]  # no rows
+    if older is not None:
+        old = _not_measured_anew(older.replay, new)
+    places = _Columns.of(np.concatenate([old, new]))  # N places
     new_places = _Columns.of(new)
-    mean = places.features.mean(axis=0)
+    mean = places.features.mean(axis=0)  # (F,) for F features, as the scale
     scale = np.maximum(places.features.std(axis=0), SMALLEST_SCALE)
-    scaled = np.clip((places.features - mean) / scale, -UNUSUAL, UNUSUAL)
-    # Other maps may be slower as a whole: this column learns their level.
+    scaled = np.clip((places.features - mean) / scale, -UNUSUAL, UNUSUAL)  # (N, F)
+    # Other maps may be slower as a whole: this column of inputs learns their level.
     count = len(places.weight)
-    is_old = (np.arange(count) < len(old)).astype(np.float32)
+    is_old = (np.arange(count) < len(old)).astype(np.float32)  # (N,)
     level = np.average(new_places.log_slowness, weights=new_places.weight)
-    target = places.log_slowness - level
-    weight = places.weight / places.weight.mean()
-    block = _blocks(count)
+    target = places.log_slowness - level  # (N,)
+    weight = places.weight / places.weight.mean()  # (N,)
+    # Places in a row are one block, and some blocks are a fold. Network k leaves out
+    # the places of fold k, and the last network none.
+    block = _blocks(count)  # (N,)
     fold_of_block = random.permutation(block[-1] + 1) % FOLDS
-    # Network k leaves out fold k, and the last network no place.
-    is_left_out = fold_of_block[block] == np.arange(FOLDS + 1)[:, None]
+    network = np.arange(FOLDS + 1)
+    is_left_out = fold_of_block[block] == network[:, None]  # (networks, N)
     training = _train(
         np.column_stack([scaled, is_old]),
         target,
@@ -117,14 +127,16 @@ def train_prior(new: Float32, older: Prior | None = None, seed: int = 0) -> Prio
         seed=seed,
     )
     share = _share_to_believe(block, weight, training.predicted, target)
-    # All places of the older prior are replayed only where none lies on this map.
-    is_new_map = older is not None and len(old) == len(older.replay)
-    if older is not None and is_new_map:
-        predicted = (share * training.predicted)[len(old) :]
+    if older is not None:
+        # All places of the older prior are left only if none lies on this map.
+        is_new_map = len(old) == len(older.replay)
+        predicted = share * training.predicted[len(old) :]  # of the new places
         predicted_by_older = older.log_slowness(new_places.features)
-        if _error(predicted_by_older, new_places) < _error(predicted, new_places):
+        error = _error(predicted, new_places)
+        if is_new_map and _error(predicted_by_older, new_places) < error:
             return older
     replay = [_some_rows(old, random), _some_rows(new, random)]
+    # The last network has learned from all places.
     last = _Weights(*(tensor[-1] for tensor in training.weights))
     arrays = {
         "mean": mean,
@@ -144,7 +156,11 @@ def train_prior(new: Float32, older: Prior | None = None, seed: int = 0) -> Prio
 
 
 def _not_measured_anew(old: Float32, new: Float32) -> Float32:
-    """Return the old rows whose position and features are those of no new row."""
+    """Return the old rows whose place is that of no new row.
+
+    Rows are those of `Prior.replay`. Two rows are of the same place if their positions
+    and features are equal: all columns but the last two.
+    """
     measured = {place.tobytes() for place in new[:, :-2]}
     is_other_place = [place.tobytes() not in measured for place in old[:, :-2]]
     return old[is_other_place]
@@ -166,19 +182,29 @@ def _some_rows(rows: Float32, random: np.random.Generator) -> Float32:
 def _share_to_believe(
     block: NDArray[np.int64], weight: Float32, predicted: Float32, target: Float32
 ) -> float:
-    """Return by which share of the prediction to predict, 0 to 1.
+    """Return by which share, 0 to 1, to multiply predictions.
 
-    It is the share that fits the target best by weighted least squares, less a part
-    that grows with the standard error of the share; 0 if this error is too large. All
-    arrays are (N,); the errors of the places of a block are taken for dependent.
+    It is the share with which ``share * predicted`` fits the target best by weighted
+    least squares, less a part that grows with the standard error of this share; 0 if
+    that error is too large. The errors of the places of a block are not independent.
+
+    Parameters
+    ----------
+    block
+        (N,): the number of the block of each place.
+    weight
+        (N,): how much each place counts.
+    predicted, target
+        (N,): the log slowness of each place that was predicted, and that was measured.
     """
-    product = np.bincount(block, weight * predicted * target)  # (blocks,)
+    # (blocks,): the sums of each block.
+    product = np.bincount(block, weight * predicted * target)
     square = np.bincount(block, weight * predicted * predicted)
     total_square = max(square.sum(), MIN_SUM)
     share = product.sum() / total_square
     error_of_block = product - share * square
     standard_error = np.linalg.norm(error_of_block) / total_square
-    # Of fewer blocks the errors are greater.
+    # With fewer blocks, the standard error is less certain: it counts for more.
     certain_share = max(share * (1 - 2 / len(product)), MIN_SUM)
     doubt = DOUBT * standard_error / certain_share
     believed: float = min(share, 1) * (1 - min(doubt, 1) ** 2)
@@ -212,7 +238,7 @@ class _Weights(NamedTuple):
 class _Training(NamedTuple):
     """The networks after the step with the least error."""
 
-    # (N,): the log slowness of each place, by the network that left the place out
+    # (N,): the log slowness of each place, as the network that left it out predicts it
     predicted: Float32
     weights: _Weights
 
@@ -220,14 +246,17 @@ class _Training(NamedTuple):
 def _train(
     inputs: Float32, target: Float32, weight: Float32, left_out: Float32, seed: int
 ) -> _Training:
-    """Train K networks on N places.
+    """Train K networks on N places, and return them as they were at their best step.
+
+    The best step is that with the least error for the places left out.
 
     Parameters
     ----------
     inputs, target, weight
         (N, I) features, (N,) log slowness, and (N,) how much each place counts.
     left_out
-        (K, N): 1 where network k leaves out a place, else 0.
+        (K, N): 1 where network k leaves out a place, else 0. Each place is left out by
+        one network.
     seed
         Of the first weights.
     """
@@ -262,10 +291,11 @@ def _train(
 def _initial_weights(
     x_NI: Tensor, target_N: Tensor, weight_KN: Tensor, seed: int
 ) -> _Weights:
-    """Return K networks that predict as well as linear ones can, before their training.
+    """Return K networks for the first step: they predict by a ridge regression.
 
-    `x_NI` are the inputs, `target_N` the log slowness, and `weight_KN` how much each
-    network counts each of N places.
+    `x_NI` are the I inputs of N places, `target_N` is their log slowness, and
+    `weight_KN` how much each network counts each place. The hidden layers have random
+    weights, and add nothing to the prediction before the first step.
     """
     networks = len(weight_KN)
     weights = _Weights(
@@ -280,17 +310,22 @@ def _initial_weights(
     for layer in (weights.weights_1, weights.weights_2):  # changed in place
         _, inputs, units = layer.shape
         layer += torch.randn((inputs, units), generator=generator) / inputs**0.5
-    # The normal equations of a ridge regression.
-    x_and_target = torch.column_stack([x_NI, target_N])
+    # The normal equations of a ridge regression for each network. The last column of
+    # the moments is the right side.
+    x_and_target = torch.column_stack([x_NI, target_N])  # (N, I + 1)
     moments = torch.einsum("kn,ni,nj->kij", weight_KN, x_NI, x_and_target)
     penalty = RIDGE * torch.eye(FEATURES + 1)
-    direct = torch.linalg.solve(moments[..., :-1] + penalty, moments[..., -1:])
+    left_side = moments[..., :-1] + penalty  # (K, I, I)
+    direct = torch.linalg.solve(left_side, moments[..., -1:])
     weights.direct.copy_(direct)
     return weights
 
 
 def _outputs(weights: _Weights, x_KNI: Tensor) -> Tensor:
-    """Return what each of K networks predicts of each of N places: (K, N)."""
+    """Return the log slowness that K networks predict for N places: (K, N).
+
+    `x_KNI` are the inputs: the features, and at last 1 for a place of another map.
+    """
     features = x_KNI[..., :FEATURES]
     first = torch.baddbmm(weights.bias_1, features, weights.weights_1).tanh()
     second = torch.baddbmm(weights.bias_2, first, weights.weights_2).tanh()

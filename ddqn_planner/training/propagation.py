@@ -34,10 +34,16 @@ class PropagationLearner:
 
     Parameters
     ----------
+    network
+        Gives the features of cells, and says whether costs are learned.
     parts
-        The tensors of θ, of θ⁻ and of Adam's two moments, which an update changes.
+        Four dictionaries of tensors by name: of θ, of θ⁻ and of Adam's two moments. An
+        update changes them in place.
+    environment
+        Its maps, rewards and goals are those of the training.
     next_q_of
-        Returns which Q of the next states the target uses, of that by θ and by θ⁻.
+        Takes Q of the next states by θ and by θ⁻, (B, 8) each, and returns which of
+        them selects the next action and which evaluates that action.
     """
 
     def __init__(
@@ -47,6 +53,7 @@ class PropagationLearner:
         environment: GridVectorEnvironment,
         next_q_of: Callable[[Q, Q], NextQ],
     ) -> None:
+        """Tabulate the features of all cells; the class tells the parameters."""
         self.environment = environment
         self.uses_costs = network.uses_costs
         self._next_q_of = next_q_of
@@ -59,7 +66,8 @@ class PropagationLearner:
         for scenario in environment.scenarios:
             patch_C9 = patches(scenario.grid.occupancy, scenario.grid.cost)
             features.append(network.features(patch_C9, scenario.move_rule))
-        # Many cells have the same features: each is evaluated once.
+        # Many cells have the same features. Each of U different rows of I features is
+        # evaluated once, and each cell of each map has the number of its row.
         self._feature_UI, number = np.unique(
             np.concatenate(features), axis=0, return_inverse=True
         )
@@ -67,7 +75,10 @@ class PropagationLearner:
         self.settle()
 
     def settle(self) -> None:
-        """Compute V, and Q by the target network, on every map."""
+        """Compute V and Q(s, a) on every map by value iteration with θ⁻.
+
+        Sets `_q_SCA`, and `_return_without_cost_SCA`, on which later updates build.
+        """
         environment = self.environment
         feature_UI = torch.from_numpy(self._feature_UI)
         success_UA = _activations(self._target, feature_UI)[-1].numpy()
@@ -109,35 +120,39 @@ class PropagationLearner:
         return _Evaluation(r_o + success_BA * gain_BA, gain_BA, activations)
 
     def _cost(self, weights: Tensors, feature_BI: Tensor) -> Tensor:
-        """Return length times cost multiplier of each move: (B, 8).
+        """Return the cost of each move as `weights` predict it: (B, 8).
 
-        0 if the network learns no costs, and the environment's reward counts.
+        It is the move's length in cells times a cost multiplier of 1 or more.
+        `feature_BI` are the features of B cells. Where the network learns no costs, and
+        the environment's reward counts, all costs are 0.
         """
         if not self.uses_costs:
             return torch.zeros(len(feature_BI), len(MOVES))
         return LENGTHS_A * (1 + _layer(weights, "prices", feature_BI).relu())
 
     def update(self, batch: Transitions, number: int) -> None:
-        """Change θ by a batch; `number` counts the updates, from 1 on.
+        """Change θ by the gradient of a batch of B transitions.
 
-        Each `target_interval` updates θ⁻ becomes θ.
+        `number` is that of this update, from 1 on. After each `target_interval` updates
+        θ⁻ becomes θ, and V is computed anew.
         """
-        count = len(batch.cell)
+        count = len(batch.cell)  # B
         p = self.environment.parameters
-        # The states, and after them the next states: 2B.
-        scenario = np.tile(batch.scenario, 2)
+        # The B states, and after them the B next states, in one evaluation.
+        scenario = np.tile(batch.scenario, 2)  # (2B,)
         cell = np.concatenate([batch.cell, batch.next_cell])
         evaluation = self._evaluate(scenario, cell)
         q_BA, online_next_BA = np.split(evaluation.q.numpy(), 2)
         target_next_BA = self._q_SCA[batch.scenario, batch.next_cell]
         next_q = self._next_q_of(online_next_BA, target_next_BA)
         by_q_BA = torch.from_numpy(double_dqn_gradient(batch, q_BA, next_q))
-        present_states = _Evaluation(
+        # The first half of the evaluation: that of the states.
+        of_states = _Evaluation(
             evaluation.q[:count],
             evaluation.gain[:count],
             [activation[:count] for activation in evaluation.activations],
         )
-        gradients = self._gradients(by_q_BA, present_states)
+        gradients = self._gradients(by_q_BA, of_states)
         self._take_step(gradients, number, p.learning_rate)
         if number % p.target_interval == 0:
             for name, tensor in self._target.items():
@@ -147,30 +162,37 @@ class PropagationLearner:
     def _gradients(
         self, by_q_BA: Tensor, evaluation: "_Evaluation"
     ) -> dict[str, Tensor]:
-        """Return the gradients by all weights, from the gradient `by_q_BA` by Q.
+        """Return the gradients by all weights of θ, by their names.
 
-        Written by hand: it takes half of autograd's time.
+        `by_q_BA` is the gradient of the loss by Q of B states, and `evaluation` is that
+        of these states: Q = r_o + success * gain. Written by hand, backpropagation
+        takes half of autograd's time.
         """
         *inputs, success_BA = evaluation.activations
         feature_BI = inputs[0]
         by_gain_BA = by_q_BA * success_BA
         gradients: dict[str, Tensor] = {}
         if self.uses_costs:
-            # A multiplier of 1 is one that ReLU clips: there the gradient is 0.
+            # Where ReLU clips the output, the multiplier is 1 and the gradient is 0.
             is_above_1_BA = self._cost(self._online, feature_BI) > LENGTHS_A
             by_price_BA = by_gain_BA * -LENGTHS_A * is_above_1_BA
             gradients |= _layer_gradients("prices", by_price_BA, feature_BI)
-        # Through the sigmoid of the last layer, then from layer to layer.
+        # Back through the sigmoid of the last layer, then through each layer and the
+        # ReLU before it. The input of a layer is the activation of the layer before it.
         by_output = by_gain_BA * (1 - success_BA) * evaluation.gain
         for layer in ("moves", "hidden", "convolution"):
             input_BF = inputs.pop()
             gradients |= _layer_gradients(layer, by_output, input_BF)
             by_input_BF = by_output @ self._online[f"{layer}.weight"]
+            # `by_input_BF` where the input is above 0, else 0.
             by_output = torch.ops.aten.threshold_backward(by_input_BF, input_BF, 0)
         return gradients
 
     def _take_step(self, gradients: Tensors, number: int, learning_rate: float) -> None:
-        """Change θ by Adam; `number` counts the updates, from 1 on."""
+        """Change θ and both moments by Adam; `number` is that of the update, from 1 on.
+
+        `gradients` has a tensor for each tensor of θ, by the same name.
+        """
         names = list(self._online)
         adam(
             params=[self._online[name] for name in names],
@@ -178,6 +200,7 @@ class PropagationLearner:
             exp_avgs=[self._mean[name] for name in names],
             exp_avg_sqs=[self._square[name] for name in names],
             max_exp_avg_sqs=[],
+            # The updates before this one: `adam` counts this one, too.
             state_steps=[torch.tensor(number - 1.0) for _ in names],
             fused=FUSED,
             amsgrad=False,
@@ -201,7 +224,11 @@ class _Evaluation(NamedTuple):
 def _layer_gradients(
     layer: str, by_output: Tensor, input_BF: Tensor
 ) -> dict[str, Tensor]:
-    """Return the gradients by weights and biases, from that by the layer's output."""
+    """Return the gradients by the weights and biases of a layer, by their names.
+
+    `by_output` (B, outputs) is the gradient by the layer's output before its activation
+    function, and `input_BF` (B, inputs) the layer's input.
+    """
     return {
         f"{layer}.weight": by_output.T @ input_BF,
         f"{layer}.bias": by_output.sum(0),
@@ -209,14 +236,20 @@ def _layer_gradients(
 
 
 def _layer(weights: Tensors, name: str, input_BF: Tensor) -> Tensor:
-    """Return the output of a layer before its activation function."""
+    """Return the output of a layer before its activation function: (B, outputs).
+
+    `weights` has the tensors of all layers, ``NAME.weight`` and ``NAME.bias``.
+    """
     return functional.linear(
         input_BF, weights[f"{name}.weight"], weights[f"{name}.bias"]
     )
 
 
 def _activations(weights: Tensors, feature_BI: Tensor) -> list[Tensor]:
-    """Return the features and the output of each layer; the last is p(s, a), (B, 8)."""
+    """Return the features of B cells, and the output of each of three layers for them.
+
+    The last output is p(s, a), (B, 8): the probability that a move succeeds.
+    """
     first_BF = _layer(weights, "convolution", feature_BI).relu()
     second_BF = _layer(weights, "hidden", first_BF).relu()
     success_BA = _layer(weights, "moves", second_BF).sigmoid()
@@ -234,7 +267,7 @@ def value_iteration(
     gamma: float,
     collision: float,
 ) -> tuple[Floats, Floats]:
-    """Iterate V until it settles; return r + γ V(s') and Q(s, a): (S, C, A) each.
+    """Iterate V until it settles, on each of S maps with C cells and A moves.
 
     V(s) = max_a Q(s, a), Q(s, a) = p (r + γ V(s')) + (1 - p) r_o, and V(goal) = 0. Off
     the map V is r_o, which with γ = 1 must be less than the return of any path.
@@ -242,15 +275,22 @@ def value_iteration(
     Parameters
     ----------
     success_SCA
-        p, which is 0 for moves into occupied cells.
+        p, the probability that a move succeeds: 0 for moves into occupied cells.
     reward_SCA
-        r of moves that succeed.
+        r, the reward of a move that succeeds.
     goal_S
         The cell of each map's goal.
     neighbours_AC
-        The cell to which each move leads; C off the map.
+        The cell to which each move leads; C for a move off the map.
     gamma, collision
-        γ and r_o.
+        The discount γ, and the reward r_o of a move that fails.
+
+    Returns
+    -------
+    (S, C, A) float32
+        r + γ V(s') of each move.
+    (S, C, A) float32
+        Q(s, a) of each move.
     """
     maps, cells, _ = success_SCA.shape
     discount = np.float32(gamma)
@@ -261,8 +301,8 @@ def value_iteration(
     # V of the goal is 0, wherever its moves lead to.
     gain_SCA[np.arange(maps), goal_S] = 0.0
     base_SCA[np.arange(maps), goal_S] = 0.0
-    # From below, as if every move collided: values then rise outwards from the goal.
-    value_SC = np.full((maps, cells + 1), r_o)  # the last one is off the map
+    # V begins too low, as if every move collided: then it rises outwards from the goal.
+    value_SC = np.full((maps, cells + 1), r_o)  # the last column is V off the map
     neighbours_CA = np.ascontiguousarray(neighbours_AC.T)
     _settle(
         value_SC,
@@ -278,9 +318,11 @@ def value_iteration(
 def _settle(
     value_SC: Floats, gain_SCA: Floats, base_SCA: Floats, neighbours_CA: Integers
 ) -> None:
-    """Iterate V(s) = max_a base + gain V(s') on each map, in place, until it settles.
+    """Iterate V(s) = max_a (base + gain V(s')) on each map, until it settles.
 
-    `value_SC` has one cell more than the maps, for all that is off the map.
+    `value_SC` (S, C + 1) holds the first V, and is changed to the last one; its last
+    column is V off the map and stays. `gain_SCA` and `base_SCA` are (S, C, A), and
+    `neighbours_CA` (C, A) is the cell s' to which each move leads, C off the map.
     """
     maps, cells, moves = gain_SCA.shape
     for s in range(maps):
@@ -289,9 +331,10 @@ def _settle(
         base = base_SCA[s]
         for sweep in range(cells + 1000):  # values that are not finite never settle
             change = np.float32(0)
-            for turn in range(cells):
-                # To and fro, so that values spread both ways in few sweeps.
-                c = turn if sweep % 2 == 0 else cells - 1 - turn
+            for index in range(cells):
+                # Every other sweep runs from the last cell to the first, so that values
+                # spread both ways in few sweeps.
+                c = index if sweep % 2 == 0 else cells - 1 - index
                 best = base[c, 0] + gain[c, 0] * value[neighbours_CA[c, 0]]
                 for a in range(1, moves):
                     q = base[c, a] + gain[c, a] * value[neighbours_CA[c, a]]

@@ -94,6 +94,7 @@ class RobotTrainer:
         seed: int,
         padding: float = 0.0,
     ) -> None:
+        """Make maps, tables and first weights; the class tells the parameters."""
         motions = _read_motions(motion, turning_radius, resolution, lattice)
         self.network = RobotNetwork.untrained(
             read_footprint(footprint, padding), motions
@@ -106,9 +107,10 @@ class RobotTrainer:
         self.parameters = replace(ROBOT, **counts)
         seeds = np.random.SeedSequence(self.seed).spawn(4)
         map_generator, *generators = [np.random.default_rng(item) for item in seeds]
+        # They draw first poses, actions, and batches.
         self._initial, self._exploration, self._sampling = generators
         side = self.network.swept_by_unit.shape[1]  # of a unit's view, cells
-        self.width = side + FREE_BORDER
+        self.width = side + FREE_BORDER  # of a square map, cells
         self._draw_maps(map_generator)
         self._tabulate_moves(motions)
         self._list_starts()
@@ -127,11 +129,12 @@ class RobotTrainer:
         self._threshold_U = tensors["threshold"]  # the network's own memory
 
     def _draw_maps(self, random: np.random.Generator) -> None:
-        """Draw the goal and the obstacle of each map.
+        """Draw the goal and the obstacle of each of M maps.
 
-        With one obstacle per map, a collision tells which place the body swept.
+        Sets `goal_M`, a pose, and `obstacle_x_M` and `obstacle_y_M`, in cells. With one
+        obstacle per map, a collision tells which place the body swept.
         """
-        cells = self.width**2
+        cells = self.width**2  # of a map
         maps = max(4, min(16, 60_000 // cells))  # fewer, if they are large
         # The first of three cells is not used. Without it, a seed would draw others.
         drawn_M3 = [random.choice(cells, 3, replace=False) for _ in range(maps)]
@@ -140,42 +143,52 @@ class RobotTrainer:
         self.obstacle_y_M, self.obstacle_x_M = np.divmod(obstacle_M, self.width)
 
     def _tabulate_moves(self, motions: Motions) -> None:
-        """Tabulate where each primitive leads from each pose, and its reward."""
+        """Tabulate where each primitive leads from each pose, and its reward.
+
+        Sets `primitive_KN`, the numbers of the primitives that start with each heading,
+        and `next_KC` and `reward_KC`, by the action 0 to K - 1 and the pose.
+        """
         primitives = [
             np.flatnonzero(motions.start == heading) for heading in range(HEADINGS)
         ]
-        count = max(map(len, primitives))
+        count = max(map(len, primitives))  # K
+        # `resize` repeats the primitives of a heading that has fewer than K.
         self.primitive_KN = np.transpose(
             [np.resize(numbers, count) for numbers in primitives]
         )
+        # A pose is (y * width + x) * HEADINGS + heading.
         pose_C = np.arange(self.width**2 * HEADINGS)
         cell_C, heading_C = np.divmod(pose_C, HEADINGS)
         y_C, x_C = np.divmod(cell_C, self.width)
         primitive_KC = self.primitive_KN[:, heading_C]
         dx_KC, dy_KC = np.moveaxis(motions.offset[primitive_KC], 2, 0)  # cells
-        next_x_KC = (x_C + dx_KC) % self.width
+        next_x_KC = (x_C + dx_KC) % self.width  # the map repeats in all directions
         next_y_KC = (y_C + dy_KC) % self.width
         next_cell_KC = next_y_KC * self.width + next_x_KC
         self.next_KC = next_cell_KC * HEADINGS + motions.end[primitive_KC]
         self.reward_KC = -motions.cost[primitive_KC]
 
     def _list_starts(self) -> None:
-        """List the poses in which episodes start: all but the goal."""
+        """Set `_starts`, the poses in which episodes start: all but the goal.
+
+        They are first the poses of map 0, then those of map 1, and so on. Each map has
+        the same number of them.
+        """
         poses = self.width**2 * HEADINGS
         is_start_MC = np.arange(poses) != self.goal_M[:, None]
-        # Those of map 0, then those of map 1, and so on; each map has poses - 1.
         _, self._starts = np.nonzero(is_start_MC)
 
     def _tabulate_places(self, side: int) -> None:
-        """Tabulate in which place of the robot's view, a square, the obstacle lies.
+        """Tabulate in which place of the robot's view the map's obstacle lies.
 
-        The table is indexed by the quarters that the robot has turned, and by how many
-        rows and columns the obstacle lies away. Place side * side is outside the view.
+        The view is a square of `side` x `side` cells around the robot, whose places are
+        numbered row by row; place side * side stands for all cells outside. Sets
+        `_place`, (4, width, width): the place by the quarter turns of the robot, and by
+        the rows and columns from the robot to the obstacle, modulo the map's width.
         """
         view = np.arange(side * side).reshape(side, side)
-        offsets = (
-            np.arange(side) - side // 2
-        )  # negative ones count from the table's end
+        # Rows and columns from the robot; negative ones count from the table's end.
+        offsets = np.arange(side) - side // 2
         self._place = np.full((4, self.width, self.width), side * side)
         for quarter in range(4):
             turned = np.rot90(view, -quarter)
@@ -222,7 +235,10 @@ class RobotTrainer:
         )
 
     def _step(self, robots: int) -> None:
-        """Let as many robots try a random primitive, and add the transitions."""
+        """Let robots try one random primitive each, and remember the transitions.
+
+        `robots` is their number B. Each one starts in a random pose of a random map.
+        """
         p = self.parameters
         maps = len(self.goal_M)
         starts_per_map = len(self._starts) // maps
@@ -238,6 +254,7 @@ class RobotTrainer:
         action = self._exploration.integers(len(self.primitive_KN), size=robots)
         unit_BK, place_B = self._view(scenario, pose)
         unit_B = unit_BK[np.arange(robots), action]
+        # A primitive is legal where its unit does not sweep the obstacle's place.
         legal = ~self._swept_UV[unit_B, place_B]
         next_pose = np.where(legal, self.next_KC[action, pose], pose)
         collision = np.float32(p.obstacle_reward)
@@ -250,67 +267,87 @@ class RobotTrainer:
         self.steps += robots
 
     def _update(self) -> None:
-        """Change weights and thresholds by the Double DQN gradient of a batch."""
+        """Draw a batch of B transitions, and descend along its Double DQN gradient.
+
+        After each `target_interval` updates, Q and V are computed anew.
+        """
         p = self.parameters
         batch = self.replay.sample(p.batch_size, self._sampling)
-        # The states, and after them the next states: 2B.
-        scenario = np.tile(batch.scenario, 2)
-        pose = np.concatenate([batch.cell, batch.next_cell])
-        unit_2BK, place_2B = self._view(scenario, pose)
+        # The B states and after them the B next states, in one evaluation.
+        scenario_2B = np.tile(batch.scenario, 2)
+        pose_2B = np.concatenate([batch.cell, batch.next_cell])
+        unit_2BK, place_2B = self._view(scenario_2B, pose_2B)
         success_2BK = self._success(unit_2BK, place_2B)
-        # Q(s, a) = p (r + γ V(s')) + (1 - p) r_o
-        collision = np.float32(p.obstacle_reward)
-        gain_2BK = self._return_SCK[scenario, pose] - collision
+        # Q(s, a) = r_o + p(s, a) gain, where the gain is r + γ V(s') - r_o.
+        collision = np.float32(p.obstacle_reward)  # r_o
+        gain_2BK = self._return_SCK[scenario_2B, pose_2B] - collision
         q_BK, online_next_BK = np.split(collision + success_2BK * gain_2BK, 2)
         target_next_BK = self._q_SCK[batch.scenario, batch.next_cell]
-        by_q_BK = double_dqn_gradient(
-            batch, q_BK, next_q(p.target, online_next_BK, target_next_BK)
-        )
+        q_of_target = next_q(p.target, online_next_BK, target_next_BK)
+        by_q_BK = double_dqn_gradient(batch, q_BK, q_of_target)
         # By the chain rule: the gradient by the success of each action that was taken,
-        # and by its logit.
-        rows = np.arange(p.batch_size)
-        success_B = success_2BK[rows, batch.action]
-        by_success_B = (by_q_BK * gain_2BK[: p.batch_size])[rows, batch.action]
+        # then by the logit of the success. The first B rows are those of the states.
+        taken = np.arange(p.batch_size), batch.action
+        success_B = success_2BK[taken]
+        by_success_B = by_q_BK[taken] * gain_2BK[taken]
         by_logit_B = by_success_B * (success_B * (1 - success_B))
-        step_B = p.learning_rate * len(self._weight_UV) * by_logit_B
-        # The logit is the threshold of the action's unit minus the weight of the place.
-        unit_B = unit_2BK[rows, batch.action]
-        place_B = place_2B[: p.batch_size]
+        self._descend(unit_2BK[taken], place_2B[: p.batch_size], by_logit_B)
+        self.updates += 1
+        if self.updates % p.target_interval == 0:
+            self._settle()
+
+    def _descend(self, unit_B: Integers, place_B: Integers, by_logit_B: Floats) -> None:
+        """Change weights and thresholds against the gradient of B logits.
+
+        A logit is the threshold of unit `unit_B` minus this unit's weight of the place
+        `place_B`; `by_logit_B` is the gradient of the loss by each logit.
+        """
+        step_B = self.parameters.learning_rate * len(self._weight_UV) * by_logit_B
         # All transitions of a unit move its threshold, and few move a weight: the
         # threshold must not jump.
         np.subtract.at(self._threshold_U, unit_B, THRESHOLD_RATE * step_B)
         np.add.at(self._weight_UV, (unit_B, place_B), step_B)
         self._weight_UV -= np.float32(DECAY)
         np.maximum(self._weight_UV, 0, out=self._weight_UV)
-        self._weight_UV[:, -1] = 0  # outside the view
-        self.updates += 1
-        if self.updates % p.target_interval == 0:
-            self._settle()
+        self._weight_UV[:, -1] = 0  # of obstacles outside the view
 
     def _view(self, scenario: Integers, pose: Integers) -> tuple[Integers, Integers]:
-        """Return the unit of each action (B, K), and the place of the obstacle (B,).
+        """Return what decides on the success of robots in poses (B,) on maps (B,).
 
-        Robots are in poses (B,) on maps (B,). A place is an index of the robot's view.
+        `scenario` has the number of each robot's map.
+
+        Returns
+        -------
+        (B, K) int64
+            The number of the unit of each action.
+        (B,) int64
+            The place in the robot's view where the map's obstacle lies: 0 to V - 1.
         """
         cell, heading = np.divmod(pose, HEADINGS)
         y, x = np.divmod(cell, self.width)
         quarter = heading // (HEADINGS // 4)
+        # From the robot to the obstacle; the map repeats in all directions.
         rows = (self.obstacle_y_M[scenario] - y) % self.width
         columns = (self.obstacle_x_M[scenario] - x) % self.width
         unit_BK = self.network.unit[self.primitive_KN[:, heading]].T
         return unit_BK, self._place[quarter, rows, columns]
 
     def _success(self, unit_BK: Integers, place_B: Integers) -> Floats:
-        """Return p(s, a), (B, K): that the action's unit passes the obstacle."""
+        """Return p(s, a), (B, K): the probability that an action passes the obstacle.
+
+        `unit_BK` is the unit of each action, and `place_B` the obstacle's place in the
+        robot's view.
+        """
         weight_BK = self._weight_UV[unit_BK, place_B[:, None]]
         logit_BK = self._threshold_U[unit_BK] - weight_BK
         success_BK: Floats = 0.5 + 0.5 * np.tanh(0.5 * logit_BK)
         return success_BK
 
     def _settle(self) -> None:
-        """Compute Q and r + γ V(s') of all poses by the present weights.
+        """Compute Q and r + γ V(s') on all maps, by the present weights.
 
-        They stay the same until the next call, as a target network's do.
+        Sets `_q_SCK` and `_return_SCK`, by map, pose and action. They stay the same
+        until the next call, as a target network's do.
         """
         p = self.parameters
         actions, poses = self.next_KC.shape
@@ -319,7 +356,9 @@ class RobotTrainer:
         self._q_SCK = np.empty((maps, poses, actions), np.float32)
         for number in range(maps):  # one after another, as all need much memory
             scenario = np.full(poses, number)
-            success_CK = self._success(*self._view(scenario, np.arange(poses)))
+            unit_CK, place_C = self._view(scenario, np.arange(poses))
+            success_CK = self._success(unit_CK, place_C)
+            # `value_iteration` takes arrays of several maps: here, of one.
             return_1CK, q_1CK = value_iteration(
                 success_CK[None],
                 self.reward_KC.T[None],
@@ -338,7 +377,11 @@ def _read_motions(
     resolution: float,
     lattice: str | Path | None,
 ) -> Motions:
-    """Return the primitives of a kind of motion, or of a lattice file."""
+    """Return the primitives of a kind of motion, or of a lattice file.
+
+    Either `motion` or `lattice` is None. `turning_radius`, in metres, and `resolution`,
+    in metres per cell, are for a kind of motion; a lattice file has its own.
+    """
     if motion is not None and lattice is None:
         return make_motions(motion, turning_radius, resolution)
     if lattice is not None and motion is None:

@@ -38,6 +38,17 @@ class TrainingRun(WorkFolder):
         seed: int,
         trainer_class: type[Trainer] = Trainer,
     ) -> None:
+        """Lock a folder, and begin or continue a training there.
+
+        Parameters
+        ----------
+        folder : path
+            Made if it is missing. If it holds a checkpoint, that training continues.
+        scenarios, parameters, seed
+            As for `Trainer`.
+        trainer_class
+            Makes the trainer.
+        """
         after = f"the training continues and tries again every {SAVE_INTERVAL} steps"
         # A folder with one of the two files belongs to a training.
         super().__init__(folder, (LOCK, CHECKPOINT), "training", "trains", after)
@@ -61,7 +72,8 @@ class TrainingRun(WorkFolder):
         """Train to the last step or until `requests` has "stop"; save at intervals.
 
         A generator: it yields the episodes that ended, as `Trainer.run` does, and the
-        caller may add to `requests` meanwhile.
+        caller may add to `requests` meanwhile. It yields at each multiple of `every`
+        steps at least.
         """
         last_step = self.trainer.parameters.steps
         with _memory_with_remedy():

@@ -59,7 +59,7 @@ class Learned(NamedTuple):
 
 
 class Learner(Protocol):
-    """Updates the network of a trainer, and evaluates it; B = a batch."""
+    """Updates the network of a trainer, and evaluates it."""
 
     def q_values(
         self, scenario: NDArray[np.int64], cell: NDArray[np.int64]
@@ -82,6 +82,16 @@ class Trainer:
     def __init__(
         self, scenarios: Sequence[Scenario], parameters: HyperParameters, seed: int
     ) -> None:
+        """Make a network of random weights, and put all robots at their first cells.
+
+        Parameters
+        ----------
+        scenarios : sequence of Scenario
+            The maps to train on, all of one size, with their starts and goals.
+        parameters : HyperParameters
+        seed : int
+            Of all random draws: 0 to 2^63 - 1.
+        """
         self.scenarios = tuple(listed(scenarios, "the scenarios"))
         self.parameters = parameters
         self.seed = as_seed(seed)
@@ -123,7 +133,7 @@ class Trainer:
         sizes = {name: values[name] for name in network_class.size_names}
         tensors = _initial_tensors(network_class.shapes(sizes), seed)
         network = network_class(sizes, tensors)
-        # A network drops what it takes for noise, which shows only after training.
+        # A network sets small cost weights to 0, which is right after training alone.
         network.tensors = tensors
         return network
 
@@ -141,20 +151,23 @@ class Trainer:
     def run(self, until: int, every: int = 10**9) -> Iterator[list[Episode]]:
         """Train until step `until`: a generator.
 
-        It yields the episodes that have ended since it yielded last, maybe none. It
-        does so often, and at each multiple of `every` steps.
+        After some steps, and at each multiple of `every` steps, it yields the episodes
+        that have ended since the last time: an empty list if none has. Steps count from
+        the beginning of the training.
         """
         while self.steps < until:
             next_multiple = (self.steps // every + 1) * every
-            pause = min(until, next_multiple)
             if self.learner is None:
-                self._play(pause)
+                self._play(min(until, next_multiple))
             else:
                 self._step(self.learner)
             yield self._end_episodes()
 
     def _play(self, last_step: int) -> None:
-        """Make some steps in compiled code, until an episode ends or to `last_step`."""
+        """Make some steps in compiled code, and the updates that fall due.
+
+        They end when an episode ends, or at step `last_step` of the training.
+        """
         counters = Counters(self.steps, self.updates, self.replay.added)
         counters = play(
             self._training, self._exploration, self._sampling, counters, last_step
@@ -162,7 +175,10 @@ class Trainer:
         self.steps, self.updates, self.replay.added = counters
 
     def _step(self, learner: Learner) -> None:
-        """Make a step, and the updates that are due after it."""
+        """Make a step of each robot, and then the updates that fall due.
+
+        `learner` evaluates the network, and updates it.
+        """
         environment = self.environment
         p = self.parameters
         scenario = environment.scenario
@@ -182,10 +198,10 @@ class Trainer:
             discount=np.where(outcome.terminated, 0.0, p.gamma).astype(np.float32),
         )
         self.replay.add(transitions)
-        # An update is due for each multiple of the interval that the steps pass.
-        passed_multiples = self.steps // p.update_interval
+        # An update is due for each multiple of the interval that these steps pass.
+        multiples_before = self.steps // p.update_interval
         self.steps += p.environments
-        updates_due = self.steps // p.update_interval - passed_multiples
+        updates_due = self.steps // p.update_interval - multiples_before
         if self.steps > p.learning_starts:
             for _ in range(updates_due):
                 self.updates += 1
@@ -204,12 +220,12 @@ class Trainer:
         return episodes
 
     def _episode(self, robot: int) -> Episode:
-        """Return the episode of a robot that has just ended."""
+        """Return the episode of robot number `robot`, which has just ended."""
         environment = self.environment
         _, width = environment.shape
         scenario = int(environment.scenario[robot])
         moves = int(environment.steps[robot])
-        numbers = environment.visited[robot, : moves + 1].tolist()
+        numbers = environment.visited[robot, : moves + 1].tolist()  # y * width + x
         if numbers[-1] == environment.goal[scenario]:
             outcome = EpisodeEnd.REACHED_GOAL
         elif environment.terminated[robot]:
@@ -257,10 +273,9 @@ class Trainer:
         return model_bytes(planner.network, planner.metadata)
 
     def _description(self) -> dict[str, Any]:
-        """Return the JSON object of a checkpoint.
+        """Return all of a checkpoint but its arrays, see `arrays`, as a JSON object.
 
-        Its arrays are in `arrays`. The keys are those of the first version, so that
-        old checkpoints load.
+        The keys are those of the first version, so that old checkpoints load.
         """
         environment = self.environment
         paths = [
@@ -279,7 +294,7 @@ class Trainer:
             "scenarios": scenarios,
             # In the order in which `_restore_arrays` reads them.
             "counters": [self.steps, self.updates, self.episodes, self.replay.added],
-            "walked": paths,
+            "walked": paths,  # the cells of each robot's unfinished episode
             "generators": states,
         }
 
@@ -349,7 +364,11 @@ class Trainer:
             raise CheckpointError(f"was made with {changed}; give those values")
 
     def _restore_arrays(self, file: Any, counters: list[int]) -> None:
-        """Set the counters, and read the arrays of an open file of safetensors."""
+        """Set the counters of a checkpoint, and read the arrays of its open file.
+
+        `file` is an open safetensors file, and `counters` are those of `_description`.
+        The arrays are read into the memory of this trainer.
+        """
         # First the counters, as they tell how many transitions there are.
         self.steps, self.updates, self.episodes, self.replay.added = counters
         tensors = self.arrays()
@@ -365,7 +384,10 @@ class Trainer:
             tensor[...] = file.get_tensor(name)
 
     def _restore_episodes(self, saved: dict[str, Any]) -> None:
-        """Restore the paths of unfinished episodes, and the random generators."""
+        """Restore the cells of unfinished episodes, and the random generators.
+
+        `saved` is the `_description` of a checkpoint.
+        """
         paths = zip(self.environment.visited, saved["walked"], strict=True)
         for visited, cells in paths:
             visited[: len(cells)] = cells
@@ -401,7 +423,10 @@ class Trainer:
 def _initial_tensors(
     shapes: Mapping[str, tuple[int, ...]], seed: int
 ) -> dict[str, NDArray[np.float32]]:
-    """Return random weights and biases, drawn as torch draws them for its layers."""
+    """Return random weights and biases by name, drawn as torch draws them for layers.
+
+    `shapes` are those of all tensors, ``LAYER.weight`` and ``LAYER.bias``.
+    """
     generator = torch.Generator().manual_seed(seed)
     tensors = {}
     for name, shape in shapes.items():
