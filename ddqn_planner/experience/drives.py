@@ -94,20 +94,21 @@ class Drive(NamedTuple):
     @property
     def metres(self) -> float:
         """How far the robot drove, without the noise of its poses."""
-        means = averaged(Poses(self.seconds, self.positions), WINDOW).position
-        corners = means[indices_apart(means, STEP)]
+        means = averaged(Poses(self.seconds, self.positions), WINDOW).position  # (M, 2)
+        corners = means[indices_apart(means, STEP)]  # (K, 2), K <= M
         path = np.concatenate([self.positions[:1], corners, self.positions[-1:]])
         dx, dy = np.diff(path, axis=0).T
         return float(np.hypot(dx, dy).sum())
 
     def teach(self, experience: Experience, grid: GridMap | None = None) -> Learned:
-        """Let `experience` learn from this drive; where the robot gave up, moves fail.
+        """Let `experience` learn from this drive, and return what it has learned.
 
-        With a map, `experience` also compares the drive's time with the expected time,
-        and so learns how sure expected times are.
+        If the robot gave up, a failure is learned at its last position. With a map
+        `grid`, the drive's time is also compared with the time expected on this map, so
+        that `experience` learns how sure expected times are.
         """
         if grid is not None:
-            # Times are expected on the last map of `apply`.
+            # `record` compares with the times on the last map of `apply`.
             experience.apply(grid)
         learned = experience.record(self.seconds, self.positions)
         if self.outcome is DriveEnd.ABORTED and learned.is_possible:
@@ -118,14 +119,17 @@ class Drive(NamedTuple):
     def row(self, number: int) -> bytes:
         """Return the row of this drive in ``episodes.csv``.
 
-        `number` counts the drives of the file, from 1.
+        `number` counts the drives of the file, from 1. The row has the number, the
+        outcome, the start time, the seconds and metres of the drive, and its samples as
+        ``seconds:x:y``, with the seconds since the start.
         """
         start = self.seconds[0]
-        elapsed = self.seconds - start
-        rows = np.column_stack([elapsed, self.positions]).tolist()  # (N, 3)
-        samples = " ".join(f"{seconds:.3f}:{x:.3f}:{y:.3f}" for seconds, x, y in rows)
+        elapsed = self.seconds - start  # (N,)
+        table = np.column_stack([elapsed, self.positions])  # (N, 3)
+        samples = [f"{seconds:.3f}:{x:.3f}:{y:.3f}" for seconds, x, y in table.tolist()]
         measures = f"{start:.3f},{elapsed[-1]:.3f},{self.metres:.3f}"
-        return f"{number},{self.outcome.value},{measures},{samples}\r\n".encode()
+        columns = f"{number},{self.outcome.value},{measures},{' '.join(samples)}"
+        return f"{columns}\r\n".encode()
 
 
 def read_drives(path: str | Path) -> Iterator[Drive]:
@@ -152,6 +156,7 @@ class DriveRecorder:
     """
 
     def __init__(self, on_drive: Callable[[Drive], None]) -> None:
+        """Begin without a goal and without a pose; `on_drive` takes each drive."""
         self._on_drive = on_drive
         self.goal: tuple[float, float] | None = None  # x and y, metres
         self.forget()
@@ -169,9 +174,10 @@ class DriveRecorder:
         return self._last.position if self._last is not None else None
 
     def add(self, seconds: float, x: float, y: float) -> None:
-        """Add a pose, which may begin or end a drive.
+        """Add a pose of the robot, which may begin or end a drive.
 
-        A ValueError if its numbers are not finite or too large.
+        `seconds` is the pose's time by any clock, and x and y are metres. A clock that
+        jumps back ends the drive. A ValueError if a number is not finite or too large.
         """
         sample = Sample(seconds, x, y)
         if not all(abs(value) < LATEST for value in sample):  # NaN fails too
@@ -191,9 +197,10 @@ class DriveRecorder:
             self._continue(sample, self._stand)
 
     def _continue(self, sample: Sample, stand: Sample) -> None:
-        """Add a pose to the drive, and end the drive if it is over.
+        """Continue the drive to a pose, and end the drive if it is over.
 
-        `stand` is the first pose from which the robot has not moved since.
+        `sample` is the pose, which is recorded if it is far enough or late enough after
+        the last one. `stand` is the first pose of the time for which the robot stands.
         """
         recorded = self._samples[-1]
         is_far = _distance(recorded, sample) >= SAMPLE_DISTANCE
@@ -217,22 +224,29 @@ class DriveRecorder:
         return math.dist(self.position, self.goal) <= ARRIVAL_DISTANCE
 
     def set_goal(self, x: float, y: float) -> None:
-        """Take a new goal, metres, and end the drive; the same goal changes nothing."""
+        """Take a new goal, x and y in metres, and end the drive to the old goal.
+
+        The same goal again changes nothing.
+        """
         if (x, y) == self.goal:
             return
         self.end(DriveEnd.ARRIVED if self._is_at_goal else DriveEnd.NEW_GOAL)
         self.goal = x, y
 
     def abort(self) -> None:
-        """End the drive because the robot gave up, also before it drove off."""
+        """End the drive because the robot gave up.
+
+        If it has not driven off yet, the drive is its last pose alone.
+        """
         if not self._samples and self._last is not None:
             self._samples.append(self._last)
         self.end(DriveEnd.ABORTED)
 
     def end(self, outcome: DriveEnd = DriveEnd.STOPPED) -> None:
-        """End the drive, if there is one; the next begins when the robot moves.
+        """End the drive, if there is one; the next one begins when the robot moves.
 
-        `on_drive` is called if the robot came SHORTEST far, or gave up.
+        `on_drive` is called with the drive if the robot came SHORTEST metres away from
+        the drive's start, or if the outcome is that it gave up.
         """
         samples = np.array(self._samples).reshape(-1, 3)  # (N, 3): seconds, x, y
         self._samples = []
@@ -272,6 +286,7 @@ class DriveFolder(WorkFolder):
         robot_width: float,
         older: str = "",
     ) -> None:
+        """Lock a folder, and load its experience; the class tells the parameters."""
         consequence = "the recording continues, and saving is tried again"
         super().__init__(folder, [LOCK], "drives", "records", consequence)
         self.record_path = self.folder / RECORD
@@ -294,7 +309,8 @@ class DriveFolder(WorkFolder):
     def _loaded(self, source: str | Path) -> Experience:
         """Load the experience of a file or folder.
 
-        A ValueError if it is that of another kind of robot.
+        `source` is its path. A ValueError if it is the experience of another kind of
+        robot, with another nominal speed or width.
         """
         saved = Experience.load(source)
         options = {
@@ -312,7 +328,8 @@ class DriveFolder(WorkFolder):
     def add(self, drive: Drive, grid: GridMap | None = None) -> Learned:
         """Record a drive, learn from it, and save; return what the drive taught.
 
-        With a map, the drive's time is compared with the expected one: `Drive.teach`.
+        With a map `grid`, the drive's time is also compared with the time expected on
+        this map, see `Drive.teach`.
         """
         self.drives += 1
         self._record.append(drive.row(self.drives))
@@ -342,9 +359,9 @@ class DriveFolder(WorkFolder):
 
 
 def _cut_incomplete_row(path: Path) -> int:
-    """Cut the incomplete last row that a crash left; return the last drive's number.
+    """Cut the incomplete last row that a crash left in an ``episodes.csv``.
 
-    Without a file, or without a drive in the file, the number is 0.
+    Returns the number of the last drive in the file: 0 without a drive or a file.
     """
     content = read_file(path, MAX_RECORD_BYTES) if path.exists() else b""
     complete = content[: content.rfind(b"\n") + 1]

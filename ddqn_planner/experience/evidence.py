@@ -68,28 +68,29 @@ class ErrorRange(NamedTuple):
 
 
 class Evidence:
-    """What was seen at each place. It fades with the time that is driven.
-
-    Parameters
-    ----------
-    nominal_speed : float
-        Metres per second.
-    robot_width : float
-        Metres.
-    half_life : float
-        Seconds of driving, after which evidence counts half.
-    """
+    """What was seen at each place. It fades with the time that is driven."""
 
     def __init__(
         self, nominal_speed: float, robot_width: float, half_life: float
     ) -> None:
+        """Begin without evidence.
+
+        Parameters
+        ----------
+        nominal_speed : float
+            Of the robot in the open, metres per second: slowness is relative to it.
+        robot_width : float
+            Metres; a place is a square half as wide.
+        half_life : float
+            Seconds of driving, after which evidence counts half.
+        """
         self.nominal_speed = nominal_speed
         self.half_life = half_life
         self.side = robot_width / 2  # of a place, metres
         self.forget()
 
     def forget(self) -> None:
-        """Forget all."""
+        """Forget all that was learned: places, errors, the prior and the posterior."""
         self.prior: Prior | None = None  # predicts the slowness of places from the map
         self.driven = 0.0  # seconds
         self.places = Places.none()
@@ -102,11 +103,15 @@ class Evidence:
         self._fit()
 
     def _fit(self) -> None:
-        """Fit the distribution of slowness to what was seen at all places."""
+        """Set `population`, the distribution of slowness over all places."""
         self.population = population_of(self.places)
 
     def add(self, visits: Visits) -> None:
-        """Learn from a drive."""
+        """Learn from a drive: its V visits of places and its W waits.
+
+        If the drive differs from what was seen before, older evidence hardly counts any
+        more. All evidence fades by the time that the drive took.
+        """
         self._add_error(visits)
         slowness = visits.seconds / visits.metres * self.nominal_speed  # (V,)
         log = np.log(np.clip(slowness, 1 / MAX_SLOWNESS, MAX_SLOWNESS))  # (V,)
@@ -137,7 +142,8 @@ class Evidence:
             The row in `places` of each visit, and its log slowness.
         """
         places = self.places
-        # Only passages from the first wait on tell how long a wait is.
+        # A visit is a passage only near a place where a robot has waited before: so the
+        # seconds waited, over the passages, are the mean wait.
         position_of_waits = places.position[places.waited > 0]  # (P, 2)
         away = visits.position[:, None] - position_of_waits  # (V, P, 2)
         distance = np.hypot(away[..., 0], away[..., 1])  # (V, P): metres
@@ -157,28 +163,30 @@ class Evidence:
         """
         places = self.places
         places.passages[rows_of_waits] = np.maximum(places.passages[rows_of_waits], 1)
-        excess = np.maximum(places.passages / MOST_PASSAGES, 1)
-        # Both become less by the same factor: the mean wait stays.
+        excess = np.maximum(places.passages / MOST_PASSAGES, 1)  # 1: not too many
+        # Both sums are divided by the same factor, so that the mean wait stays.
         places.passages /= excess
         places.waited /= excess
 
     def _surprises_of(self, rows: Int64, log: Float64) -> list[float]:
-        """Return by how much the parts of a drive differ from what was seen before.
+        """Return by how much each part of a drive differs from what was seen before.
 
-        A part has about PLACES_OF_PART visits of known places, one after another. The
-        difference of its mean log slowness is in standard deviations.
+        A part has about PLACES_OF_PART visits of known places, one after another. Its
+        surprise is the mean difference of the log slowness, in standard deviations.
 
         Parameters
         ----------
         rows, log : (V,) int64, (V,) float64
-            The row in `places` of each visit, and its log slowness.
+            The row in `places` of each visit of the drive, and its log slowness.
         """
         weight = self.places.weight[rows]  # (V,)
         visits = np.flatnonzero(weight >= KNOWN_WEIGHT)  # (K,): those of known places
         known_rows = rows[visits]
         known_weight = weight[visits]
-        difference = log[visits] - self.places.sum_of_log[known_rows] / known_weight
-        # Of each difference, in NOISE: of this visit, and of the mean of those before.
+        # (K,): the mean log slowness that was seen before at each of these places.
+        mean_log = self.places.sum_of_log[known_rows] / known_weight
+        difference = log[visits] - mean_log
+        # (K,): the variance of the difference over NOISE, that of one visit.
         variance = 1 + 1 / known_weight
         part_count = max(1, len(visits) // PLACES_OF_PART)
         surprises = []
@@ -192,8 +200,8 @@ class Evidence:
         return surprises
 
     def _usual_surprise(self) -> float:
-        """Return up to which surprise nothing has changed, in standard deviations."""
-        # What is often slower in one direction has not changed.
+        """Return the largest surprise that is no change, in standard deviations."""
+        # Where the times of drives differ more than usual, so may those of places.
         error_range = self.error_range()
         excess = max((error_range.high - error_range.low) / USUAL_RANGE, 1)
         surprises = [*self.surprises, *[1.0] * ASSUMED_DRIVES]
@@ -201,9 +209,10 @@ class Evidence:
         return max(SURPRISE * excess, UNUSUAL * large_surprise)
 
     def _find_or_add_rows(self, position: Float64) -> Int64:
-        """Return the row in `places` of each position, and add places that are new.
+        """Return the row in `places` of each position: (N,) int64.
 
-        `position` is (N, 2), metres; the rows are (N,).
+        `position` is (N, 2), x and y in metres. Places that are new are added, with
+        sums of 0 and the log slowness that the prior predicts for them.
         """
         squares = np.floor(position / self.side).astype(np.int64)
         rows = np.empty(len(squares), np.int64)
@@ -222,10 +231,10 @@ class Evidence:
         return rows
 
     def _add_error(self, visits: Visits) -> None:
-        """Append the error of the time expected for a drive to `errors`.
+        """Append to `errors` by how much a drive's time differs from the expected time.
 
-        The time is expected on the last map; without a map, or on a drive mostly off
-        the map, nothing is appended. See `ErrorRange`.
+        The error is that of `ErrorRange`. The time is expected on the last map; without
+        a map, or on a drive mostly off the map, nothing is appended.
         """
         posterior = self.posterior
         if posterior is None:
@@ -245,7 +254,7 @@ class Evidence:
 
     def error_range(self) -> ErrorRange:
         """Return the range of errors of the last drives and ASSUMED_DRIVES more."""
-        # Evenly over a little more than the 90 % of a normal distribution.
+        # Errors that lie evenly over a little more than 90 % of a normal distribution.
         assumed = NORMAL * np.linspace(-1.05, 1.05, ASSUMED_DRIVES)
         errors = np.concatenate([self.errors, assumed])
         low, high = np.quantile(errors, (TAIL, 1 - TAIL)).tolist()
@@ -278,7 +287,7 @@ class Evidence:
         shift = _level_of(self.prior) - _level_of(other.prior)
         count_before = len(self.places)
         rows = self._find_or_add_rows(other.places.position)  # of each place of `other`
-        # All rows differ, as a place of one evidence is a place of the other.
+        # No row is there twice, as both divide the world into the same squares.
         places = self.places
         places.weight[rows] += other.places.weight
         places.sum_of_log[rows] += other.places.sum_of_log
@@ -294,9 +303,9 @@ class Evidence:
     def use_prior(self, prior: Prior | None) -> None:
         """Predict with another prior, or with none.
 
-        The level of a prior is the mean log slowness of places, which these places have
-        taught it. So that it does not count twice, their predictions move by the
-        difference of both levels.
+        The level of a prior is the mean log slowness of the places that have taught it.
+        The predictions stored for known places move by the difference of both levels,
+        so that a level which these places have taught does not count twice.
         """
         self.places.predicted += _level_of(prior) - _level_of(self.prior)
         self.prior = prior

@@ -123,7 +123,12 @@ class Experience:
         half_life: float = 36_000.0,
         max_pause: float = 90.0,
     ) -> None:
-        """Begin without evidence; the class tells what the options hold."""
+        """Begin without evidence.
+
+        `nominal_speed` is in metres per second, `robot_width` in metres. Evidence
+        counts half after `half_life` seconds of driving; a stand of more than
+        `max_pause` seconds is no wait on the way. The class tells more.
+        """
         self.nominal_speed = _as_option("nominal_speed", nominal_speed)
         self.robot_width = _as_option("robot_width", robot_width)
         self.half_life = _as_option("half_life", half_life)
@@ -138,11 +143,11 @@ class Experience:
 
     @property
     def options(self) -> dict[str, float]:
-        """The parameters by their names."""
+        """The parameters of `__init__` by their names, in the order of OPTIONS."""
         return {name: getattr(self, name) for name in OPTIONS}
 
     def forget(self) -> None:
-        """Forget all."""
+        """Forget all that was learned."""
         self._learn(Evidence.forget)
 
     def record(self, seconds: ArrayLike, positions: ArrayLike) -> Learned:
@@ -151,9 +156,9 @@ class Experience:
         Parameters
         ----------
         seconds : (N,) array
-            The time of each pose, of any clock.
+            The time of each pose, by any clock.
         positions : (N, 2) array
-            In metres, in the frame of the map.
+            The x and y of each pose: metres, in the frame of the map.
 
         Returns
         -------
@@ -195,7 +200,10 @@ class Experience:
         return Learned(places, visits.total_seconds)
 
     def _why_nothing(self, poses: Poses, count: int) -> str:
-        """Return why `poses`, the possible ones of `count` poses, taught nothing."""
+        """Return in words why a drive taught nothing, and what to do.
+
+        `poses` are those of its `count` poses that can be true.
+        """
         if len(poses.time) < 2:
             return (
                 f"{len(poses.time)} of {count} poses are possible and differ in their "
@@ -220,10 +228,10 @@ class Experience:
         return f"the robot comes no farther than {extent:.2g} m; give a longer drive"
 
     def _wrong_speed(self, speed: float, words: str, nominal: str) -> str:
-        """Return why a drive at `speed`, metres per second, teaches nothing.
+        """Return in words why a drive at `speed`, metres per second, taught nothing.
 
-        `words` stand before the speed. The nominal speed should be greater or less:
-        `nominal`.
+        `words` stand before the speed: "at", or "at most at". `nominal` says how the
+        nominal speed should be: "greater" or "less".
         """
         return (
             f"the robot moves {words} {speed:.3g} m/s; give metres and seconds, or a "
@@ -248,7 +256,11 @@ class Experience:
         self._learn(partial(Evidence.add, visits=visits))
 
     def _learn(self, change: Callable[[Evidence], None]) -> None:
-        """Change the evidence, and remember the change for the next `save`."""
+        """Change the evidence, and remember the change for the next `save`.
+
+        `change` is a function that changes evidence. If another process has saved to
+        the same file meanwhile, `save` applies the change to what that process saved.
+        """
         change(self.evidence)
         if self._saved_path is not None:
             self._unsaved.append(change)
@@ -327,20 +339,21 @@ class Experience:
         share = as_number("exploration", exploration, 0, 10, "0 to 10")
         population = self.evidence.population
         posterior = self.evidence.posterior_over(grid)
-        # The log slowness of the fastest place, in steps: fields have to be made anew
-        # when it changes.
+        # The log slowness of the fastest place, 0 or less, rounded to steps: all fields
+        # have to be made anew when it changes.
         steps = math.floor(population.fastest_log / FAST_STEP + 0.5)
         fastest = FAST_STEP * min(0, steps)
         expected = self._timed(grid, posterior, "expected", 0.0, fastest)
         if not share:
             return expected
-        # (P,): one standard deviation of the log slowness of each place.
-        deviation = math.sqrt(population.variance) * posterior.unknown
+        # The bold map: each of P places is faster by one standard deviation of its log
+        # slowness. The largest deviation is rounded up to steps.
+        deviation = math.sqrt(population.variance) * posterior.unknown  # (P,)
         largest_deviation = deviation.max(initial=0)
         largest = FAST_STEP * math.ceil(largest_deviation / FAST_STEP)
         bold = self._timed(grid, posterior, "bold", deviation, fastest - largest)
-        # Where no place counts as faster by more than the share, no plan is expected to
-        # take longer than the best plan by more than the share.
+        # The safe map: no place is faster by more than the share. So no plan on it is
+        # expected to take longer than the best plan by more than the share.
         limit = math.log(1 + share)
         limited = np.minimum(deviation, limit)
         safe = self._timed(grid, posterior, "safe", limited, fastest - limit)
@@ -354,11 +367,21 @@ class Experience:
         optimism: Float64 | float,
         fastest: float,
     ) -> GridMap:
-        """Return the map with the expected times of moves.
+        """Return the map with expected times: slowness, and seconds per cell.
 
-        The map has the slowness over that of the fastest place, and the seconds per
-        cell of the fastest place. The last three parameters are those of
-        `Posterior.paint`.
+        The slowness (H, W) is that of each cell over that of the fastest place, whose
+        time for a cell is the seconds per cell.
+
+        Parameters
+        ----------
+        grid, posterior : GridMap, Posterior
+            The map, and the posterior of its P places.
+        name : str
+            A name of the layer, under which `posterior` keeps its array.
+        optimism : (P,) float64, or float
+            The logarithm by which each place is assumed to be faster than expected.
+        fastest : float
+            The log slowness of the fastest place, after optimism.
         """
         slowness = posterior.paint(name, optimism, fastest)
         seconds = grid.resolution / self.nominal_speed * math.exp(fastest)
@@ -400,16 +423,20 @@ class Experience:
         corners = cells_inside(cells, grid.occupancy.shape)
         if len(corners) < 2:
             return ExpectedTime(0.0, 0.0, 0.0)
-        path, position = cells_along(corners)  # (N, 2), and (N,) in segments
+        # The N cells along the path, (N, 2), and their positions on it, (N,): 2.5 is
+        # the middle of the third segment between two of the K corners.
+        path, position = cells_along(corners)
         dx, dy = np.diff(corners, axis=0).T
-        metres_of_segments = np.hypot(dx, dy) * grid.resolution
+        metres_of_segment = np.hypot(dx, dy) * grid.resolution  # (K - 1,)
+        # (N - 1,), for the moves from each cell to the next one.
         segment = position[:-1].astype(np.int64)
-        metres = np.diff(position) * metres_of_segments[segment]  # (N - 1,)
+        metres = np.diff(position) * metres_of_segment[segment]
         x, y = path.T
         places = posterior.place[y, x]  # (N,)
-        slowness = posterior.slowness[places]
-        mean_slowness = (slowness[1:] + slowness[:-1]) / 2  # (N - 1,): of each move
+        slowness = posterior.slowness[places]  # (N,)
+        mean_slowness = (slowness[1:] + slowness[:-1]) / 2
         seconds_of_moves = metres / self.nominal_speed * mean_slowness
+        # Of the logarithm of the path's time.
         deviation = posterior.deviation_of(seconds_of_moves, places[1:])
         errors = np.array(self.evidence.error_range())  # (3,): low, mean, high
         seconds = float(seconds_of_moves.sum())
@@ -438,7 +465,12 @@ class Experience:
         self._unsaved = []
 
     def _join_content_of(self, path: Path) -> None:
-        """Change the evidence to that of a file, and what is new in this experience."""
+        """Join what others have saved to a file with what this experience has learned.
+
+        The evidence becomes that of the file, and then learns what is new in this
+        experience: all that it learned since it was saved to this file or loaded from
+        it, or all evidence if the file is another.
+        """
         checksum = crc32(read_file(path, MAX_FILE_BYTES))
         is_own_file = path == self._saved_path
         if is_own_file and checksum == self._saved_checksum:
@@ -547,9 +579,10 @@ def _as_option(name: str, value: Any) -> float:
 
 
 def _possible(time: Float64, position: Float64) -> Poses:
-    """Return the possible poses, without those that repeat the time of the last one.
+    """Return the poses that can be true, without poses at the time of the pose before.
 
-    `time` is (N,), in seconds, and `position` (N, 2), in metres.
+    `time` is (N,), in seconds, and `position` (N, 2), in metres. Poses that are not
+    finite, or too late or too far away, cannot be true.
     """
     # Comparisons with NaN are false.
     is_time = np.abs(time) < LATEST
@@ -562,7 +595,7 @@ def _possible(time: Float64, position: Float64) -> Poses:
 
 
 def _arrays_in(data: bytes) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a file by name; nothing is unpickled."""
+    """Return the arrays in the bytes of an .npz file, by name; nothing is unpickled."""
     with np.lib.npyio.NpzFile(io.BytesIO(data)) as file:
         # A small file can claim arrays of any size.
         size = sum(entry.file_size for entry in file.zip.infolist())

@@ -43,7 +43,10 @@ class Places:
     def table(self) -> Float64:
         """Return the places as the rows of a table, (N, 7), which files hold.
 
-        The last two columns are x and y of the position; the class tells the others.
+        The columns: weight, the sum of the weights of all visits; the sum of their log
+        slowness, times their weights; the weight of passages since a robot first waited
+        near; the seconds waited; the log slowness that the prior predicted before the
+        first visit; and x and y of the first visit, in metres.
         """
         columns = (
             self.weight,
@@ -61,7 +64,8 @@ class Places:
     def append(self, predicted: Float64, position: Float64) -> None:
         """Add M places that were not seen yet, with sums of 0.
 
-        `predicted` (M,) and `position` (M, 2) are as the attributes.
+        `predicted` (M,) is the log slowness that the prior predicts, and `position`
+        (M, 2) x and y of the first visit, in metres.
         """
         nothing = np.zeros(len(predicted))
         self.weight = np.append(self.weight, nothing)
@@ -72,7 +76,7 @@ class Places:
         self.position = np.concatenate([self.position, position])
 
     def fade(self, share: float) -> None:
-        """Multiply all sums with a share, 0 to 1."""
+        """Multiply all sums of what was seen with `share`, 0 to 1."""
         self.weight *= share
         self.sum_of_log *= share
         self.passages *= share

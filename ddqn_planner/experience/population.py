@@ -51,16 +51,20 @@ class Population(NamedTuple):
 
 
 def population_of(places: Places) -> Population:
-    """Fit the distribution of the log slowness to places."""
+    """Return the distribution of the log slowness, fitted to places.
+
+    `places` has sums of what was seen at N places: the level, the weight of the prior
+    and the variance are fitted to the M places that were visited.
+    """
     has_visits = places.weight >= SMALLEST_WEIGHT
     weight = places.weight[has_visits]  # (M,), as the following arrays
     mean_log = places.sum_of_log[has_visits] / weight
     noise = NOISE / weight  # the variance of each mean
-    # (M, 2): what the level and the weight of the prior are multiplied with.
+    # (M, 2): the log slowness is about `design @ (level, prior_weight)`.
     design = np.column_stack([np.ones(len(weight)), places.predicted[has_visits]])
 
     variance = VARIANCE
-    count = len(weight) / ALIKE_PLACES
+    count = len(weight) / ALIKE_PLACES  # the number of places that are not alike
     for _ in range(ITERATIONS):
         level, prior_weight = _regression(mean_log, design, variance + noise)
         residual = mean_log - design @ (level, prior_weight)
@@ -70,7 +74,8 @@ def population_of(places: Places) -> Population:
         mean_square = total / (ASSUMED_PLACES + count)
         variance = float(np.clip(mean_square, LEAST_VARIANCE, MOST_VARIANCE))
 
-    # Where the log is normal, the log of the mean is half of the variance above it.
+    # The log of the mean of a lognormal is half of the variance above the mean of the
+    # log. The surplus counts less while few places were visited.
     surplus = (variance + NOISE) / 2 * len(weight) / (FEW_PLACES + len(weight))
     known_log = mean_log[weight >= KNOWN_WEIGHT]
     open_log = 0.0
@@ -91,12 +96,12 @@ def _regression(
     Parameters
     ----------
     log, variances : (M,) float64
-        The log slowness of places, and its variances.
+        The log slowness of each place, and its variance.
     design : (M, 2) float64
-        Ones, and the prediction of the prior.
+        Ones, and the log slowness that the prior predicts for each place.
     """
-    # (2, M): with the inverse variance of each place, of which ALIKE_PLACES tell as
-    # much as one place alone.
+    # (2, M): the design times the inverse variance of each place. ALIKE_PLACES places
+    # tell as much as one place alone.
     weighted = design.T / variances / ALIKE_PLACES
     inverse_variances = INVERSE_VARIANCE_OF_LEVEL, INVERSE_VARIANCE_OF_PRIOR_WEIGHT
     covariance = np.linalg.inv(np.diag(inverse_variances) + weighted @ design)  # (2, 2)

@@ -89,6 +89,10 @@ class Posterior:
     """
 
     def __init__(self, grid: GridMap, side: float, nominal_speed: float) -> None:
+        """Divide a map into places and link neighbours; `update` solves the field.
+
+        `side` is that of a place, in metres, and `nominal_speed` in metres per second.
+        """
         from scipy.ndimage import distance_transform_edt
 
         self.grid = grid
@@ -99,14 +103,15 @@ class Posterior:
         self.place = _places_of(grid, block)
         self._middle_cells = _middle_cells_of(self.place, block)
         # Each cell's place, and that of the nearest free cell for an occupied one.
-        cells_away, (y, x) = distance_transform_edt(
+        cells_away, (y, x) = distance_transform_edt(  # (H, W) each
             self.place == NO_PLACE, return_indices=True
         )
         is_near = cells_away <= 1.5 * block
         self._nearest_place = np.where(is_near, self.place[y, x], NO_PLACE)  # (H, W)
-        count = len(self._middle_cells)
+        count = len(self._middle_cells)  # P
         self._links = _links_of(self.place, block, count)
-        self._strength_of_links: Float64 = self._links.sum(axis=1)  # (P,): of all
+        # (P,): the sum over the links of each place.
+        self._strength_of_links: Float64 = self._links.sum(axis=1)
         # (P, 2), the solutions of two systems of equations: the log slowness that was
         # seen beyond the expected one, and the share that is known.
         self._solution = np.zeros((count, 2))
@@ -122,22 +127,25 @@ class Posterior:
         seconds, places : (N,) float64, (N,) int64
             The expected seconds of each part of the path, and the number of its place.
         """
+        # The mean over the time of the path: 0 if all is known, 1 if nothing.
         unknown = float(seconds @ self.unknown[places] / seconds.sum())
         return math.hypot(DRIVE_NOISE, UNKNOWN_NOISE * unknown)
 
     def places_at(self, position: Float64) -> Int64:
-        """Return the place of each position (N, 2): the nearest one.
+        """Return the number of the nearest place to each position: (N,).
 
-        It is NO_PLACE off the map, and where no place is within 1.5 sides of a place.
+        `position` is (N, 2), x and y in metres in the frame of the map. The number is
+        NO_PLACE off the map, and where no place is within 1.5 sides of a place.
         """
         cells, is_inside = cells_of(position, self.grid)
         x, y = cells.T
         return np.where(is_inside, self._nearest_place[y, x], NO_PLACE)
 
     def predicted_at(self, position: Float64) -> Float64:
-        """Return the log slowness that the prior predicts at each position, (N, 2).
+        """Return the log slowness that the prior predicts at each position: (N,).
 
-        It is 0 without a prior, and off the map.
+        `position` is (N, 2), x and y in metres. Without a prior, and off the map, the
+        prediction is 0.
         """
         # NO_PLACE is the index of the last value.
         predicted = np.append(self._predicted, 0.0)
@@ -172,7 +180,7 @@ class Posterior:
             self.slowness += self.nominal_speed * waits
 
     def _predict(self, prior: Prior | None) -> None:
-        """Predict the log slowness of each place, if the prior is another."""
+        """Set the log slowness that a prior predicts, unless it is the last prior."""
         if prior is self._prior:
             return
         self._prior = prior
@@ -183,20 +191,22 @@ class Posterior:
             self._predicted[:] = prior.log_slowness(map_features(self.grid)[y, x])
 
     def _sums_of(self, places: Places) -> SumsOnMap:
-        """Return, for each place of the map, the sums of what was seen there.
+        """Return, for each of the map's P places, the sums of what was seen there.
 
-        `places` are squares of the world's frame. The places of the map are blocks of
-        cells, of the same size, that lie otherwise: each place of the world counts for
-        the place of the map that has its centre.
+        `places` are N squares of the world, aligned with the axes of its frame. The
+        map's places are blocks of cells of the same size, from the map's corner on. A
+        square's sums count for the place of the map that is nearest to the square's
+        first visit; those of squares off the map are left out.
         """
-        place_on_map = self.places_at(places.position)
-        is_on_map = place_on_map != NO_PLACE
-        place_on_map = place_on_map[is_on_map]
+        nearest_place = self.places_at(places.position)  # (N,)
+        is_on_map = nearest_place != NO_PLACE
+        place_of_square = nearest_place[is_on_map]  # (M,)
+        count = len(self._middle_cells)  # P
 
         def summed(values: Float64) -> Float64:
-            count = len(self._middle_cells)
-            sums = np.bincount(place_on_map, values[is_on_map], count)
-            # Without any place, the sums are integers.
+            """Return the sums (P,) of the values (N,) of squares."""
+            sums = np.bincount(place_of_square, values[is_on_map], count)
+            # Without any square on the map, the sums are integers.
             return sums.astype(np.float64)
 
         return SumsOnMap(
@@ -207,7 +217,11 @@ class Posterior:
         )
 
     def _solve(self, sums: SumsOnMap, expected: Float64, variance: float) -> None:
-        """Solve the equations of the field, beginning with the last solution.
+        """Solve the equations of the Gaussian Markov random field over the P places.
+
+        Changes `_solution` (P, 2) from the last solution to the new one. Its first
+        column is the log slowness that was seen beyond the expected one, and its second
+        column the share that is known: 0 far from visits, near 1 after many.
 
         Parameters
         ----------
@@ -216,21 +230,25 @@ class Posterior:
         expected : (P,) float64
             The log slowness of each place that is expected without any visit.
         variance : float
-            Of the log slowness of places.
+            The variance of the log slowness of places.
         """
-        # A lattice whose links have strength 1 has about the variance ln(32 / kappa) /
-        # 4 pi; 1 is added for cells of many metres, where that would be negative.
+        # Neighbours are linked with the strength 1, and each place is drawn to 0 with
+        # the strength kappa. On such a lattice the values have about the variance
+        # ln(32 / kappa) / 4 pi; for large kappa, where that would be negative, 1 is
+        # added to the argument.
         kappa = (self._spacing / CORRELATION) ** 2
         variance_of_lattice = math.log1p(32 / kappa) / (4 * math.pi)
+        # Each visit draws its place to the log slowness that was seen, with the
+        # strength `scale`: so the field has the given variance, and a visit has NOISE.
         scale = variance / variance_of_lattice / NOISE
-        visits = scale * sums.weight  # (P,), as the following arrays
+        visits = scale * sums.weight  # (P,): the strength of all visits of each place
         # Half of the noise is added, as the mean of its exponential is more than 1.
-        seen = scale * (sums.sum_of_log + sums.weight * NOISE / 2)
+        seen = scale * (sums.sum_of_log + sums.weight * NOISE / 2)  # (P,)
         right = np.column_stack([seen - visits * expected, visits])  # (P, 2)
-        # The equations map the same error everywhere to its product with `kappa +
-        # visits`, and greater errors to greater residuals: residuals up to that product
-        # prove that no error is greater.
-        largest_residual = ACCURACY * (kappa + visits)
+        # If the solution is off by the same error everywhere, the residuals are that
+        # error times `kappa + visits`, and they are larger for larger errors. So
+        # residuals up to this product prove that no place is off by more than ACCURACY.
+        largest_residual = ACCURACY * (kappa + visits)  # (P,)
         equations = Equations(
             first_link=self._links.indptr,
             neighbour=self._links.indices,
@@ -244,20 +262,22 @@ class Posterior:
         """Return the seconds that a robot waits per metre through each place: (P,).
 
         They are the seconds waited around the place, over the metres driven around it.
-        So each path through costs what a passage did, also beside the place where
-        robots stood.
+        So a path that passes beside the place where robots stood has the same wait.
 
         Parameters
         ----------
-        passages, waited : (P,) float64
-            How often a robot passed each place, and how many seconds it waited there.
+        passages : (P,) float64
+            How often robots passed each place; a passage is a side of a place long.
+        waited : (P,) float64
+            The seconds that robots waited at each place, in all passages.
         """
         reach = round(2 * self.side / self._spacing)  # links
         seconds_around = self._mean_around(waited, reach)
         passages_around = self._mean_around(passages, reach)
         waits = seconds_around / (passages_around + WAIT_PLACES) / self.side
-        # Robots wait where nobody drove, too. But one place of waits says nothing of
-        # others, so the surroundings of the longest wait do not count.
+        # Robots wait in unknown places, too: they wait there for the mean of known
+        # places. One place of long waits says nothing of other places, so the
+        # surroundings of the longest wait do not count.
         is_longest_wait = np.zeros(len(waits))
         is_longest_wait[waited.argmax()] = 1
         is_elsewhere = self._mean_around(is_longest_wait, 2 * reach) == 0
@@ -267,26 +287,28 @@ class Posterior:
         return waits + waits_in_unknown
 
     def _mean_around(self, values: Float64, reach: int) -> Float64:
-        """Return weighted means of the values (P,) of places, for each place.
+        """Return for each place a weighted mean of the values around it: (P,).
 
-        They are over the places up to `reach` links away, none behind a wall. A place
-        in the open has four links.
+        `values` (P,) are those of places. The mean is over the places up to `reach`
+        links away, of which none is behind a wall.
         """
+        # Each round takes the mean of a place and its neighbours: four in the open.
         for _ in range(reach):
             sum_of_neighbours: Float64 = self._links @ values
             values = (values + sum_of_neighbours) / 5
         return values
 
     def paint(self, name: str, optimism: Float64 | float, fastest: float) -> Float32:
-        """Return (H, W) float32: the slowness over that of the fastest place.
+        """Return the slowness of each cell over that of the fastest place.
 
-        The array is the same as before while no value changes, so that fields need no
-        repair.
+        (H, W) float32: 1 to MAX_SLOWNESS, in steps of 2 %, and 1 in occupied cells.
+        While no value changes, the array is the very object of the last call, so that
+        fields need no repair.
 
         Parameters
         ----------
         name : str
-            Of the layer, under which the array is kept for the next call.
+            A name for the layer, under which the array is kept for the next call.
         optimism : (P,) float64, or float
             The logarithm by which each place is assumed to be faster than expected.
         fastest : float
@@ -295,7 +317,7 @@ class Posterior:
         log = np.log(self.slowness) - optimism - fastest  # (P,)
         possible_log = np.clip(log, 0, math.log(MAX_SLOWNESS))
         steps = np.rint(possible_log / math.log(1 + STEP)).astype(np.int64)
-        values = STEPS[steps]
+        values = STEPS[steps]  # (P,)
         painted = self._painted.get(name)
         if painted is None or not np.array_equal(values, painted.values):
             painted = Painted(values, self.to_cells(values, 1))
@@ -303,9 +325,10 @@ class Posterior:
         return painted.layer
 
     def to_cells(self, values: Float32, occupied: float) -> Float32:
-        """Return the value of each cell's place, `occupied` for occupied cells: (H, W).
+        """Return the value of each cell: (H, W) float32.
 
-        `values` are those of places, (P,).
+        A free cell has that of its place, from the `values` (P,), and an occupied cell
+        the value `occupied`.
         """
         # NO_PLACE is the index of the last value.
         values_with_occupied = np.append(values, np.float32(occupied))
@@ -319,8 +342,8 @@ def _places_of(grid: GridMap, block: int) -> Int64:
     """
     from scipy.ndimage import label
 
-    # A copy of the map with an occupied row and column after each block, so that no
-    # part connects two blocks.
+    # In a copy of the map, an occupied row and column follow each block, so that no
+    # connected part has cells of two blocks.
     height, width = grid.occupancy.shape
     row = np.arange(height)
     column = np.arange(width)
@@ -337,7 +360,7 @@ def _places_of(grid: GridMap, block: int) -> Int64:
 
 
 def _middle_cells_of(place: Int64, block: int) -> Int64:
-    """Return the cell of each place that is nearest to the middle of its block.
+    """Return for each place its cell that is nearest to the middle of its block.
 
     Parameters
     ----------
@@ -382,7 +405,7 @@ def _links_of(place: Int64, block: int, count: int) -> Any:
     are_free = (first != NO_PLACE) & (second != NO_PLACE)
     is_link = are_free & (first != second)
     strength = np.full(np.count_nonzero(is_link), 1 / block)
-    # The strengths of the same two places are added up.
+    # `csr_array` adds up the strengths of the same pair of places.
     links = csr_array(
         (strength, (first[is_link], second[is_link])), shape=(count, count)
     )
@@ -393,13 +416,13 @@ def _links_of(place: Int64, block: int, count: int) -> Any:
 def _relax(equations: Equations, residual: Float64, solution: Float64) -> None:
     """Solve two systems of equations by relaxation: one place after another.
 
-    It ends when no residual is above the tolerance of its place.
+    The function ends when no place has residuals above its tolerance.
 
     Parameters
     ----------
     equations : Equations
-        The equations (diagonal - links) x = right of P places. Both systems have them,
-        with different right sides.
+        The equations (diagonal - links) x = right of P places. Both systems have these
+        left sides, with different right sides.
     residual : (P, 2) float64
         The right side of each system. It is changed to the residuals, which are the
         right sides less the left sides.
@@ -422,6 +445,7 @@ def _relax(equations: Equations, residual: Float64, solution: Float64) -> None:
     while not is_solved:
         is_solved = True
         for place in range(count):
+            # Of the residuals of both systems.
             square = residual[place, 0] ** 2 + residual[place, 1] ** 2
             is_off = square > equations.tolerance[place]
             if not is_off:

@@ -43,11 +43,13 @@ def map_features(grid: GridMap) -> Float32:
     beside_wall = np.exp(-metres_to_wall / 0.25)
     near_wall = np.exp(-metres_to_wall / 0.75)
 
+    # (H, W): the free metres around each cell in its row, and in its column.
     width_of_rows = _free_widths(occupied, grid.resolution)
     width_of_columns = _free_widths(occupied.T, grid.resolution).T
     # A robot drives through a passage in the direction that is free for longer.
     width = np.minimum(width_of_rows, width_of_columns)
     length = np.maximum(width_of_rows, width_of_columns)
+    # Smooth steps: 1 where the passage is much narrower, 0 where it is much wider.
     is_narrow = [
         1 / (1 + np.exp(STEEPNESS * (width / narrow - 1))) for narrow in NARROW
     ]
@@ -71,7 +73,7 @@ def _free_widths(occupied: Occupancy, resolution: float) -> Float32:
     wall_or_right_edge = np.where(occupied, column, width)
     from_right = wall_or_right_edge[:, ::-1]
     next_wall = np.minimum.accumulate(from_right, axis=1)[:, ::-1]
-    # Both walls of an occupied cell are this cell.
+    # The last and the next wall of an occupied cell are the cell itself.
     cells = np.maximum(next_wall - last_wall - 1, 0).astype(np.float32)
     metres = cells * np.float32(resolution)
     return np.asarray(np.minimum(metres, 2 * REACH))
@@ -97,7 +99,10 @@ class Prior(NamedTuple):
     replay: Float32
 
     def log_slowness(self, features: Float32) -> Float32:
-        """Return the expected log slowness (...,) of places with features (..., F)."""
+        """Return the log slowness (...,) predicted for places with features (..., F).
+
+        The features are those of `map_features`.
+        """
         deviations = (features - self.mean) / self.scale
         x = np.clip(deviations, -UNUSUAL, UNUSUAL)
         hidden_1 = np.tanh(x @ self.weights_1 + self.bias_1)

@@ -141,7 +141,10 @@ def _divided_into_drives(path: Path, name: str, samples: Sequence[Sample]) -> Re
 
 
 def _check_on_map(path: Path, drives: Sequence[Drive], grid: GridMap) -> None:
-    """Raise a ValueError if no pose of any drive lies on a free cell."""
+    """Raise a ValueError if no pose of any drive lies on a free cell of the map.
+
+    `path` is that of the recording, for the words of the error.
+    """
     positions = np.concatenate([drive.positions for drive in drives])  # (N, 2)
     cells, is_inside = cells_of(positions, grid)
     x, y = cells.T
@@ -262,10 +265,10 @@ def read_mcap(
 def _robots_of(
     samples_of_source: Mapping[PoseSource, list[Sample]], best: PoseSource
 ) -> list[str]:
-    """Return the names of the sources that seem to be of different robots.
+    """Return the names of one source for each robot, sorted.
 
-    The first robot is that of the source `best`. A source whose poses lie elsewhere at
-    the same times is of another robot.
+    One robot is that of the source `best`. A source whose poses lie elsewhere at the
+    same times is of another robot. Sources that differ in `dated_by` alone are one.
     """
     robots = {best._replace(dated_by="")}
     for source, samples in samples_of_source.items():
@@ -277,8 +280,8 @@ def _robots_of(
 def _are_apart(samples: Sequence[Sample], reference: Sequence[Sample]) -> bool:
     """Return whether samples are those of another robot than the reference samples.
 
-    They are if most lie more than DISTANCE_OF_ROBOTS from where the reference robot was
-    at the same time. Too few samples are of no robot.
+    They are if most of them lie more than DISTANCE_OF_ROBOTS from where the reference
+    robot was at the same time. Too few samples are not taken for a robot's.
     """
     if len(samples) < SMALLEST_SHARE * len(reference):
         return False
@@ -291,13 +294,14 @@ def _are_apart(samples: Sequence[Sample], reference: Sequence[Sample]) -> bool:
 
 
 class _Bag:
-    """The poses of robots in the files of a bag.
-
-    `frame` is that of the map. `robot_frame` is that of the robot, or empty for any
-    frame that ends in ``base_link``, and for topics of poses.
-    """
+    """The poses of robots in the files of a bag."""
 
     def __init__(self, frame: str, robot_frame: str) -> None:
+        """Begin without poses.
+
+        `frame` is that of the map. `robot_frame` is that of the robot, or empty for any
+        frame that ends in ``base_link``, and for topics of poses.
+        """
         self.frame = frame
         self.robot_frame = robot_frame
         self.samples_of_source: dict[PoseSource, list[Sample]] = defaultdict(list)
@@ -331,11 +335,11 @@ class _Bag:
                 ) from error
 
     def _add(self, message_type: str, topic: str, message: Any) -> None:
-        """Add the poses of a message; one of another type is left out."""
+        """Add the poses of a message; a message of another type is left out."""
         if message_type in POSE_TYPES:
             self._add_pose(topic, message)
         elif message_type == TRANSFORM_TYPE:
-            # Static transforms belong to the tree of the topic beside them.
+            # Transforms on "tf_static" belong to the tree of the topic "tf".
             self._add_transforms(topic.removesuffix("_static"), message.transforms)
 
     def _add_pose(self, topic: str, message: Any) -> None:
@@ -352,9 +356,9 @@ class _Bag:
     def _add_transforms(self, topic: str, transforms: Sequence[Any]) -> None:
         """Add TransformStamped messages to the tree of `topic`, and poses of robots.
 
-        Each transform between a robot and the map frame gives a pose of the robot, at
-        the time of the transform. The poses by one transform are a source of their own:
-        see `PoseSource.dated_by`.
+        A transform on the chain from a robot's frame to the map frame gives a pose of
+        the robot, at the time of the transform. The poses by the transforms of one
+        frame are a source of their own: see `PoseSource.dated_by`.
         """
         tree = self._trees[topic]
         for message in transforms:
@@ -383,14 +387,14 @@ class _Bag:
 
 
 def _seconds(stamped: Any) -> float:
-    """Return the time of a stamped message."""
+    """Return the time of a stamped message in seconds."""
     return float(stamped.header.stamp.sec + stamped.header.stamp.nanosec / 1e9)
 
 
 def _planar(stamped: Any) -> Transform | None:
-    """Return a TransformStamped message in the plane.
+    """Return the transform of a TransformStamped message, in the plane.
 
-    None if its quaternion is no rotation, as tf2 leaves such a transform out.
+    None if its quaternion is no rotation: tf2 leaves such a transform out, too.
     """
     shift = stamped.transform.translation
     quaternion = stamped.transform.rotation

@@ -74,7 +74,7 @@ class Visits(NamedTuple):
 
     @classmethod
     def of_wait(cls, x: float, y: float, seconds: float) -> Visits:
-        """Return one wait, and no place that was driven."""
+        """Return a wait of some seconds at x and y, in metres, and no driven place."""
         waits = SecondsAt(np.array([[x, y]]), np.array([seconds]))
         return cls(np.zeros((0, 2)), np.zeros(0), np.zeros(0), waits)
 
@@ -104,15 +104,18 @@ def visits_of(poses: Poses, side: float, limits: Limits) -> Visits:
     steps_of_parts = []
     waits_of_parts = []
     for part in _believed_parts(poses, limits):
-        means = averaged(part, limits.window)
-        # The indices of the means at which the robot came to another spot. It may stand
-        # at the first and the last spot: that is no wait on the way.
+        means = averaged(part, limits.window)  # M mean poses
+        # A spot is a mean pose that lies STAND_DISTANCE from the spot before it. The
+        # robot may stand at its first pose and at the last spot: that is no wait on the
+        # way. So the first spot is left out, and no stand at the last one is computed.
         spots = np.array(indices_apart(means.position, STAND_DISTANCE), np.int64)[1:]
         if not len(spots):
             continue
+        # (S - 1,) for S spots: the seconds from each spot to the next one, standing at
+        # the spot and then driving.
         stood = _seconds_stood(means.time, spots, limits.speed)
-        driving = np.diff(means.time[spots]) - stood
-        steps_of_parts.append(_steps_along(means.position[spots], driving, step_length))
+        driven = np.diff(means.time[spots]) - stood
+        steps_of_parts.append(_steps_along(means.position[spots], driven, step_length))
         next_position = means.position[spots[1:]]
         is_wait = (stood > 0) & (stood <= limits.max_pause)
         waits_of_parts.append(SecondsAt(next_position[is_wait], stood[is_wait]))
@@ -147,25 +150,34 @@ def _seconds_stood(time: Float64, spots: Int64, speed: float) -> Float64:
 def _visits_of_steps(
     steps: SecondsAt, step_length: float, side: float, waits: SecondsAt
 ) -> Visits:
-    """Join the steps of a drive that lie one after another in the same place.
+    """Return the visits of a drive: steps in a row that lie in the same place are one.
 
     Parameters
     ----------
     steps : SecondsAt
-        The middle of each of N steps, and the seconds that it took.
-    step_length, side : float
-        Of each step, and of a place; metres.
+        The middle of each of N steps along the drive, and the seconds that it took.
+    step_length : float
+        The length of each step, metres.
+    side : float
+        The side of a place, which is a square; metres.
     waits : SecondsAt
-        Of the same drive.
+        The waits of the drive, which the result holds unchanged.
     """
-    squares = np.floor(steps.position / side)  # (N, 2)
-    is_entered = (np.diff(squares, axis=0, prepend=np.nan) != 0).any(axis=1)
-    first_steps = np.flatnonzero(is_entered)  # (V,): the first step of each visit
-    step_count = np.diff(first_steps, append=len(squares))  # (V,)
-    rows = np.column_stack([steps.position, steps.seconds])  # (N, 3)
-    sums = np.add.reduceat(rows, first_steps)  # (V, 3)
-    mean_position = sums[:, :2] / step_count[:, None]
-    return Visits(mean_position, sums[:, 2], step_length * step_count, waits)
+    place = np.floor(steps.position / side)  # (N, 2): x and y of each place, in sides
+    # A visit begins where a step lies in another place than the step before it. NaN
+    # differs from all: the first step begins a visit, too.
+    is_first = (np.diff(place, axis=0, prepend=np.nan) != 0).any(axis=1)  # (N,)
+    first_steps = np.flatnonzero(is_first)  # (V,): the first step of each visit
+    step_count = np.diff(first_steps, append=len(place))  # (V,)
+    # (N, 3): x, y and the seconds of each step; (V, 3): their sums over each visit.
+    rows = np.column_stack([steps.position, steps.seconds])
+    sums = np.add.reduceat(rows, first_steps)
+    return Visits(
+        position=sums[:, :2] / step_count[:, None],
+        seconds=sums[:, 2],
+        metres=step_length * step_count,
+        waits=waits,
+    )
 
 
 def speeds_of(poses: Poses, window: float) -> Float64:
@@ -185,74 +197,84 @@ def speeds_of(poses: Poses, window: float) -> Float64:
 def window_of(poses: Poses, speed: float) -> float:
     """Return over how many seconds to average poses: longer if they have more noise.
 
-    `speed` is what the robot usually drives, in metres per second.
+    `speed` is the robot's usual speed, in metres per second.
     """
+    # The second differences of the positions: mostly noise, as a robot turns slowly.
     bend_x, bend_y = np.diff(poses.position, 2, axis=0).T
     bends = np.hypot(bend_x, bend_y)
     if not len(bends):
         return WINDOW / speed
     noise = float(np.median(bends)) / BEND_OF_NOISE  # metres
-    # The mean of so many poses has a noise of AVERAGED_NOISE.
+    # The mean of `pose_count` poses has a noise of AVERAGED_NOISE.
     pose_count = (noise / AVERAGED_NOISE) ** 2
     period = float(np.median(np.abs(np.diff(poses.time))))  # seconds between poses
-    metres = pose_count * period * speed
+    metres = pose_count * period * speed  # that the robot drives during these poses
     return min(max(metres, WINDOW), LONGEST_WINDOW) / speed
 
 
 def averaged(poses: Poses, window: float) -> Poses:
-    """Return the mean time and position of the poses in each window of time.
+    """Return M mean poses of N poses: one for each window of time that has poses.
 
-    Otherwise pose noise would count as distance. `window` is in seconds; a window
-    without poses has no mean.
+    A mean pose is the mean time and the mean position of the poses in the window. The
+    windows of `window` seconds begin at the first pose. Without averaging, pose noise
+    would count as distance.
     """
-    # (N,): the number of each pose's window
+    # (N,): the number of each pose's window.
     window_number = np.floor((poses.time - poses.time[:1]) / window)
-    # (M,): the first pose in each window
+    # (M,): the first pose in each window. NaN differs from all: the first pose is one.
     first_poses = np.flatnonzero(np.diff(window_number, prepend=np.nan) != 0)
     pose_count = np.diff(first_poses, append=len(poses.time))  # (M,)
-    samples = np.column_stack([poses.time, poses.position])  # (N, 3)
-    means = np.add.reduceat(samples, first_poses) / pose_count[:, None]  # (M, 3)
-    return Poses(means[:, 0], means[:, 1:])
+    # (N, 3): the time, x and y of each pose; (M, 3): their means in each window.
+    rows = np.column_stack([poses.time, poses.position])
+    means = np.add.reduceat(rows, first_poses) / pose_count[:, None]
+    return Poses(time=means[:, 0], position=means[:, 1:])
 
 
 def indices_apart(position: Float64, metres: float) -> list[int]:
-    """Return indices of positions, (N, 2), that lie at least so many `metres` apart.
+    """Choose positions of a path that lie apart, and return their indices.
 
-    The first index is 0. Each further index is that of the next position that is far
-    enough from the position chosen before.
+    `position` is (N, 2), x and y in metres, N >= 1. The first position is chosen, and
+    then each position that is `metres` or more away from the one chosen last.
     """
     points = position.tolist()
-    indices = [0]
+    chosen = [0]  # indices in `points`
     for index, point in enumerate(points):
-        if math.dist(point, points[indices[-1]]) >= metres:
-            indices.append(index)
-    return indices
+        last_chosen = points[chosen[-1]]
+        if math.dist(point, last_chosen) >= metres:
+            chosen.append(index)
+    return chosen
 
 
 def _believed_parts(poses: Poses, limits: Limits) -> Iterator[Poses]:
-    """Yield the parts of a drive between jumps of the pose and breaks of the clock.
+    """Divide the N poses of a drive into parts, and yield the parts to be believed.
 
-    A part is left out if the robot cannot have driven to its first pose from the last
-    pose of the part that was yielded before.
+    A drive is cut where the pose jumps or the clock pauses or goes back. A part is left
+    out if it has one pose, or if the robot cannot have driven to its first pose from
+    the last pose of the last part that was believed; for the first part, from the first
+    pose of the drive.
     """
     time, position = poses
-    elapsed = np.diff(time)  # (N - 1,)
-    dx, dy = np.diff(position, axis=0).T
+    elapsed = np.diff(time)  # (N - 1,): seconds from each pose to the next one
+    dx, dy = np.diff(position, axis=0).T  # metres
     is_jump = np.hypot(dx, dy) > limits.max_speed * elapsed + CORRECTION
-    is_break = (elapsed <= 0) | (elapsed > limits.max_pause) | is_jump
-    first_poses = np.flatnonzero(is_break) + 1  # of all parts but the first
-    last_believed = 0  # the index of a pose
-    for start, end in pairwise([0, *first_poses.tolist(), len(time)]):
-        pause = min(max(time[start] - time[last_believed], 0), MEMORY)
-        reach = limits.max_speed * pause + RELOCATION  # metres
+    is_pause = elapsed > limits.max_pause
+    is_cut = is_jump | is_pause | (elapsed <= 0)
+    first_poses = np.flatnonzero(is_cut) + 1  # of all parts but the first
+    bounds = [0, *first_poses.tolist(), len(time)]
+    last_believed = 0  # the index of the last pose that was believed
+    for start, end in pairwise(bounds):
+        # The longest time for which the robot may have driven on without being seen.
+        unseen = min(max(time[start] - time[last_believed], 0), MEMORY)  # seconds
+        reach = limits.max_speed * unseen + RELOCATION  # metres
         distance = math.dist(position[start], position[last_believed])
-        if end - start > 1 and distance <= reach:
+        has_several_poses = end - start > 1
+        if has_several_poses and distance <= reach:
             last_believed = end - 1
             yield Poses(time[start:end], position[start:end])
 
 
 def _steps_along(path: Float64, seconds: Float64, step_length: float) -> SecondsAt:
-    """Divide a path into steps of one length; a shorter rest at its end is left out.
+    """Divide a path into N steps of one length; a shorter rest at its end is left out.
 
     Parameters
     ----------
@@ -266,17 +288,18 @@ def _steps_along(path: Float64, seconds: Float64, step_length: float) -> Seconds
     Returns
     -------
     SecondsAt
-        The middle of each of N steps, and its driving time.
+        The middle of each step, and its driving time.
     """
     dx, dy = np.diff(path, axis=0).T
-    # (P,): from the beginning of the path to each corner
+    # (P,): from the beginning of the path to each corner.
     metres_to_corner = np.cumsum(np.append(0, np.hypot(dx, dy)))
     seconds_to_corner = np.cumsum(np.append(0, seconds))
-    # (N + 1,): from the beginning of the path to the ends of all steps
-    metres_to_end = np.arange(0, metres_to_corner[-1], step_length)
-    seconds_to_end = np.interp(metres_to_end, metres_to_corner, seconds_to_corner)
-    x = np.interp(metres_to_end, metres_to_corner, path[:, 0])
-    y = np.interp(metres_to_end, metres_to_corner, path[:, 1])
-    ends = np.column_stack([x, y])
-    middle = (ends[1:] + ends[:-1]) / 2
-    return SecondsAt(middle, np.diff(seconds_to_end))
+    # (N + 1,): from the beginning of the path to each point between two steps. The
+    # first point is the beginning of the path.
+    metres_to_point = np.arange(0, metres_to_corner[-1], step_length)
+    seconds_to_point = np.interp(metres_to_point, metres_to_corner, seconds_to_corner)
+    x = np.interp(metres_to_point, metres_to_corner, path[:, 0])
+    y = np.interp(metres_to_point, metres_to_corner, path[:, 1])
+    points = np.column_stack([x, y])
+    middle = (points[1:] + points[:-1]) / 2
+    return SecondsAt(middle, np.diff(seconds_to_point))
