@@ -47,8 +47,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def exit_code(program: str, run: Callable[[], int]) -> int:
     """Run a program, and return its exit code.
 
-    After an error of its input it is 2, and a line names the error; after Ctrl-C it is
-    130.
+    `run` returns the exit code of the program named `program`. If its input is wrong,
+    the code is 2 and a line on stderr tells the error; after Ctrl-C it is 130.
     """
     try:
         return unless_cut_off(run)
@@ -61,7 +61,10 @@ def exit_code(program: str, run: Callable[[], int]) -> int:
 
 
 def _run_command(arguments: Sequence[str]) -> int:
-    """Run the command that the first argument names; return its exit code."""
+    """Run the command that the first argument names; return its exit code.
+
+    Without such a command, the help or an error is printed and the process exits.
+    """
     parser = argparse.ArgumentParser(
         prog="ddqn-planner", description=str(__doc__).replace("`", "")
     )

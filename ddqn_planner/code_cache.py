@@ -53,14 +53,18 @@ class CodeFiles:
     """
 
     def __init__(self, folder: Path, base: str, source_stamp: object) -> None:
+        """Name the files in `folder`; none is read or written yet."""
         self._folder = folder
         self._base = base
         self._index = folder / f"{base}.nbi"
         self._state = (numba.__version__, source_stamp)
-        self.last_read = self._index
+        self.last_read = self._index  # the path of the file that was read last
 
     def load(self, key: object) -> Any:
-        """Return the data that was saved for a key, or None if there is none."""
+        """Return the data that was saved for a key, or None without any.
+
+        A key is a signature of the function. An error is raised if a file is damaged.
+        """
         name = self._read_index().get(key)
         if name is None:
             return None
@@ -94,7 +98,7 @@ class CodeFiles:
         return name
 
     def flush(self) -> None:
-        """Empty the index; numba calls it to drop all code."""
+        """Write an index without entries; numba calls this to drop all code."""
         write_checked(self._index, (self._state, {}))
 
     def remove_last_read(self) -> None:
@@ -124,13 +128,18 @@ class CheckedCache(FunctionCache):
     """Numba's cache of the code of one function; after an error it compiles again."""
 
     def __init__(self, function: Any) -> None:
+        """Find the files of a Python function; an error if no folder is writable."""
         super().__init__(function)  # type: ignore[no-untyped-call]
         stamp = self._impl.locator.get_source_stamp()
         self._files = CodeFiles(Path(self.cache_path), self._impl.filename_base, stamp)
         self._cache_file = self._files  # type: ignore[assignment]
 
     def load_overload(self, signature: Any, target: Any) -> Any:
-        """Return the code for a signature, or None; a damaged file is removed."""
+        """Return the code for a signature, or None if it must be compiled.
+
+        `target` is numba's context of the compilation. A damaged file is removed, with
+        a warning.
+        """
         llvm_was_used.set()
         try:
             return super().load_overload(signature, target)  # type: ignore[no-untyped-call]
@@ -147,7 +156,7 @@ class CheckedCache(FunctionCache):
         return None
 
     def save_overload(self, signature: Any, result: Any) -> None:
-        """Save the code for a signature; a warning if that is impossible."""
+        """Save the compiled code `result` for a signature; else log a warning."""
         llvm_was_used.set()
         try:
             super().save_overload(signature, result)  # type: ignore[no-untyped-call]
@@ -173,7 +182,10 @@ class Messages(Listener):
         self._has_warned = False
 
     def on_start(self, event: Any) -> None:
-        """Announce a compilation. Numba has no such event for code that it loads."""
+        """Announce the first compilation of a function of this package.
+
+        Numba calls this when it compiles a function, but not when it loads code.
+        """
         dispatcher = event.data["dispatcher"]
         is_ours = str(dispatcher.py_func.__module__).startswith("ddqn_planner.")
         if self._has_announced or not is_ours:
@@ -195,7 +207,8 @@ class Messages(Listener):
     def warn(self, problem: str) -> None:
         """Log a problem: the first as a warning, later ones for debugging only.
 
-        A power cut may damage the files of all functions.
+        So there are few messages, even if a power cut has damaged the files of all
+        functions.
         """
         level = logging.DEBUG if self._has_warned else logging.WARNING
         self._has_warned = self._has_announced = True

@@ -23,6 +23,7 @@ def compiled(function: Function, **options: Any) -> Function:
 
     @cache
     def dispatcher() -> Any:
+        """Return numba's object for the function, made at the first call."""
         # Numba knows its own objects alone: the globals become those of its objects.
         scope = dict(function.__globals__)
         for name in global_names(function.__code__):
@@ -57,6 +58,7 @@ def compiled(function: Function, **options: Any) -> Function:
 
     @wraps(function)
     def call(*arguments: Any) -> Any:
+        """Call the compiled function."""
         return dispatcher()(*arguments)
 
     call.dispatcher = dispatcher  # type: ignore[attr-defined]
@@ -69,10 +71,11 @@ def in_place(function: Function) -> Function:
 
 
 def inner(function: Function, **options: Any) -> Function:
-    """Compile a function for Python, and another time for compiled functions to call.
+    """Compile a function twice: for Python, and for compiled functions that call it.
 
-    The latter has no entry for Python, which is most of the code if parameters are
-    tuples of many arrays: so its callers compile sooner.
+    The second version has no entry for Python. That entry is most of the code if the
+    parameters are tuples of many arrays, and without it the callers compile sooner.
+    `options` are those of `compiled`.
     """
     with_entry = compiled(function, **options)
     without = compiled(function, no_cpython_wrapper=True, **options)
@@ -81,9 +84,9 @@ def inner(function: Function, **options: Any) -> Function:
 
 
 def inlined(function: Function) -> Function:
-    """Compile a function into the functions that call it, which must be `in_place`.
+    """Compile a function into the compiled functions that call it.
 
-    Python calls it as it is, not compiled.
+    The callers must be `in_place`. Where Python calls the function, it is not compiled.
     """
     options = {"_nrt": False, "forceinline": True, "no_cpython_wrapper": True}
     function.dispatcher = compiled(function, **options).dispatcher  # type: ignore[attr-defined]

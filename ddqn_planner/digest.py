@@ -13,8 +13,8 @@ MISSING = object()  # in place of the value of an attribute that does not exist
 def digest_of(function: FunctionType, options: Mapping[str, object]) -> str:
     """Return 16 hexadecimal digits for a function and the options of its compilation.
 
-    They depend on its code, and on all globals that it reads: constants, and functions
-    with their own code and globals.
+    They depend on the function's code, and on all globals that it reads: constants, and
+    functions with their own code and globals.
     """
     description = repr((_Describer().describe(function), sorted(options.items())))
     return hashlib.sha256(description.encode()).hexdigest()[:16]
@@ -23,7 +23,7 @@ def digest_of(function: FunctionType, options: Mapping[str, object]) -> str:
 def global_names(code: CodeType) -> set[str]:
     """Return the names of globals and attributes that code uses.
 
-    Those of the functions that are defined in the code are among them.
+    The names that functions within the code use are among them.
     """
     names = set(code.co_names)
     for constant in code.co_consts:
@@ -40,13 +40,14 @@ class _Describer:
     """
 
     def __init__(self) -> None:
+        """Begin without any described function."""
         # The functions that have been described: functions may call each other.
         self._functions: set[FunctionType] = set()
 
     def describe(self, value: Any, names: frozenset[str] = frozenset()) -> object:
-        """Return the type of a value, and what the value is.
+        """Return a description of a value: the name of its type, and its content.
 
-        Of a module or a class, the attributes in `names` are described.
+        The content of a module or a class are its attributes with names in `names`.
         """
         kind = _name_of(type(value))
         match value:
@@ -71,7 +72,10 @@ class _Describer:
         return kind, repr(value)
 
     def _attributes(self, owner: Any, names: frozenset[str]) -> Iterator[object]:
-        """Yield name and description of the attributes that a module or class has."""
+        """Yield the names and descriptions of attributes of a module or class `owner`.
+
+        They are the attributes with names in `names` that `owner` has.
+        """
         for name in sorted(names):
             # Not by `getattr` of a module, which may import another one.
             if isinstance(owner, ModuleType):
@@ -91,11 +95,11 @@ class _Describer:
     def _function(self, function: FunctionType) -> object:
         """Describe a function with its defaults and all globals that it reads."""
         if function in self._functions:
-            return function.__qualname__
+            return function.__qualname__  # described before: a call in a circle ends
         self._functions.add(function)
         names = frozenset(global_names(function.__code__))
         scope = function.__globals__
-        constants = [
+        used_globals = [
             (name, self.describe(scope[name], names))
             for name in sorted(names & scope.keys())
         ]
@@ -107,7 +111,7 @@ class _Describer:
         closure = function.__closure__ or ()
         enclosed = [self.describe(cell.cell_contents) for cell in closure]
         code = self._code(function.__code__)
-        return function.__qualname__, code, constants, defaults, enclosed
+        return function.__qualname__, code, used_globals, defaults, enclosed
 
 
 def _name_of(value: Any) -> str:

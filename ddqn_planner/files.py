@@ -45,6 +45,7 @@ class FileWriteError(OSError):
     """A file cannot be written; `strerror` says why."""
 
     def __init__(self, path: Path, error: OSError) -> None:
+        """Say what `error`, raised when `path` was written, means and what to do."""
         reason = error.strerror or str(error)
         remedy = "give another path, or allow writing there"
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
@@ -68,7 +69,7 @@ def kind_of(path: str | Path) -> str:
 
 
 def _kind(mode: int) -> str:
-    """Return what a mode of `os.stat` stands for; "" for a regular file."""
+    """Return the kind of file that a mode of `os.stat` means, "" if it is regular."""
     return "" if stat.S_ISREG(mode) else KINDS.get(stat.S_IFMT(mode), "no file")
 
 
@@ -77,8 +78,8 @@ def open_regular(path: Path, limit: float = math.inf) -> BinaryIO:
     kind = kind_of(path)
     if kind:  # to open a device may change it
         raise ValueError(f"{path} is {kind}; give a regular file")
-    # The path may be a pipe's by now. To open it without O_NONBLOCK would wait for
-    # its writer.
+    # A named pipe may have taken the file's place since. With O_NONBLOCK, opening a
+    # pipe does not wait for a process that writes into it.
     file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
     try:
         status = os.fstat(file.fileno())
@@ -107,7 +108,10 @@ def read_file(path: Path, limit: int) -> bytes:
 
 
 def read_rows(path: Path) -> Iterator[bytes]:
-    """Yield the rows of a file with their line ends; a very long row in pieces."""
+    """Yield the rows of a file with their line ends.
+
+    A row of more than MAX_ROW_BYTES comes in several pieces.
+    """
     with open_regular(path, MAX_RECORD_BYTES) as file:
         while row := file.readline(MAX_ROW_BYTES):
             yield row
@@ -160,12 +164,17 @@ def as_path(path: Any, name: str = "path") -> Path:
         raise ValueError(
             f"{problem}, with a variable that nothing has replaced; {remedy}"
         )
-    # Path leaves out "./", with which a name that begins with ~ is no home folder.
-    return Path(text).absolute() if str(Path(text)).startswith("~") else Path(text)
+    # `Path` drops a leading "./". A name that still begins with ~ is that of a file: as
+    # an absolute path, nothing takes it for a home folder.
+    plain = Path(text)
+    return plain.absolute() if str(plain).startswith("~") else plain
 
 
 def _check_name(text: str, problem: str) -> None:
-    """Raise a ValueError that begins with `problem` if no file can have this path."""
+    """Raise a ValueError if no file can have the path `text`.
+
+    The error's text begins with `problem`.
+    """
     if not text.strip():
         raise ValueError(f"{problem}; give a path")
     if "\0" in text:
@@ -182,10 +191,14 @@ def _check_name(text: str, problem: str) -> None:
 
 
 def _with_home(text: str, problem: str) -> str:
-    """Return a path that begins with ~ or ~user with the home folder in its place."""
+    """Return a path that begins with ~ or ~user, with the home folder in that place.
+
+    Where a file or folder has the name that begins with ~, the result is ``./`` and the
+    path. A ValueError that begins with `problem` if no home folder is known.
+    """
     first, slash, path_in_home = text.partition("/")
     user = first.removeprefix("~")
-    if user and os.path.lexists(first):  # a name, as that of an editor's copy
+    if user and os.path.lexists(first):  # as the copy of a file by an editor
         return os.path.join(os.curdir, text)
     home = _home_of(user)
     if not home:
@@ -258,7 +271,8 @@ def check_distinct(
 ) -> None:
     """Raise a ValueError if an output is one file with another output or an input.
 
-    Both map the names that an error uses to files, or to None for no file.
+    Both map the names that an error gives to files to their paths, or to None where no
+    file was given.
     """
     files = {name: path for name, path in inputs.items() if path is not None}
     for option, path in outputs.items():
@@ -273,7 +287,7 @@ def check_distinct(
 
 
 def _is_same(path: Path, other: Path) -> bool:
-    """Return if two paths lead to one file, which need not exist."""
+    """Return whether two paths lead to the same file, which need not exist."""
     if os.path.realpath(path) == os.path.realpath(other):
         return True
     try:
@@ -310,9 +324,10 @@ def write_csv(
 
 
 def differences(saved: Mapping[str, object], present: Mapping[str, object]) -> str:
-    """Return, in words for an error, which saved values are not the present ones.
+    """Return, in words for an error, which saved values differ from the present ones.
 
-    Only the names in `present` count. "" if all their values are the same.
+    Both map names to values. Only the names in `present` are compared; the text is
+    empty if all their values are the same.
     """
     return ", ".join(
         f"{name} {saved[name]} (now {value})"
@@ -329,6 +344,8 @@ class WorkFolder(ExitStack):
 
     Parameters
     ----------
+    folder
+        Its path.
     marks
         Names of files that only such a folder contains. The first is the lock.
     content
@@ -347,6 +364,7 @@ class WorkFolder(ExitStack):
         works: str,
         after: str = "",
     ) -> None:
+        """Make the folder if it is missing, check what it holds, and lock it."""
         folder = as_path(folder, "the folder")
         folder.mkdir(parents=True, exist_ok=True)
         names = sorted(path.name for path in folder.iterdir())
@@ -375,7 +393,7 @@ class WorkFolder(ExitStack):
 
     @contextmanager
     def opening(self) -> Iterator[None]:
-        """Close what is open, and unlock the folder, if the block fails."""
+        """Run a block; if it fails, close all files of this object, also the lock."""
         try:
             yield
         except BaseException:
@@ -400,13 +418,18 @@ class Appender:
     """Appends records to a file; while the disk is full, they wait in memory."""
 
     def __init__(self, path: Path) -> None:
+        """Open the file at `path`, or make it; `close` closes it."""
         # Unbuffered: readers see every record, also after a crash.
         self._file = open_to_append(path)
         self._pending = bytearray()  # the bytes that are not in the file yet
         self.close = self._file.close
 
     def append(self, record: bytes) -> None:
-        """Append a record, now or with a later one; `flush` tells why it waits."""
+        """Append a record to the file, or keep it until a later record can be written.
+
+        No error is raised; `flush` raises that for which records wait. While records of
+        MAX_PENDING_BYTES wait, further records are lost.
+        """
         if len(self._pending) < MAX_PENDING_BYTES:
             self._pending += record
         with suppress(OSError):
@@ -415,5 +438,5 @@ class Appender:
     def flush(self) -> None:
         """Write the records that wait; an OSError if that fails."""
         while self._pending:
-            written_count = self._file.write(self._pending)  # maybe a part
+            written_count = self._file.write(self._pending)  # bytes, maybe not all
             del self._pending[:written_count]

@@ -19,11 +19,11 @@ llvm_was_used = threading.Event()
 
 
 def reuse_small_arrays() -> None:
-    """Let glibc reuse the memory of arrays up to 16 MB.
+    """Let glibc keep the memory of freed arrays of up to 16 MB for new arrays.
 
-    That of larger arrays is returned to the system at once. New pages would cost small
-    fields a third of their time. If the pages of large arrays were kept, the memory
-    would grow.
+    Memory of larger arrays is returned to the system at once, as keeping it would make
+    the process grow. With new pages from the system each time, small fields would take
+    half as long again.
     """
     with suppress(AttributeError):  # another C library
         mallopt = ctypes.CDLL(None).mallopt
@@ -47,10 +47,11 @@ def give_back() -> None:
 
 
 def unwritten_mappings(file: str) -> Iterator[tuple[int, int]]:
-    """Yield first address and end of the unchanged mappings of a file.
+    """Yield the first address and the end of each unchanged mapping of a file.
 
-    The end of the file's path is `file`. Changed pages would be lost by MADV_DONTNEED;
-    the linker has changed some mappings that are read-only by now.
+    `file` is the end of the file's path. A mapping with changed pages is left out, as
+    MADV_DONTNEED would lose the changes; the linker has changed some mappings that are
+    read-only by now.
     """
     text = Path("/proc/self/smaps").read_text(encoding="utf-8")
     for mapping in re.split(r"\n(?=[0-9a-f]+-[0-9a-f]+ )", text):

@@ -9,9 +9,10 @@ BROKEN_PIPE: Final = 141  # a shell's exit code of a program that SIGPIPE ended
 
 
 def unless_cut_off(run: Callable[[], int]) -> int:
-    """Run a program, and write its output; return its exit code.
+    """Run a program, flush its output, and return its exit code.
 
-    The code is 141 if the reader of the output has stopped.
+    `run` is the program, which returns its exit code. The code is 141 if the process
+    that reads the output has ended before.
     """
     try:
         try:

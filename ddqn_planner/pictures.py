@@ -46,26 +46,40 @@ class BodyPicture(NamedTuple):
 
 
 def draw_text(grid: GridMap, cells: Sequence[Cell]) -> str:
-    """Return the map as text, y upwards: a sign per cell, or per square of cells.
+    """Return a map and a path on it as text: lines of signs, the highest y first.
 
-    # is occupied, . free, and an arrow a one-way zone; * is the path, from S to G.
+    # is occupied, . free, and an arrow a one-way zone; * is the path of cells (x, y),
+    from S to G. On a wide map a sign stands for a square of cells, and shows the sign
+    that comes last in SIGNS among those of its cells.
     """
-    signs = np.full(grid.occupancy.shape, SIGNS.index("."))  # indices in SIGNS
+    # (H, W): the sign of each cell, as an index in SIGNS.
+    signs = np.full(grid.occupancy.shape, SIGNS.index("."))
     if grid.forbidden is not None:
-        x, y = _mean_directions(grid.forbidden)
-        # 0 to 3: the quarter turns from +x to the direction, as the arrows > ^ < v.
-        quarters = np.rint(np.arctan2(y, x) / (np.pi / 2)).astype(np.int64) % 4
-        is_one_way = np.hypot(x, y) > SHORTEST_DIRECTION
-        signs[is_one_way] = SIGNS.index(">") + quarters[is_one_way]
+        signs = _with_arrows(signs, grid.forbidden)
     signs[grid.occupancy] = SIGNS.index("#")
     for sign, marked_cells in (("*", cells), ("S", cells[:1]), ("G", cells[-1:])):
         for x, y in marked_cells:
             signs[y, x] = SIGNS.index(sign)
-    side = _ceil_divide(grid.width, MAX_TEXT_WIDTH)  # of the squares, in cells
+    # The greatest index in each square of cells: first over its rows, then its columns.
+    side = _ceil_divide(grid.width, MAX_TEXT_WIDTH)  # of a square, in cells
     signs = np.maximum.reduceat(signs, range(0, grid.height, side), axis=0)
     signs = np.maximum.reduceat(signs, range(0, grid.width, side), axis=1)
     upwards = signs[::-1]
     return "\n".join(" ".join(SIGNS[sign] for sign in row) for row in upwards)
+
+
+def _with_arrows(
+    signs: NDArray[np.int64], forbidden: NDArray[np.uint8]
+) -> NDArray[np.int64]:
+    """Return signs (H, W), indices in SIGNS, with an arrow in each one-way cell.
+
+    `forbidden` (H, W) has bit a set where move a is forbidden.
+    """
+    x, y = _mean_directions(forbidden)  # (H, W) each
+    is_one_way = np.hypot(x, y) > SHORTEST_DIRECTION
+    # 0 to 3: the quarter turns from +x to the direction, as the arrows > ^ < v.
+    quarters = np.rint(np.arctan2(y, x) / (np.pi / 2)).astype(np.int64) % 4
+    return np.where(is_one_way, SIGNS.index(">") + quarters, signs)
 
 
 def save_picture(
@@ -83,10 +97,18 @@ def save_picture(
     ----------
     path
         The file. Its ending says in which format; a ValueError lists the formats.
+    grid
+        The map, of H x W cells.
+    cells
+        The cells (x, y) of a path, which a line joins; not drawn if there is a body.
     value
         (H, W): a colour per cell, where the value is finite.
+    title
+        Stands above the map.
     value_label
         What the colours show.
+    body
+        A body, drawn along its poses.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
@@ -94,7 +116,8 @@ def save_picture(
     file = as_path(path)
     ending = picture_format(file)  # an error comes before the work
     aspect = min(max(grid.height / grid.width, 0.4), 1.0)
-    figure = Figure(figsize=(7.2, 1.5 + 5.1 * aspect), dpi=120, layout="constrained")
+    inches = (7.2, 1.5 + 5.1 * aspect)  # with room for the title and the legend
+    figure = Figure(figsize=inches, dpi=120, layout="constrained")
     axes = figure.subplots()
     axes.set(facecolor="white", xlabel="x [cells]", ylabel="y [cells]", aspect="equal")
     axes.set_title(title, loc="left", fontsize=12)
@@ -109,7 +132,7 @@ def save_picture(
         _draw_path(axes, cells)
     if cells or body is not None:
         figure.legend(loc="outside lower center", ncols=4, frameon=False)
-    # In memory first, so that an old file stays complete, and no pipe is waited for.
+    # Into memory first: after an error an old file is still complete.
     content = io.BytesIO()
     figure.savefig(content, format=ending)
     write_atomically(file, content.getvalue())
@@ -145,7 +168,7 @@ def _draw_value(axes: Axes, value: NDArray[np.float32], label: str) -> None:
 
 
 def _draw_path(axes: Axes, cells: Sequence[Cell]) -> None:
-    """Draw a line through cells, and a marker at each end."""
+    """Draw a line through cells (x, y), and a marker at the first and the last one."""
     from matplotlib.patheffects import withStroke
 
     x, y = np.transpose(cells)
@@ -162,11 +185,16 @@ def _draw_path(axes: Axes, cells: Sequence[Cell]) -> None:
 
 
 def draw_body(axes: Axes, footprint: Array, poses: Array, ends: Array) -> None:
-    """Draw what a body sweeps, and the body at both ends; see `BodyPicture`."""
+    """Draw what a body sweeps along a path, and the body at the path's two ends.
+
+    Lengths are in cells. `footprint` (K, 2) holds the corners of a body at (0, 0) that
+    faces +x, `poses` (N, 3) x, y and yaw along the path, and `ends` (2, 3) the start
+    and the goal.
+    """
     from matplotlib.collections import PolyCollection
 
     if len(poses):
-        swept: Any = placed(footprint, poses)  # (N, K, 2)
+        swept: Any = placed(footprint, poses)  # (N, K, 2): its corners at all poses
         axes.add_collection(
             PolyCollection(swept, facecolor=VALUE_COLOURS[1], label="swept")
         )
@@ -179,26 +207,29 @@ def draw_body(axes: Axes, footprint: Array, poses: Array, ends: Array) -> None:
         )
         axes.add_collection(outlines)
         axes.plot(*poses.T[:2], color=PATH_COLOUR, linewidth=2, label="path")
-    # A triangle from the robot's origin to the front of the body shows the heading. It
-    # begins at the back if all of the body lies ahead of the origin, and in the middle
-    # if all of it lies behind.
+    # A triangle with its tip at the front of the body shows the heading. Its base lies
+    # at the robot's origin; at the body's back if the origin is behind the body, and in
+    # the middle of the body if the origin is ahead of the body.
     back, _ = footprint.min(axis=0)
     front, left = footprint.max(axis=0)
     base = max(0.0, back)
     if front <= 0:
         base = (front + back) / 2
-    nose = np.array([[front, 0], [base, left / 2], [base, -left / 2]])
+    triangle = np.array([[front, 0], [base, left / 2], [base, -left / 2]])
     colours = {"start": "white", "goal": PATH_COLOUR}
     for pose, (label, colour) in zip(ends, colours.items(), strict=True):
         outline = placed(footprint, pose)
         axes.fill(
             *outline.T, label=label, facecolor=colour, edgecolor=PATH_COLOUR, zorder=3
         )
-        axes.fill(*placed(nose, pose).T, facecolor=OBSTACLE_COLOUR, zorder=3)
+        axes.fill(*placed(triangle, pose).T, facecolor=OBSTACLE_COLOUR, zorder=3)
 
 
 def draw_obstacles(axes: Axes, grid: GridMap) -> None:
-    """Draw a map's occupied cells, lines between cells, and arrows in one-way zones."""
+    """Draw a map's occupied cells, and arrows in its one-way zones.
+
+    A map of few cells also has lines between its cells.
+    """
     from matplotlib.colors import ListedColormap
 
     occupied = np.where(grid.occupancy, 1.0, np.nan)
@@ -214,14 +245,18 @@ def draw_obstacles(axes: Axes, grid: GridMap) -> None:
 
 
 def _draw_directions(axes: Axes, grid: GridMap, forbidden: NDArray[np.uint8]) -> None:
-    """Draw an arrow in each n-th row and column of the one-way zones."""
+    """Draw arrows in the one-way zones, at most MAX_ARROWS along a side of the map.
+
+    `forbidden` (H, W) has bit a set where move a is forbidden.
+    """
     step = _ceil_divide(max(grid.width, grid.height), MAX_ARROWS)  # cells
-    directions = _mean_directions(forbidden)
+    directions = _mean_directions(forbidden)  # (2, H, W)
     is_one_way = (np.hypot(*directions) > SHORTEST_DIRECTION) & ~grid.occupancy
+    # The rows and columns of the cells with an arrow, in steps.
     row, column = np.nonzero(is_one_way[::step, ::step])
     y = row * step
     x = column * step
-    arrows = directions[:, y, x]  # (2, arrows)
+    arrows = directions[:, y, x]  # (2, arrows): made 0.8 steps long
     arrows *= 0.8 * step / np.hypot(*arrows)
     axes.quiver(
         x,
@@ -242,10 +277,10 @@ def _mean_directions(forbidden: NDArray[np.uint8]) -> Array:
     `forbidden` (H, W) has bit a set where move a is forbidden. The sum is 0 where all
     moves are legal, or none.
     """
-    action = np.arange(len(MOVES))[:, None, None]
+    action = np.arange(len(MOVES))[:, None, None]  # (8, 1, 1)
     is_legal = (forbidden >> action & 1) == 0  # (8, H, W)
     unit_vectors = MOVES / LENGTHS[:, None]  # (8, 2)
-    directions: Array = np.tensordot(unit_vectors.T, is_legal, 1)
+    directions: Array = np.tensordot(unit_vectors.T, is_legal, 1)  # summed over moves
     return directions
 
 

@@ -25,7 +25,7 @@ PACKAGES: Final = {
 
 
 def with_remedy(error: Exception) -> str:
-    """Return the text of an error, with what to install if a library is missing."""
+    """Return the text of an error; if a library is missing, with what to install."""
     module = getattr(error, "name", None) or ""  # of an ImportError
     library = module.partition(".")[0]
     if library == "rclpy" or library.endswith(("_interfaces", "_msgs", "_srvs")):

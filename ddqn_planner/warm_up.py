@@ -15,14 +15,15 @@ def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
     """Plan on small maps in all ways, so that all code of a planner is compiled.
 
     A generator: it yields once when the code of most requests is compiled, and once at
-    the end. With `learns`, the code of an `Experience` is compiled, too.
+    the end. The maps have the size that the planner's model needs, or 8 x 8 cells.
+    With `learns`, the code of an `Experience` is compiled, too.
     """
     sizes = planner.metadata.sizes
     free = np.zeros((sizes.get("height", 8), sizes.get("width", 8)), np.bool_)
     height, width = free.shape
     start = (0, 0)
     goal = (width - 1, height - 1)
-    # Unit costs and expected times have the same code as costs.
+    # The map has costs. One without costs, or with expected times, needs no other code.
     grid = GridMap(free, cost=free.astype(np.int8))
     if learns:
         experience = Experience(nominal_speed=1.0)
@@ -42,8 +43,8 @@ def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
     planner.plan(grid.with_patch([[True]], 1, 1), start, goal)
     rest_of_path([start, goal], start, grid, rule)
     yield
-    # From an obstacle an escape path leads to where a path begins. Cells may be left in
-    # some directions only.
+    # Where the start is an obstacle, a plan begins with an escape path. Its code differs
+    # on a map with one-way zones.
     obstacle = free.copy()
     obstacle[0, 0] = True
     some_forbidden = np.full(free.shape, 0b10000, np.uint8)  # one move
@@ -54,13 +55,15 @@ def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
 
 
 def _plan_poses(planner: Planner) -> None:
-    """Plan where a wall divides a map, where it is open, and past an obstacle.
+    """Plan for a body, so that all code of a pose planner is compiled.
 
-    Then compute the rest of the last path.
+    A wall divides the map into two rooms. The body plans from one room to the other
+    with the wall, without it, and past an obstacle in its place; then the rest of the
+    last path is computed.
     """
     assert planner.pose_planner is not None
     resolution = planner.pose_planner.motions.resolution
-    # Cells of each room: enough for a field that computes lower bounds before it grows.
+    # The cells of a room's side: enough for a field to compute lower bounds first.
     side = 2 * planner.pose_planner.body.reach + 48
     walled = np.zeros((side, 2 * side), np.bool_)
     walled[:, side] = True

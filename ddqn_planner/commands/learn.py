@@ -86,7 +86,11 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
 
 
 def _experience_to_teach(options: Namespace) -> Experience:
-    """Return the experience of ``--experience``, or a new one of the options."""
+    """Return the experience that the drives add to.
+
+    It is that of the file ``--experience``, or without it a new one. A ValueError if
+    other options contradict the file.
+    """
     robot = {}
     for name in ("nominal_speed", "robot_width"):
         value = getattr(options, name)
@@ -104,10 +108,10 @@ def _experience_to_teach(options: Namespace) -> Experience:
 def _read_drives(
     options: Namespace, grid: GridMap, locked_folders: ExitStack
 ) -> list[Drive]:
-    """Return the drives of all recordings.
+    """Return the drives of all recordings, which were driven on the map `grid`.
 
-    `locked_folders` keeps the folder of a trainer node locked: no node may record there
-    meanwhile.
+    Recordings that are folders of a trainer node are locked, so that no node records
+    there meanwhile. The locks are put into `locked_folders`, which the caller closes.
     """
     drives: list[Drive] = []
     for path in options.drives:
@@ -129,14 +133,15 @@ def _read_drives(
 def _teach(
     experience: Experience, drives: Sequence[Drive], grid: GridMap, out: Path
 ) -> None:
-    """Teach an experience drives on a map, and train its prior.
+    """Let an experience learn from drives on a map, and train its prior.
 
-    A ValueError if it could learn from none of them: the file `out` stays as it is.
+    A ValueError if no drive taught anything. Its text says that the file `out` stays as
+    it is, as the caller has not written it yet.
     """
     reasons = []
     for number, drive in enumerate(drives, 1):
         learned = drive.teach(experience, grid)
-        if not learned:
+        if not learned:  # of no place
             reasons.append(learned.reason)
             print(f"drive {number} taught nothing: {learned.reason}")
     if len(reasons) == len(drives):

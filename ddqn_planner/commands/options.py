@@ -25,7 +25,11 @@ class Option(NamedTuple):
 
 
 def add_options(parser: ArgumentParser, *options: Option) -> None:
-    """Add options to a parser; their help names a default that is not empty."""
+    """Add options to a parser.
+
+    A flag has no value, a path is made a Path, and the help of an option names its
+    default unless that is None or empty.
+    """
     for name, kind, default, words in options:
         settings: dict[str, Any] = {"default": default, "help": words}
         if kind is bool:
@@ -41,7 +45,10 @@ def add_options(parser: ArgumentParser, *options: Option) -> None:
 
 
 def file_of(argument: str) -> Path:
-    """Return the path that an argument names; argparse reports if it names none."""
+    """Return the path that an argument names: a type for argparse.
+
+    An ArgumentTypeError, which argparse reports, if it can be no path.
+    """
     try:
         return as_path(argument)
     except ValueError as error:
@@ -49,7 +56,11 @@ def file_of(argument: str) -> Path:
 
 
 def add_map_options(parser: ArgumentParser, move_rule: str | None) -> None:
-    """Add the map, its start and goal, and the move rule, by default `move_rule`."""
+    """Add the options for a map, a start and a goal on it, and the move rule.
+
+    `move_rule` is the name of the default rule; with None, the default is None, and the
+    help says that the model's rule counts.
+    """
     parser.add_argument(
         "map", help="ROS map YAML, MovingAI .map, or name of a shipped map"
     )
@@ -69,7 +80,11 @@ def add_map_options(parser: ArgumentParser, move_rule: str | None) -> None:
 
 
 def read_map(options: Namespace) -> tuple[MapFile, Cell, Cell]:
-    """Return the map file, the start and the goal of `add_map_options`."""
+    """Return the map file that the options name, and a start and goal (x, y) on it.
+
+    They are the options' cells, else those in the map file; a ValueError if there are
+    none. `options` are those of `add_map_options`.
+    """
     map_file = read_map_file(find_map(options.map))
     start = options.start or map_file.start
     goal = options.goal or map_file.goal

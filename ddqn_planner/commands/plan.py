@@ -108,7 +108,11 @@ class Report(NamedTuple):
 
 
 def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
-    """Print a plan, and write the files of the options; return 1 without a path."""
+    """Plan, print the plan, and write the files that the options name.
+
+    `arguments` are those of the command line after the command's name. Returns the exit
+    code: 0, or 1 without a path.
+    """
     add_map_options(parser, None)
     add_options(parser, *OPTIONS)
     parser.add_argument(
@@ -141,7 +145,7 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
         options.occupied_threshold, options.allow_unknown, options.use_map_costs
     )
     grid = inflate(grid, options.robot_radius, options.clearance_weight)
-    # So that the time of the plan leaves out how long compiled code takes to load.
+    # Load the compiled code first, so that the printed time is that of the plan alone.
     next(warm_up(planner))
     if has_body:
         report = _plan_poses(options, planner, grid, start, goal)
@@ -162,12 +166,12 @@ def _refuse_options(
     preposition: str,
     model: str,
 ) -> None:
-    """Raise a ValueError if the arguments contain an option of `names`.
+    """Raise a ValueError if the arguments contain an option that `model` cannot follow.
 
-    Models "with" or "without" a body, the `preposition`, can follow these options, and
-    `model` is of the other kind.
+    `names` are the options that only models "with" or "without" a body can follow: that
+    word is the `preposition`. `model` is the name of a model of which this is not true.
     """
-    # Without defaults, an option has a value only where it was in the arguments.
+    # Parsed again without defaults, an option is None unless the arguments contain it.
     no_defaults = Namespace(**dict.fromkeys(names))
     values = parser.parse_args(arguments, no_defaults)
     for name in names:
@@ -181,7 +185,10 @@ def _refuse_options(
 def _plan_cells(
     options: Namespace, planner: Planner, grid: GridMap, start: Cell, goal: Cell
 ) -> Report:
-    """Plan a path of cells, and compare its length with that of the shortest path."""
+    """Plan a path of cells, and compare its length with that of the shortest path.
+
+    `options` are the parsed arguments; `start` and `goal` are cells (x, y) of `grid`.
+    """
     metres = (0, np.inf, "metres, 0 or more")
     tolerance = as_number("--tolerance", options.tolerance, *metres)
     radius = as_number(
@@ -198,10 +205,12 @@ def _plan_cells(
     )
     optimum = _shortest_length(plan, grid)
     has_field = planner.network.supports((grid.height, grid.width))
-    value = None
+    value = None  # (H, W): the colours of the picture
     if options.picture and plan.cells and has_field:
         value = planner.q_field(grid, plan.cells[-1], plan.move_rule).value
-    lines = [f"{x} {y}" for x, y in plan.cells if options.cells]
+    lines = []
+    if options.cells:
+        lines += [f"{x} {y}" for x, y in plan.cells]
     if plan.cells:
         lines += _lines_of(plan, grid, optimum)
     return Report(
@@ -236,7 +245,10 @@ def _shortest_length(plan: Plan, grid: GridMap) -> float | None:
 
 
 def _lines_of(plan: Plan, grid: GridMap, optimum: float | None) -> list[str]:
-    """Return two lines about a path of cells; `optimum` is the least length, cells."""
+    """Return two lines of text about a path of cells.
+
+    `optimum` is the length of the shortest path in cells, or None if it is not known.
+    """
     metres = path_length(plan.path) * grid.resolution
     figures = [f"length {plan.length:.2f} cells"]
     if optimum is not None:
@@ -253,7 +265,11 @@ def _lines_of(plan: Plan, grid: GridMap, optimum: float | None) -> list[str]:
 def _plan_poses(
     options: Namespace, planner: Planner, grid: GridMap, start: Cell, goal: Cell
 ) -> Report:
-    """Plan a path of poses with the yaws of the options at its two ends."""
+    """Plan a path of poses for a model with a body.
+
+    `options` are the parsed arguments, with the yaws at both ends of the path. `start`
+    and `goal` are cells (x, y) of `grid`: the poses are at their centres.
+    """
     assert planner.pose_planner is not None
     start_yaw, goal_yaw = options.yaws
     start_pose = (*grid.cell_to_world(start), start_yaw)
@@ -262,7 +278,7 @@ def _plan_poses(
     plan = planner.plan_poses(grid, start_pose, goal_pose, tolerance, options.bound)
     metres = plan.length * grid.resolution
     title = plan.status.value
-    ends = np.array([start_pose, goal_pose])
+    ends = np.array([start_pose, goal_pose])  # (2, 3): where the picture shows the body
     if plan.cells:
         title = f"{metres:.2f} m"
         ends = plan.poses[[0, -1]]
@@ -291,7 +307,7 @@ def _plan_poses(
 
 
 def _print(options: Namespace, grid: GridMap, report: Report) -> None:
-    """Print a plan as JSON or as text, or why there is no path."""
+    """Print a plan as JSON or as text, or on stderr why there is no path."""
     plan = report.plan
     milliseconds = plan.field_ms + plan.rollout_ms
     if options.json:
@@ -307,5 +323,6 @@ def _print(options: Namespace, grid: GridMap, report: Report) -> None:
             print(draw_text(grid, plan.cells))
         print(*report.lines, sep="\n", end=f", planned in {milliseconds:.1f} ms\n")
     else:
+        # The usual reason is the text of the status.
         hint = report.hint if plan.reason == plan.status.value else ""
         print(f"no path: {plan.reason}{hint}", file=sys.stderr)

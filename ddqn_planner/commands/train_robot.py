@@ -42,7 +42,10 @@ OPTIONS = (
 
 
 def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
-    """Train until the body is proved, and save the model; return 1 without a proof."""
+    """Train until the body is proved, and save the model.
+
+    Returns the exit code: 0, or 1 without a proof after ``--steps``.
+    """
     add_options(parser, *OPTIONS)
     options = parser.parse_args(arguments)
     as_whole("--steps", options.steps, 1, MOST_STEPS)

@@ -20,7 +20,10 @@ if TYPE_CHECKING:
 def add_training_options(
     parser: ArgumentParser, out: str, defaults: HyperParameters
 ) -> None:
-    """Add the folder, `out` by default, the seed, and each hyper-parameter."""
+    """Add the options ``--out`` and ``--seed``, and one for each hyper-parameter.
+
+    `out` is the default folder, and `defaults` has those of the hyper-parameters.
+    """
     add_options(
         parser,
         Option("out", Path, out, "folder of the run"),
@@ -36,9 +39,10 @@ def add_training_options(
 def run_training(
     options: Namespace, make_scenarios: Callable[[], Sequence[Scenario]]
 ) -> "TrainingRun":
-    """Train into ``--out`` to step ``--steps`` or a signal; return the closed run.
+    """Train into the folder ``--out`` until step ``--steps`` or a signal to stop.
 
-    The scenarios are made after the checks of the options, as that can take seconds.
+    `make_scenarios` returns the scenarios to train on. It is called after the options
+    were checked, as it may take seconds. Returns the run, which is closed.
     """
     as_seed(options.seed)
     check_writable(options.out / "model.safetensors", "--out")
