@@ -43,8 +43,8 @@ def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
     planner.plan(grid.with_patch([[True]], 1, 1), start, goal)
     rest_of_path([start, goal], start, grid, rule)
     yield
-    # Where the start is an obstacle, a plan begins with an escape path. Its code differs
-    # on a map with one-way zones.
+    # Where the start is an obstacle, a plan begins with an escape path. A map with
+    # one-way zones needs other code.
     obstacle = free.copy()
     obstacle[0, 0] = True
     some_forbidden = np.full(free.shape, 0b10000, np.uint8)  # one move

@@ -48,6 +48,10 @@ class BaseNode(Node):
     """
 
     def __init__(self, name: str, parameters: Parameters) -> None:
+        """Make a node, and declare its parameters with the values that users gave.
+
+        An error says which value is wrong.
+        """
         self._logged_problems: list[str] = []
         self.jump_back_callbacks: list[Callable[[], None]] = []
         """Functions called when the clock is set back: a bag loops, or a simulator is
@@ -191,7 +195,10 @@ class BaseNode(Node):
 
     @contextmanager
     def answering(self) -> Iterator[None]:
-        """Count a request as open while the body of the with statement answers it."""
+        """Count a request as open while the body of the with statement answers it.
+
+        A node that is being stopped waits for open requests, and then a moment longer.
+        """
         self._open_requests += 1
         try:
             yield
@@ -243,7 +250,10 @@ class BaseNode(Node):
     # Topics
 
     def create_publisher(self, *arguments: Any, **options: Any) -> Publisher:
-        """Create a publisher without rclpy's events, a third of the cost of a wait."""
+        """Create a publisher without rclpy's own events.
+
+        These would make each wait of the executor a third slower.
+        """
         events = options.setdefault("event_callbacks", PublisherEventCallbacks())
         events.use_default_callbacks = False
         return super().create_publisher(*arguments, **options)
@@ -251,7 +261,10 @@ class BaseNode(Node):
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **options: Any
     ) -> Subscription:
-        """Create a subscription with the quality that parameters may override."""
+        """Create a subscription whose quality of service parameters may override.
+
+        The arguments are those of rclpy. A RuntimeError names a wrong parameter.
+        """
         name = self.resolve_topic_name(topic)
         options["qos_overriding_options"] = overriding_options(name)
         options["event_callbacks"] = SubscriptionEventCallbacks(
@@ -270,7 +283,7 @@ class BaseNode(Node):
             ) from None
 
     def header(self, frame: str = "") -> Header:
-        """Return the header of a message about now."""
+        """Return a header with the present time of the node's clock and a frame."""
         return Header(stamp=self.get_clock().now().to_msg(), frame_id=frame)
 
     def topic_problems(self) -> list[str]:
@@ -286,18 +299,22 @@ class BaseNode(Node):
 def unless_refused(
     answer: Coroutine[None, None, Answer], refusal: Callable[[], Refusal | None]
 ) -> Generator[None, None, Answer | Refusal]:
-    """Await an answer; close its coroutine as soon as there is a refusal instead.
+    """Await an answer, but stop as soon as there is a refusal.
+
+    The executor resumes a waiting coroutine each time it wakes: then the refusal is
+    looked at first.
 
     Parameters
     ----------
     answer
         The coroutine that computes the answer.
     refusal
-        Returns what to answer instead; something false as long as `answer` may go on.
+        Returns what to answer instead, or something false as long as the answer may
+        still be computed.
 
     Returns
     -------
-    The answer, or the refusal.
+    The answer; or the refusal, after the coroutine `answer` was closed.
     """
     while True:
         refused = refusal()

@@ -65,7 +65,7 @@ DEFAULT_RULES = MapRules()
 def grid_from_message(
     message: OccupancyGrid, rules: MapRules = DEFAULT_RULES
 ) -> GridMap:
-    """Make a grid map of a map message.
+    """Make a grid map of a map message; the rules say how to read its values.
 
     Raises
     ------
@@ -122,10 +122,11 @@ def occupancy_values(message: OccupancyGrid) -> NDArray[np.int8]:
 def grid_from_values(
     values: NDArray[np.int8], resolution: float, origin: Origin, rules: MapRules
 ) -> GridMap:
-    """Make a grid map of values as they are in a map message, (H, W) int8.
+    """Make a grid map of the values of a map message.
 
-    The resolution is in metres per cell; the origin is the pose of the corner of the
-    first cell, in metres and radians.
+    `values` are (H, W) int8, the resolution is in metres per cell, and the origin is
+    the pose of the corner of the first cell: x and y in metres, yaw in radians. `rules`
+    say what the values mean.
     """
     if rules.map_type == "costmap":
         return grid_from_costmap(values, resolution, origin, rules.allow_unknown)
@@ -172,11 +173,23 @@ def occupancy_message(
 def path_message(
     points: Float64, yaws: Float64, header: Header, last: Quaternion | None = None
 ) -> Path:
-    """Make the message that `path_bytes` serializes; points are positions there."""
+    """Make the message of a path.
+
+    Parameters
+    ----------
+    points : (N, 2) float64
+        x and y of each pose, metres.
+    yaws : (N,) float64, or (N - 1,) with `last`
+        The heading of each pose, radians.
+    header
+        The header of the path and of each pose.
+    last
+        The orientation of the last pose, if `yaws` has none.
+    """
     path = Path(header=header)
-    # Most of an answer's time is making messages. Poses in the same direction share a
-    # quaternion, and all are copies, which take a quarter of the time of the messages'
-    # constructors.
+    # Making messages takes most of the time of an answer. So poses are copies of blank
+    # ones, which take a quarter of the time of the messages' constructors, and poses
+    # with the same heading share a quaternion.
     poses: list[PoseStamped] = []
     while len(poses) < len(points):
         poses += pickle.loads(BLANK_POSES)
@@ -199,14 +212,15 @@ def path_message(
 
 
 def along(points: Float64, spacing: float = math.inf) -> tuple[Float64, Float64]:
-    """Return points at most a spacing apart on a path, and the path's headings.
+    """Return points on a path of straight pieces, and the headings between them.
 
     Parameters
     ----------
     points : (N, 2) float64
         The corners of the path, metres.
     spacing
-        Metres; if infinite, the points returned are the corners.
+        The greatest distance from a point to the next, metres; if infinite, the points
+        are the corners.
 
     Returns
     -------
@@ -236,7 +250,7 @@ def frame_of(path: Path) -> str:
 
 
 def poses_of(path: Path, with_yaw: bool = True) -> Float64:
-    """Return the poses of a path, (N, 3): x and y in metres, yaw in radians.
+    """Return the N poses of a path message, (N, 3): x, y in metres, yaw in radians.
 
     Without `with_yaw`, the yaw is 0. A ValueError says which pose is not finite, or
     that the path has no pose.
@@ -264,7 +278,7 @@ def in_outer_frame(poses: Float64, origin: Origin) -> Float64:
     poses : (N, 3) float64
         x and y in metres, yaw in radians.
     origin
-        The pose of the frame of the poses in the other frame.
+        The pose (x, y, yaw) of the frame of the poses in the other frame.
     """
     x, y, yaw = poses.T
     origin_x, origin_y, origin_yaw = origin
@@ -303,12 +317,12 @@ def path_bytes(
     start = empty_path[:-4] + count.to_bytes(4, "little")
     if count == 0:
         return start
-    # Numbers are aligned to their size, 8 bytes, from the end of the encoding on. The
-    # seven numbers of a pose end there, so all poses but the first begin aligned, and
-    # have the same bytes before their numbers.
+    # The seven numbers of a pose are aligned to 8 bytes, counted from the end of the
+    # encoding on. They end at a multiple of 8 bytes, where the next pose begins: so all
+    # poses but the first have the same bytes before their numbers.
     first_pose_header = _padded(pose_header, offset=len(start) - ENCODING_BYTES)
     next_pose_header = _padded(pose_header, offset=0)
-    header_type = f"V{len(next_pose_header)}"  # so many bytes
+    header_type = f"V{len(next_pose_header)}"  # NumPy's type of that many bytes
     poses = np.zeros(count, dtype=[("header", header_type), ("numbers", "<f8", 7)])
     poses["header"] = np.void(next_pose_header)
     numbers = poses["numbers"]  # (N, 7): x, y, z, and a quaternion x, y, z, w
@@ -318,20 +332,25 @@ def path_bytes(
     if last is not None:
         numbers[-1, 3:] = (last.x, last.y, last.z, last.w)
     content = poses.tobytes()
+    # The first pose has its own header.
     return start + first_pose_header + content[len(next_pose_header) :]
 
 
 def _padded(content: bytes, offset: int) -> bytes:
-    """Return bytes with zeros appended, to end at a multiple of 8 bytes.
+    """Return bytes with zeros appended, so that they end at a multiple of 8 bytes.
 
-    The offset is the position of the first byte.
+    `offset` is the position of the first byte.
     """
     end = offset + len(content)
     return content + bytes(-end % 8)
 
 
 def bytes_message(kind: str, data: bytes) -> UInt8MultiArray:
-    """Make the message that carries bytes of a kind, a model or an experience."""
+    """Make the message that carries the bytes of a file.
+
+    `kind` is "model" or "experience": the label of the message has the kind, a version
+    and a digest of the bytes.
+    """
     label = LABEL.format(kind, hashlib.sha256(data).hexdigest())
     dimension = MultiArrayDimension(label=label, size=len(data), stride=len(data))
     return UInt8MultiArray(
@@ -340,9 +359,10 @@ def bytes_message(kind: str, data: bytes) -> UInt8MultiArray:
 
 
 def bytes_of(kind: str, message: UInt8MultiArray) -> bytes:
-    """Return the bytes of a kind that a message of `bytes_message` carries.
+    """Return the bytes that a message of `bytes_message` carries.
 
-    A ValueError says that they are damaged, or of another kind or version.
+    A ValueError if they are damaged, or not of this kind ("model" or "experience") and
+    of the present version.
     """
     data = bytes(message.data)
     label: str = message.layout.dim[0].label if message.layout.dim else ""
@@ -361,7 +381,7 @@ def bytes_of(kind: str, message: UInt8MultiArray) -> bytes:
 def check_pose(
     name: str, stamped: PoseStamped, frame: str = "", other_remedy: str = ""
 ) -> None:
-    """Check that a pose is a pose in a frame.
+    """Raise a ValueError unless a message is a pose in a frame.
 
     Parameters
     ----------

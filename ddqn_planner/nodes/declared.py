@@ -102,7 +102,10 @@ class Declared(NamedTuple):
         return value
 
     def _in_type(self, value: Any) -> Any:
-        """Return a number in the type of the default, if it loses nothing by that."""
+        """Return a whole number as a float, or 65.0 as 65, where the default is such.
+
+        Any other value is returned as it is.
+        """
         default_type = type(self.default)
         if default_type is float and type(value) is int:
             return float(value)
@@ -121,7 +124,10 @@ class Declared(NamedTuple):
         raise ValueError(f"{name} is {value!r}; give one of {names}")
 
     def _read_number(self, name: str, value: Any, low: float, high: float) -> Any:
-        """Return a number of a range; a bit beyond an end, the end. See `read`."""
+        """Return a number from `low` to `high`, else raise a ValueError; see `read`.
+
+        For a number beyond an end by no more than rounding, the end is returned.
+        """
         if low <= value <= high:
             return value
         for end in (low, high):
@@ -130,9 +136,10 @@ class Declared(NamedTuple):
         raise ValueError(f"{name} is {value}; give {self.limits}")
 
     def _read_namespaces(self, name: str, value: Any) -> list[str]:
-        """Return namespaces without empty ones and without slashes; see `read`.
+        """Return a list of namespaces, without slashes at their ends; see `read`.
 
-        The list of none is [""], as ROS has no type for an empty list.
+        Empty and repeated namespaces are left out. If none is left the list is [""], as
+        ROS has no type for an empty list.
         """
         namespaces = [value] if isinstance(value, str) else value or []
         is_list = isinstance(namespaces, list)
@@ -160,7 +167,7 @@ class Declared(NamedTuple):
         return TYPES[kind] if kind is str else f"{TYPES[kind]}, {self.limits}"
 
     def _shown(self, value: Any) -> str:
-        """Return a value and its type, and how to write it if only quotes are wrong."""
+        """Return a wrong value in words: its type, and whether its quotes are wrong."""
         if value is None:  # also what ROS makes of [] and of blanks
             return "no value, an empty list or blanks"
         words = f"{value!r}, {TYPES.get(type(value), type(value).__name__)}"

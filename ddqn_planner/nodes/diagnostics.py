@@ -24,6 +24,7 @@ class Diagnostics:
     def __init__(
         self, node: BaseNode, on_change: Callable[[], None] = lambda: None
     ) -> None:
+        """Begin without refused inputs; `on_change` is called after each change."""
         self.node = node
         self.refused: dict[str, str] = {}
         """The reason of each refusal, by the name of the input."""

@@ -55,6 +55,7 @@ class Directions:
         on_change: Callable[[], None],
         clock: Callable[[], float],
     ) -> None:
+        """Subscribe to the directions; the class tells the parameters."""
         self._node = node
         self._diagnostics = diagnostics
         self._on_change = on_change

@@ -40,7 +40,7 @@ class Picture(NamedTuple):
 
     @property
     def subject(self) -> tuple[object, ...]:
-        """What is shown: two pictures with equal subjects look the same."""
+        """What the picture depends on: pictures with equal subjects look the same."""
         request = self.outcome.request
         plan = self.outcome.plan
         grid = None if request is None else request.grid
@@ -66,6 +66,7 @@ class FieldDisplay:
     # Its worker, which publishes, has no other tasks: neither requests nor maps wait
     # for a field that is only shown.
     def __init__(self, node: Node, worker: Worker) -> None:
+        """Create the publishers of `node`; the thread of `worker` publishes."""
         self._logger = node.get_logger()
         self._worker = worker
         self._picture: Picture | None = None
@@ -85,7 +86,10 @@ class FieldDisplay:
         }
 
     def show(self, outcome: Outcome) -> None:
-        """Show an outcome from now on, or nothing if the outcome has no goal."""
+        """Show the field or the path of an outcome from now on.
+
+        If the outcome has no goal, what was shown last is cleared.
+        """
         last = self._picture
         if outcome.plan.goal is not None:
             picture = Picture(outcome, outcome.header, is_empty=False)
@@ -98,11 +102,14 @@ class FieldDisplay:
             self._publish_later()
 
     def _publish_later(self, _: object = None) -> None:
-        """Let the worker publish what has changed, as when a subscription came."""
+        """Let the worker publish the picture; also called when a subscription comes."""
         self._worker.call(self._publish)
 
     def _publish(self) -> None:
-        """Publish the picture on the topics that do not show it yet; log failures."""
+        """Publish the picture on each topic that does not show it yet, in the worker.
+
+        A failure is logged.
+        """
         for topic in TOPICS:
             picture = self._picture
             if picture is None:
@@ -119,7 +126,9 @@ class FieldDisplay:
     def _publish_on(self, topic: Topic, picture: Picture) -> None:
         """Publish a picture on a topic, unless the topic shows the picture already.
 
-        A topic for robots with a body is empty for a plan of cells, and the reverse.
+        One topic shows the plans of robots with a body, the other topic those of robots
+        without. On the topic that does not fit the picture's plan, an empty message
+        clears what was shown. Without a subscriber, only empty messages are published.
         """
         has_body = isinstance(picture.outcome.plan, PosePlan)
         is_empty = picture.is_empty or has_body != topic.is_for_bodies
@@ -127,10 +136,10 @@ class FieldDisplay:
         if visible is self._published[topic.name]:
             return
         publisher = self._publishers[topic.name]
-        # A latched picture is cleared even if nobody subscribes now.
+        # Later subscribers receive the last message, so it is cleared in any case.
         if not is_empty and publisher.get_subscription_count() == 0:
             return
-        # First, so that a picture that cannot be made is not tried again each time.
+        # Noted before the message is made: if that fails, it is not tried again.
         self._published[topic.name] = visible
         publisher.publish(topic.make_message(picture, is_empty))
 
@@ -149,7 +158,8 @@ def value_message(field: QField | None, grid: GridMap, header: Header) -> Occupa
 
     Returns
     -------
-    The message: 100 at the goal, 0 at the lowest value, -1 without a value.
+    OccupancyGrid
+        100 at the goal, 0 at the lowest value, -1 in cells without a value.
     """
     percent = np.full(grid.occupancy.shape, -1, dtype=np.int8)  # (H, W)
     if field is not None:
@@ -168,7 +178,7 @@ def outlines_along(poses: Float64, footprint: Float64) -> Float64:
     Parameters
     ----------
     poses : (N, 3) float64
-        Metres and radians, in the map's frame.
+        x, y and yaw along the path: metres and radians, in the map's frame.
     footprint : (K, 2) float64
         The body's corners, metres, in its own frame.
 
@@ -184,7 +194,7 @@ def outlines_along(poses: Float64, footprint: Float64) -> Float64:
     y = outlined_poses[:, 1:2]
     cos = np.cos(outlined_poses[:, 2:])
     sin = np.sin(outlined_poses[:, 2:])
-    ahead, aside = footprint.T
+    ahead, aside = footprint.T  # (K,) each
     corner_x = x + (cos * ahead - sin * aside)
     corner_y = y + (sin * ahead + cos * aside)
     return np.stack([corner_x, corner_y], axis=-1)
@@ -198,7 +208,7 @@ def _is_outlined(poses: Float64) -> NDArray[np.bool_]:
     distance = np.cumsum(steps + turns * METRES_PER_RADIAN)  # from the first pose
     # The path is divided into intervals of the spacing. An outline is drawn at the
     # first pose of the path, and at the first pose in each later interval.
-    interval = distance // OUTLINE_SPACING  # (N - 1,), the number of the interval
+    interval = distance // OUTLINE_SPACING  # (N - 1,), of the second to the last pose
     is_first = np.diff(interval, prepend=0) > 0
     return np.append(True, is_first)
 

@@ -46,20 +46,7 @@ NOT_RECORDING = "no drives are being recorded; call ~/start first"
 
 
 class DrivingRobot:
-    """Divides the poses, goals and navigation states of a robot into drives.
-
-    Parameters
-    ----------
-    node
-        The node that listens.
-    frames
-        Transforms poses into the map's frame.
-    name
-        The robot's namespace; empty for the node's own robot.
-    on_drive
-        Called with each drive, after words for the robot such as " by r1" (empty for
-        the node's own robot).
-    """
+    """Divides the poses, goals and navigation states of a robot into drives."""
 
     def __init__(
         self,
@@ -68,17 +55,28 @@ class DrivingRobot:
         name: str,
         on_drive: Callable[[str, Drive], None],
     ) -> None:
-        """Subscribe to the topics of the robot `name`; "" for the node's own robot.
+        """Listen to the goals, the navigation and the pose of one robot.
 
-        `on_drive` gets the text " by NAME", or "", and each drive that has ended.
+        Parameters
+        ----------
+        node : LearningNode
+            The node that listens.
+        frames : Frames
+            Transforms poses into the map's frame.
+        name : str
+            The robot's namespace; "" for the node's own robot.
+        on_drive : callable
+            Called with each drive that has ended. Its first argument are words for the
+            log, " by NAME", or "" for the node's own robot.
         """
         self._node = node
         self._frames = frames
         self._name = name
-        self._prefix = f"{name}/" if name else ""  # of its topics and its frame
+        self._prefix = f"{name}/" if name else ""  # of the robot's topics and frame
         by_robot = f" by {name}" if name else ""
         self.recorder = DriveRecorder(partial(on_drive, by_robot))
-        # Goals that its navigation has aborted; None before the first status.
+        # The UUIDs of goals that the robot's navigation has aborted; None before the
+        # first message of its status.
         self._aborted_goals: set[bytes] | None = None
         listen(node, f"{self._prefix}goal_pose", 10, node.diagnostics, self._on_goal)
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -88,11 +86,14 @@ class DrivingRobot:
             frames.listen()
             node.create_timer(LOOK_UP_PERIOD, self._look_up, clock=STEADY)
         else:
-            # The queue is long, as every pose counts.
+            # A queue of 1000 messages, so that no pose is lost while the node is busy.
             listen(node, f"{self._prefix}odom", 1000, node.diagnostics, self._on_pose)
 
     def _on_pose(self, pose: PoseStamped) -> None:
-        """Record a pose, unless there is no map; a ValueError refuses the pose."""
+        """Record a pose of the robot, unless there is no map.
+
+        A ValueError refuses a pose that cannot be used.
+        """
         seconds = Time.from_msg(pose.header.stamp).nanoseconds / 1e9
         position = self._position("the robot's pose", pose)
         if position is None:
@@ -102,7 +103,7 @@ class DrivingRobot:
         self.recorder.add(seconds, *position)
 
     def _look_up(self) -> None:
-        """Record the robot's pose by TF, or report in the diagnostics why not."""
+        """Record the robot's pose of now by TF; the diagnostics report a failure."""
         map_in_frame = self._node.map
         if map_in_frame is None:
             return
@@ -124,7 +125,7 @@ class DrivingRobot:
     def _position(self, name: str, pose: PoseStamped) -> tuple[float, float] | None:
         """Return x and y of a pose in the map's frame, metres; None without a map.
 
-        A ValueError says why the pose cannot be used, and calls the pose by its name.
+        A ValueError says why the pose cannot be used; `name` is what it calls the pose.
         """
         map_in_frame = self._node.map
         if map_in_frame is None:
@@ -140,7 +141,7 @@ class DrivingRobot:
             if status.status == GoalStatus.STATUS_ABORTED
         }
         if self._aborted_goals is None:
-            # Goals that failed before the node listened end no drive of now.
+            # These goals failed before the node listened: they end no drive of now.
             self._aborted_goals = aborted_goals
             return
         if aborted_goals - self._aborted_goals:
@@ -148,7 +149,7 @@ class DrivingRobot:
         self._aborted_goals |= aborted_goals
 
     def describe(self) -> dict[str, str]:
-        """Return the lines of the diagnostics about the robot."""
+        """Return the diagnostics' lines about the robot: its position and its goal."""
         positions = {"robot": self.recorder.position, "goal": self.recorder.goal}
         lines: dict[str, str] = {}
         for role, position in positions.items():
@@ -164,6 +165,7 @@ class Driving:
     """Records drives in the node's ``output_folder``, and learns from them."""
 
     def __init__(self, node: LearningNode) -> None:
+        """Listen to the robots that the node's parameters name, and begin to record."""
         self._node = node
         self._folder: DriveFolder | None = None  # while drives are recorded
         self._lines = {"last drive": ""}  # of the diagnostics
@@ -211,7 +213,10 @@ class Driving:
         self._node.draw(map_in_frame.frame, drive.positions)
 
     def _on_saved(self, folder: DriveFolder) -> None:
-        """Publish what was saved, or why that failed, after each attempt."""
+        """Publish the experience and where it was saved, or why that failed.
+
+        The folder calls this after each attempt to save.
+        """
         experience = folder.experience
         self._grid_of_slowness = None
         self._check_speed(folder)
@@ -226,10 +231,11 @@ class Driving:
     def _check_speed(self, folder: DriveFolder) -> None:
         """Warn once when drives show that the nominal speed is wrong."""
         experience = folder.experience
-        # Log slowness is 0 where the robot drives at the nominal speed.
+        # The log slowness is 0 where the robot drives at the nominal speed, and below 0
+        # where it is faster.
         population = experience.evidence.population
         is_faster = population.open_log < -WRONG_SPEED
-        # Many places may be slow. If even the fastest are, it is the robot that is.
+        # Many places may be slow. If even the fastest places are, the robot is slow.
         is_slower = population.fastest_log > WRONG_SPEED
         is_wrong = is_faster or is_slower
         if is_wrong and not self._is_speed_wrong:
@@ -241,7 +247,10 @@ class Driving:
         self._is_speed_wrong = is_wrong
 
     async def train_prior(self) -> None:
-        """Train the prior, and again once drives have shown a tenth more places."""
+        """Train the prior in the worker, if drives have shown a tenth more places.
+
+        A timer calls this each second. The new prior is saved.
+        """
         map_in_frame = self._node.map
         folder = self._folder
         if map_in_frame is None or folder is None:
@@ -274,7 +283,7 @@ class Driving:
             folder.try_to_save()
 
     def _is_prior_due(self, places: int) -> bool:
-        """Return whether to train the prior, with a number of places with evidence."""
+        """Return whether to train the prior; `places` is the number of known places."""
         if places == 0:
             return False
         was_forgotten = places < self._places_of_prior
@@ -307,9 +316,10 @@ class Driving:
         )
 
     def start(self) -> Answer:
-        """Record drives in the folder of the parameters.
+        """Begin to record drives in the folder that the parameters name.
 
-        What robots drove before, without an end, is no part of the first drives.
+        Drives that robots have begun before are not recorded. The answer says whether
+        the recording has begun.
         """
         node = self._node
         if self._folder is not None:
@@ -336,7 +346,7 @@ class Driving:
         return Answer(True, f"recording in {folder.folder} after drive {folder.drives}")
 
     def stop(self) -> Answer:
-        """Record the drive that a robot is on, save, and record no more."""
+        """End and record the drives that robots are on, save, and stop recording."""
         folder = self._folder
         if folder is None:
             self._node.state = "stopped"
@@ -352,11 +362,11 @@ class Driving:
         return Answer(True, f"stopped after drive {folder.drives}; ~/start continues")
 
     def close(self) -> None:
-        """Record the drive that a robot is on, and save."""
+        """Stop recording, as the node ends; see `stop`."""
         self.stop()
 
     def save(self) -> Answer:
-        """Save now."""
+        """Save the drives and the experience now."""
         folder = self._folder
         if folder is None:
             return Answer(False, NOT_RECORDING)
@@ -366,7 +376,7 @@ class Driving:
         return Answer(True, f"saved in {folder.folder}")
 
     def forget(self) -> Answer:
-        """Forget what was learned."""
+        """Forget what was learned, but not the drives; a backup file stays."""
         folder = self._folder
         if folder is None:
             return Answer(False, NOT_RECORDING)
@@ -382,12 +392,12 @@ class Driving:
         return Answer(True, f"{done}: {undo}")
 
     def recorded(self, file: Path, map_in_frame: MapInFrame) -> Recording:
-        """Return the drives of a file, of which the map has the frame."""
+        """Return the drives of a file, in the frame of the map, with fewer poses."""
         paths = (drive.positions[::REPLAY_STRIDE] for drive in read_drives(file))
         return Recording(map_in_frame.frame, paths)
 
     def _on_second(self) -> None:
-        """Try again what a full disk prevented, and show the slowness."""
+        """Each second, try again what a full disk prevented, and show the slowness."""
         if self._folder is not None and self._folder.save_error:
             self._folder.try_to_save()
         elif self._node.state == "failed" and self._is_disk_full:
@@ -404,7 +414,10 @@ class Driving:
 def _trained_prior(
     grid: GridMap, places: Places, older: Prior | None, seed: int
 ) -> Prior | None:
-    """Return a prior that places on a map have taught, from the older prior on."""
+    """Return a prior that was trained on the places of a map, see `prior_of`.
+
+    It has learned from the places of the `older` prior, too. The worker calls this.
+    """
     from ddqn_planner.training.prior_training import prior_of  # it imports torch
 
     return prior_of(grid, places, older, seed)

@@ -43,6 +43,10 @@ class ExpectedTimes:
         worker: Worker,
         on_change: Callable[[], None],
     ) -> None:
+        """Load the parameter's file, and listen to the trainer if parameters say so.
+
+        The class tells the parameters.
+        """
         self._node = node
         self._diagnostics = diagnostics
         self._worker = worker
@@ -141,9 +145,10 @@ class ExpectedTimes:
         return grid.with_times_of(map_with_times)
 
     def diagnostics_of(self, outcome: Outcome) -> dict[str, str]:
-        """Return what `describe` returns; empty until the worker has computed it.
+        """Return the diagnostics' lines about how long the robot needs for a plan.
 
-        The first call for an outcome lets the worker begin.
+        The worker computes them, see `describe`: it begins at the first call for an
+        outcome, and the lines are empty until it has ended.
         """
         if self._experience is None:
             return {}
@@ -161,8 +166,8 @@ class ExpectedTimes:
     def describe(self, outcome: Outcome) -> dict[str, str]:
         """Return how long the robot needs for a plan, as lines of the diagnostics.
 
-        They are empty if the map of the plan is old or has no times. The worker calls
-        this function.
+        Without lines if the outcome has no path, or its map is an older one or has no
+        times. The worker calls this function.
         """
         request = outcome.request
         grid = self._spread_map

@@ -24,7 +24,10 @@ history, depth, durability or reliability.
 
 
 def print_help(make_node: Callable[[], Node], parameters: Parameters) -> int:
-    """Print what a node does, and its parameters."""
+    """Print what a node does, and its parameters; return the exit code 0.
+
+    The docstring of `make_node`, the node's class, says what the node does.
+    """
     summary = (make_node.__doc__ or "").replace("``", "")
     print(HELP.format(program=Path(sys.argv[0]).name, summary=summary))
     for name, declared in parameters.items():

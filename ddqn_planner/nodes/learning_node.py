@@ -77,14 +77,16 @@ class LearningNode(BaseNode):
     """The node of a learner: its map, its folder, its state, and what it publishes."""
 
     def __init__(self, name: str, parameters: Parameters) -> None:
+        """Make a node without a learner, and the publishers of what is learned."""
         super().__init__(name, parameters)
-        self.map: MapInFrame | None = None
+        self.map: MapInFrame | None = None  # the last one
         self.diagnostics = Diagnostics(self)
         self.worker = Worker(self)
-        self.state = "idle"
-        self.error = ""
-        self.save_error = ""
+        self.state = "idle"  # what the learner does, for the diagnostics
+        self.error = ""  # the last failure of the learner; empty since its next start
+        self.save_error = ""  # why the last save failed; empty if it succeeded
         self.is_replaying = False
+        # Whether the node learns from drives, and not from a training in simulation.
         self.is_driving: bool = self.value("learn_from") == "driving"
         self._product = "experience" if self.is_driving else "model"
         self._episodes = self.create_publisher(Path, "~/episode", 10)
@@ -112,16 +114,17 @@ class LearningNode(BaseNode):
         return Answer(False, explained(error))
 
     def tell_saved(self, data: bytes, path: FilePath, error: str) -> None:
-        """Publish what was learned, and where it is saved.
+        """Publish what was learned, and the path of its file if it was saved.
 
         Parameters
         ----------
         data
-            The model or the experience.
+            The bytes of the model or the experience.
         path
-            Its file.
+            The path of its file.
         error
-            Why it cannot be saved; empty if it is saved. It is logged once.
+            Why it could not be saved; empty if it was saved. An error that lasts is
+            logged once.
         """
         last_error = self.save_error
         self.save_error = error
@@ -135,14 +138,18 @@ class LearningNode(BaseNode):
         self._saved_files.publish(String(data=str(path)))
 
     def draw(self, frame: str, positions: Float64) -> None:
-        """Publish an episode or a drive (N, 2), unless a replay is shown."""
+        """Publish an episode or a drive, unless a replay is shown.
+
+        `positions` (N, 2) are x and y in metres, in the frame `frame`.
+        """
         if not self.is_replaying:
             self.publish_episode(frame, positions)
 
     def publish_episode(self, frame: str, positions: Float64) -> None:
-        """Publish an episode or a drive, (N, 2) metres.
+        """Publish an episode or a drive as a path.
 
-        Each pose faces the next position, and the last pose faces as the one before.
+        `positions` (N, 2) are x and y in metres, in the frame `frame`. Each pose faces
+        the next position, and the last pose faces as the pose before it.
         """
         steps = np.diff(positions, axis=0)  # (N - 1, 2)
         yaw = np.arctan2(steps[:, 1], steps[:, 0])

@@ -129,6 +129,7 @@ class ManagedNode(BaseNode):
     """
 
     def __init__(self, name: str, parameters: Parameters) -> None:
+        """Make an unconfigured node with these parameters, and its services."""
         # First, as a node that cannot start is destroyed, too.
         self.state = "unconfigured"  # or inactive, active or finalized
         self._is_changing = False
@@ -154,9 +155,10 @@ class ManagedNode(BaseNode):
             )
 
     def change(self, label: str) -> None:
-        """Do a transition that the state has, and tell subscribers.
+        """Do a transition that the present state has, and tell subscribers.
 
-        If the method of that name raises an error, the state stays.
+        `label` is the transition's label, as "configure": the method of this name is
+        called. If it raises an error, the state stays.
         """
         changes = {change.label: change for change in self._changes()}
         change = changes[label]
@@ -204,9 +206,9 @@ class ManagedNode(BaseNode):
         return True
 
     def configure(self) -> None:
-        """Create what the node needs; an override calls this method first.
+        """Note which entities the node has; an override calls this method first.
 
-        From now on, `cleanup` destroys what is created.
+        What the override then creates is destroyed by `cleanup`.
         """
         self._entities_before = {
             entity for name in ENTITIES.values() for entity in getattr(self, name)
@@ -229,7 +231,7 @@ class ManagedNode(BaseNode):
         self.destroy_publisher(self._heartbeat_publisher)
 
     def cleanup(self) -> None:
-        """Destroy what was created since `configure`, also if that failed."""
+        """Destroy all entities created since `configure`, also if that failed."""
         for kind, name in ENTITIES.items():
             destroy = getattr(self, f"destroy_{kind}")
             for entity in {*getattr(self, name)} - self._entities_before:
@@ -251,12 +253,14 @@ class ManagedNode(BaseNode):
     def _on_get_state(
         self, _: GetState.Request, response: GetState.Response
     ) -> GetState.Response:
+        """Answer ``~/get_state`` with the present state."""
         response.current_state = _state(self.state)
         return response
 
     def _on_get_states(
         self, _: GetAvailableStates.Request, response: GetAvailableStates.Response
     ) -> GetAvailableStates.Response:
+        """Answer ``~/get_available_states`` with all states of ROS."""
         response.available_states = [_state(label) for label in STATES]
         return response
 
@@ -265,6 +269,7 @@ class ManagedNode(BaseNode):
         _: GetAvailableTransitions.Request,
         response: GetAvailableTransitions.Response,
     ) -> GetAvailableTransitions.Response:
+        """Answer ``~/get_available_transitions`` with those of the present state."""
         response.available_transitions = [
             _describe(change) for change in self._changes()
         ]
@@ -281,10 +286,10 @@ class ManagedNode(BaseNode):
     async def _on_change_state(
         self, request: ChangeState.Request, response: ChangeState.Response
     ) -> ChangeState.Response:
-        """Do the transition of the request's label, or of its number without a label.
+        """Answer ``~/change_state``: do the transition that the request names.
 
-        A transition that the state does not have is refused, and any transition while
-        another one is done.
+        The request names it by a label, or without a label by its number. It is refused
+        if the state does not have it, or while the node changes its state or stops.
         """
         labels = {change.number: change.label for change in self._changes()}
         number = request.transition.id
@@ -332,8 +337,8 @@ class ManagedNode(BaseNode):
             remedy = f"{apt_install('bond')}, or set bond_timeout to 0.0 in its manager"
             self.get_logger().info(f"no bond: bond is not installed; {remedy}")
             return
-        # As bondpy does, except for its subscription: the topic has the heartbeats of
-        # all nodes' bonds, each ten times per second.
+        # As bondpy does, but without a subscription to the topic, which has the
+        # heartbeats of all nodes' bonds, each ten times per second.
         self._heartbeat = Status(
             id=self.get_name(), instance_id=str(uuid4()), active=True
         )

@@ -48,6 +48,7 @@ class MapServerNode(BaseNode):
     """Serves one map, on a latched topic and as a service, and its directions."""
 
     def __init__(self) -> None:
+        """Make the node, load the map of the parameters, and create services."""
         super().__init__("map_server", PARAMETERS)
         self._loaded: MapFile | None = None
         self._served = OccupancyGrid()
@@ -112,9 +113,10 @@ class MapServerNode(BaseNode):
         return success
 
     def _serve(self, values: NDArray[np.int8]) -> None:
-        """Publish the directions, then values as the map, where the loaded map lies.
+        """Publish values as the map, after the directions of the loaded map.
 
-        `values` is (H, W), as in a map message.
+        `values` is (H, W) int8, as in a map message; the map has the place of the
+        loaded map.
         """
         loaded = self._loaded
         assert loaded is not None

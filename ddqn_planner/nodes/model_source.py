@@ -59,6 +59,7 @@ class ModelSource:
     def __init__(
         self, node: BaseNode, diagnostics: PlannerDiagnostics, worker: Worker
     ) -> None:
+        """Begin without a model; the class tells the parameters."""
         self.planner: Planner | None = None
         self.file = ""
         # Of the trainer's message that the model came in; it holds the digest.

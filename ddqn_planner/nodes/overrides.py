@@ -49,6 +49,7 @@ class Source(NamedTuple):
 
 
 def _node_name(full_name: str) -> str:
+    """Return the name of a node, or of a pattern, without its namespace."""
     return full_name.rpartition("/")[2]
 
 

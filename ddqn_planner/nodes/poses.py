@@ -75,23 +75,31 @@ class CheckedTransforms:
     """
 
     def __init__(self, buffer: Any, node: BaseNode) -> None:
+        """Give transforms to `buffer`, tf2's; `node` logs refused transforms."""
         self._buffer = buffer
         self._node = node
         self.refused: dict[tuple[str, str], str] = {}
-        """Why the last transform between two frames was refused."""
+        """Why the last transform between two frames, parent and child, was refused."""
 
     def set_transform(self, transform: TransformStamped, authority: str) -> None:
-        """Give a transform of the topic `tf` to the buffer, if it is good."""
+        """Give a transform of the topic `tf` to the buffer, unless it is refused.
+
+        tf2's listener calls this; `authority` is its name for the publisher.
+        """
         if self._make_unit(transform):
             self._buffer.set_transform(transform, authority)
 
     def set_transform_static(self, transform: TransformStamped, authority: str) -> None:
-        """Give a transform of the topic `tf_static` to the buffer, if it is good."""
+        """Give a transform of the topic `tf_static` to the buffer, unless refused."""
         if self._make_unit(transform):
             self._buffer.set_transform_static(transform, authority)
 
     def _make_unit(self, stamped: TransformStamped) -> bool:
-        """Give a transform's quaternion the norm 1; return False if it is refused."""
+        """Change a transform's quaternion to the norm 1; return False to refuse it.
+
+        The reason of a refusal is kept in `refused`, and logged if it is the first of
+        these two frames.
+        """
         frames = (stamped.header.frame_id, stamped.child_frame_id)
         problem = transform_problem(stamped)
         if problem:
@@ -119,6 +127,7 @@ class Frames:
     def __init__(
         self, node: BaseNode, tolerance: Callable[[], float] = lambda: math.inf
     ) -> None:
+        """Begin without listening; the class tells the parameters."""
         self.available = has_tf()
         self._node = node
         self._tolerance = tolerance
@@ -127,7 +136,11 @@ class Frames:
         """When the node began to listen to TF, in seconds of the steady clock."""
 
     def check(self, name: str, stamped: PoseStamped, map_frame: str) -> None:
-        """Check a pose as `check_pose` does; with TF, poses of any frame are good."""
+        """Raise a ValueError for a malformed pose, see `check_pose`.
+
+        `name` is what the error calls the pose. Without TF, the pose must be in the
+        map's frame; with TF, in any frame.
+        """
         check_pose(name, stamped, "" if self.available else map_frame, REMEDY)
 
     def to_map(self, name: str, stamped: PoseStamped, map_frame: str) -> PoseStamped:
@@ -170,7 +183,10 @@ class Frames:
         return transformed(PoseStamped(), self._newest(map_frame, frame))
 
     def _newest(self, target: str, source: str) -> TransformStamped:
-        """Return the newest transform between two frames; ValueError if it is old."""
+        """Return the newest transform of poses from frame `source` to frame `target`.
+
+        A ValueError if there is none, or if it is older than the tolerance.
+        """
         transform = self._lookup(target, source, NEWEST)
         problem = self._age_problem(transform)
         if problem:
@@ -178,7 +194,11 @@ class Frames:
         return transform
 
     def _at_time(self, target: str, source: str, stamp: Time) -> TransformStamped:
-        """Return the transform between two frames at a time; ValueError without it."""
+        """Return the transform of poses from `source` to `target` at a time.
+
+        A ValueError if TF has none. If `stamp` is at most AGE_OF_FIRST_POSE before the
+        newest transform, and TF begins later, the newest transform is returned.
+        """
         try:
             return self._lookup(target, source, stamp)
         except ValueError:
@@ -190,9 +210,10 @@ class Frames:
             raise
 
     def _lookup(self, target: str, source: str, stamp: Time) -> TransformStamped:
-        """Return what tf2 has after all messages that came; ValueError if nothing.
+        """Return tf2's transform of poses from frame `source` to frame `target`.
 
-        The transform turns and shifts poses of the frame `source` into `target`.
+        It is that of the time `stamp`. A ValueError if tf2 has none, also after all
+        messages that have come were read.
         """
         self.listen()
         self._receive_transforms()
@@ -206,7 +227,10 @@ class Frames:
         return transform
 
     def _age_problem(self, transform: TransformStamped) -> str:
-        """Return why a newest transform is too old, or too new; empty if it is not."""
+        """Return in words why the newest transform is too old or in the future.
+
+        Empty if its age is within the tolerance, or if the transform is static.
+        """
         stamp = Time.from_msg(transform.header.stamp)
         is_static = stamp.nanoseconds == 0
         age = (self._node.get_clock().now() - stamp).nanoseconds / 1e9
@@ -259,6 +283,7 @@ class Frames:
 
 
 def _no_transform(target: str, source: str, problem: str) -> str:
+    """Return the text of an error: no transform leads from `source` to `target`."""
     return f"no transform leads from {source!r} to {target!r} ({problem}); publish one"
 
 
@@ -279,6 +304,7 @@ def transform_problem(stamped: TransformStamped) -> str:
 
 
 def _rounded(numbers: Iterable[float]) -> str:
+    """Return numbers with six digits, separated by commas."""
     return ", ".join(f"{number:.6g}" for number in numbers)
 
 
@@ -294,14 +320,15 @@ X_AXIS = Vector(1.0, 0.0, 0.0)
 
 
 def vector(message: Point | Vector3) -> Vector:
-    """Return the numbers of a message."""
+    """Return x, y and z of a message."""
     return Vector(message.x, message.y, message.z)
 
 
 def transformed(stamped: PoseStamped, transform: TransformStamped) -> PoseStamped:
-    """Return a pose in the transform's frame, in the plane: z, roll and pitch are 0.
+    """Return a pose turned and shifted by a transform, in the plane.
 
-    A ValueError if the transform's numbers are those of no transform.
+    The result is in the parent frame of the transform; its z, roll and pitch are 0. A
+    ValueError if the transform's numbers are those of no transform.
     """
     problem = transform_problem(transform)
     if problem:
@@ -310,6 +337,7 @@ def transformed(stamped: PoseStamped, transform: TransformStamped) -> PoseStampe
     position = _turned(vector(stamped.pose.position), turn)
     translation = transform.transform.translation
     rotation_of_pose = rotation(stamped.pose.orientation).normalised()
+    # The direction in which the pose's x axis points after both rotations.
     direction = _turned(_turned(X_AXIS, rotation_of_pose), turn)
     result = PoseStamped(header=transform.header)
     result.pose.position.x = position.x + translation.x
@@ -319,7 +347,10 @@ def transformed(stamped: PoseStamped, transform: TransformStamped) -> PoseStampe
 
 
 def _turned(point: Vector, turn: Rotation) -> Vector:
-    """Return a point p turned by a unit quaternion (r, w): p + 2 r × (r × p + w p)."""
+    """Return a point turned by a rotation of norm 1.
+
+    For the point p and the quaternion (r, w) it is p + 2 r × (r × p + w p).
+    """
     axis = Vector(turn.x, turn.y, turn.z)
     first = _cross(axis, point)
     shifted = Vector(
@@ -355,7 +386,7 @@ def listen(
     ----------
     node : BaseNode
     topic : str
-        A name in `TYPES`, perhaps after a namespace.
+        A name in `TYPES`, perhaps after a namespace: it decides on the type.
     depth : int
         Length of the queue in messages.
     diagnostics : Diagnostics
@@ -407,13 +438,13 @@ class Poses(Frames):
         map_frame: Callable[[], str],
         on_start: Callable[[], None],
     ) -> None:
+        """Listen to the source of the robot's pose; the class tells the parameters."""
         super().__init__(node, lambda: settings().transform_tolerance)
         self._diagnostics = diagnostics
         self._settings = settings
         self._map_frame = map_frame
         self._on_start = on_start
-        # The last one of the source's topic, with the time by the node's clock when it
-        # came.
+        # The last pose on the source's topic, and when it came by the node's clock.
         self._last_pose: PoseStamped | None = None
         self._pose_came = Time()
         # When the node began to wait for odometry, in seconds of the steady clock.
@@ -443,14 +474,19 @@ class Poses(Frames):
             )
 
     def _forget_odometry(self) -> None:
+        """Forget the last pose of odometry, as the clock was set back."""
         if self._source == "odom":
             self._last_pose = None
             self._odometry_since = time.monotonic()
 
     def receive(self, pose: PoseStamped) -> None:
-        """Use a pose of the source's topic; a ValueError refuses it."""
+        """Take a pose of the source's topic as the robot's pose.
+
+        A ValueError refuses the pose. `on_start` is called for a pose that a request
+        may wait for.
+        """
         self.check("the start", pose, self._map_frame())
-        # Odometry comes all the time: only the first pose may be waited for.
+        # Odometry comes all the time: a request waits for its first pose alone.
         is_start = self._last_pose is None or self._source == "initialpose"
         self._last_pose = pose
         self._pose_came = self._node.get_clock().now()
@@ -458,9 +494,9 @@ class Poses(Frames):
             self._on_start()
 
     def transform_initial_pose(self) -> None:
-        """Transform a set pose to the map's frame as soon as TF can.
+        """Transform the pose of `initialpose` to the map's frame as soon as TF can.
 
-        Later TF has forgotten the time of the pose.
+        Later TF has forgotten the transform of the pose's time.
         """
         frame = self._map_frame()
         if self._source == "initialpose" and self._last_pose is not None and frame:
@@ -468,7 +504,7 @@ class Poses(Frames):
                 self._last_pose = self.to_map("the start", self._last_pose, frame)
 
     def can_transform(self, goals: Sequence[PoseStamped]) -> bool:
-        """Return whether the robot's pose and all goals have a pose on the map now."""
+        """Return whether the robot and all goals have poses in the map's frame now."""
         with suppress(ValueError):
             for pose in (self.robot(), *goals):
                 self.to_map("a pose", pose, self._map_frame())

@@ -26,6 +26,7 @@ def overriding_options(topic: str) -> QoSOverridingOptions:
     """
 
     def check_depth(quality: QoSProfile) -> SetParametersResult:
+        """Accept a quality of service, or raise a ValueError for its depth."""
         if not 0 <= quality.depth <= GREATEST_DEPTH:
             parameter = f"qos_overrides.{topic}.subscription.depth"
             remedy = f"give 0 to {GREATEST_DEPTH}"

@@ -61,22 +61,25 @@ class Simulation:
     """
 
     def __init__(self, node: LearningNode, map_file: MapFile | None) -> None:
+        """Listen to start and goal, and begin to import torch."""
         self._node = node
         self._poses: dict[str, PoseStamped] = {}  # by "start" and "goal"
         if map_file is not None and node.map is not None:
             self._use_poses_of(map_file, node.map.grid)
-        # The last training, also when it has ended; its map; the steps it began with.
-        self._run: TrainingRun | None = None
+        self._run: TrainingRun | None = None  # the last training, also after its end
         self._map_of_run: MapInFrame | None = None
-        self._first_step = 0
+        self._first_step = 0  # the step with which that training began
         self._rewards = node.create_publisher(Float32, "~/average_reward", 100)
         for name, topic in (("start", "initialpose"), ("goal", "goal_pose")):
             listen(node, topic, 10, node.diagnostics, partial(self._on_pose, name))
-        # In the worker, so that the node answers; only ~/start waits for the import.
+        # The worker imports, so that the node answers meanwhile; ~/start waits for it.
         self._imported = node.worker.call(import_training)
 
     def _use_poses_of(self, map_file: MapFile, grid: GridMap) -> None:
-        """Use the start and the goal, cells of a grid, that a map file may name."""
+        """Use the start and the goal of a map file, if it names them.
+
+        They are cells of `grid`; their poses are at the centres of the cells.
+        """
         for name, cell in (("start", map_file.start), ("goal", map_file.goal)):
             if cell is None:
                 continue
@@ -97,10 +100,10 @@ class Simulation:
         self._poses[name] = stamped
 
     def _cell(self, name: str, pose: PoseStamped, map_in_frame: MapInFrame) -> Cell:
-        """Return the cell of the start's or the goal's pose.
+        """Return the cell (x, y) of a pose on the map.
 
-        A ValueError says that no free cell of the map has the pose. `name` is "start"
-        or "goal".
+        `name` is "start" or "goal", for errors: a ValueError unless the pose lies on a
+        free cell of the map.
         """
         cell = cell_from_pose(
             f"the {name}", pose, map_in_frame.grid, map_in_frame.frame
@@ -111,7 +114,10 @@ class Simulation:
         return cell
 
     async def start(self) -> Answer:
-        """Train, or continue a training."""
+        """Begin a training in the worker, or continue the one in the output folder.
+
+        The answer says at once whether that is possible.
+        """
         await self._imported
         node = self._node
         if node.state == "training":
@@ -173,7 +179,11 @@ class Simulation:
         return Answer(True, "saving after this step; ~/model_saved or an error follows")
 
     def _train(self, run: TrainingRun, map_in_frame: MapInFrame) -> None:
-        """Train until the training has finished or is stopped, in the worker."""
+        """Train until the training has finished or is stopped, in the worker's thread.
+
+        Rewards and episodes are published; the node's state tells how the training
+        ended.
+        """
         node = self._node
         # Episodes are drawn in the executor's thread, in which replays begin: no
         # episode comes between the steps of a replay.
@@ -198,7 +208,10 @@ class Simulation:
         node.get_logger().info(f"the training {end}")
 
     def _tell_saved(self, run: TrainingRun) -> None:
-        """Publish and log what was saved, or why that failed, after each attempt."""
+        """Publish the model and where it was saved, or why that failed.
+
+        The run calls this after each attempt to save.
+        """
         self._node.tell_saved(run.model, run.model_path, run.save_error)
         if not run.save_error:
             place = f"step {run.saved_at} is saved in {run.checkpoint_path}"

@@ -21,7 +21,8 @@ class StopSignal:
     """
 
     def __init__(self) -> None:
-        self.has_come = False
+        """Begin without a signal; `listen` receives signals."""
+        self.has_come = False  # whether a signal has come
         self.obeyed = threading.Event()
         """Set by the main thread when it runs no callback any more: it saves now."""
         self._interrupts = False  # whether signals raise `Interrupted`

@@ -62,7 +62,11 @@ def _problems_of(subscription: Subscription, node: Node) -> Iterator[str]:
 
 
 def _misfits(offered: QoSProfile, requested: QoSProfile) -> list[Misfit]:
-    """Return why a subscription receives nothing of a publisher; empty if it does."""
+    """Return the policies for which a subscription receives nothing of a publisher.
+
+    `offered` is the publisher's quality of service and `requested` the subscription's;
+    the list is empty if they fit.
+    """
     return [
         misfit
         for misfit in MISFITS

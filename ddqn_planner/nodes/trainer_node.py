@@ -81,6 +81,7 @@ class TrainerNode(LearningNode):
     """Trains on the last ``map`` from the last ``initialpose`` to ``goal_pose``."""
 
     def __init__(self) -> None:
+        """Make the node, its learner by the parameter ``learn_from``, and services."""
         self._is_complete = False  # whether the node has its learner
         super().__init__("trainer", PARAMETERS)
         self._replay_timer: Timer | None = None
@@ -215,7 +216,10 @@ class TrainerNode(LearningNode):
 
 
 def _beginnings(paths: Iterator[Float64]) -> Iterator[Float64]:
-    """Yield of each path the first place, the first two places, and so on."""
+    """Yield the beginnings of each path: its first position, its first two, and so on.
+
+    Paths and beginnings are (N, 2), x and y in metres.
+    """
     for path in paths:
         for number in range(1, len(path) + 1):
             yield path[:number]

@@ -15,8 +15,10 @@ class Worker:
     """Calls functions one after another in a daemon thread."""
 
     def __init__(self, node: Node) -> None:
+        """Start the thread; after each call, it wakes the executor of `node`."""
         # Wakes the executor, so that it resumes callbacks that await a call.
         self._wake = node.create_guard_condition(lambda: None)
+        # The calls that wait; None ends the thread.
         self._calls: queue.SimpleQueue[Task | None] = queue.SimpleQueue()
         # The end of the process does not wait for a daemon thread.
         self._thread = threading.Thread(target=self._work, daemon=True)
