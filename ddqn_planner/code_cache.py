@@ -43,17 +43,19 @@ class CodeFiles:
     power cut, files of that class may be empty or have blocks of zeros; numba would
     unpickle them, and run the machine code in them, which can end the process. So the
     checksum of a file is compared before the file is unpickled.
-
-    Parameters
-    ----------
-    base
-        How the names of the files begin.
-    source_stamp
-        Changes if the file of the function changes: then its code is compiled again.
     """
 
     def __init__(self, folder: Path, base: str, source_stamp: object) -> None:
-        """Name the files in `folder`; none is read or written yet."""
+        """Name the files in `folder`; none is read or written yet.
+
+        Parameters
+        ----------
+        base
+            How the names of the files begin.
+        source_stamp
+            Changes if the file of the function changes: then its code is compiled
+            again.
+        """
         self._folder = folder
         self._base = base
         self._index = folder / f"{base}.nbi"
@@ -182,7 +184,7 @@ class Messages(Listener):
         self._has_warned = False
 
     def on_start(self, event: Any) -> None:
-        """Announce the first compilation of a function of this package.
+        """Announce the first compilation of a function of this package in the log.
 
         Numba calls this when it compiles a function, but not when it loads code.
         """

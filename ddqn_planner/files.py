@@ -219,9 +219,10 @@ def _home_of(user: str) -> str:
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a temporary file beside `path`, and rename it to `path`.
+    """Write content to a temporary file beside `path`, and rename it to `path`.
 
-    Missing folders are made. A FileWriteError names `path`, not the temporary file.
+    So `path` holds either its old or its new content, also after a crash. Missing
+    folders are made. A FileWriteError names `path`, not the temporary file.
     """
     try:
         _refuse_other_kinds(path)
@@ -242,7 +243,7 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def check_writable(path: Path, option: str) -> None:
-    """Raise a ValueError if a file could not be written after hours of work.
+    """Raise a ValueError if no file can be written to `path`, before hours of work.
 
     To try it, an empty file is made in the folder and removed; missing folders are
     made. `option` is what the error calls the file.
@@ -269,7 +270,7 @@ def check_writable(path: Path, option: str) -> None:
 def check_distinct(
     outputs: Mapping[str, Path | None], inputs: Mapping[str, Path | None]
 ) -> None:
-    """Raise a ValueError if an output is one file with another output or an input.
+    """Raise a ValueError if an output is the same file as an input or another output.
 
     Both map the names that an error gives to files to their paths, or to None where no
     file was given.
@@ -341,19 +342,6 @@ class WorkFolder(ExitStack):
 
     A missing folder is made. A ValueError if another process works there, or if the
     folder is not empty and has none of the files `marks`.
-
-    Parameters
-    ----------
-    folder
-        Its path.
-    marks
-        Names of files that only such a folder contains. The first is the lock.
-    content
-        What the folder should hold, in the words of an error: "training".
-    works
-        What the process does there: "trains".
-    after
-        What follows if saving fails.
     """
 
     def __init__(
@@ -364,7 +352,21 @@ class WorkFolder(ExitStack):
         works: str,
         after: str = "",
     ) -> None:
-        """Make the folder if it is missing, check what it holds, and lock it."""
+        """Make the folder if it is missing, check what it holds, and lock it.
+
+        Parameters
+        ----------
+        folder
+            Its path.
+        marks
+            Names of files that only such a folder contains. The first is the lock.
+        content
+            What the folder should hold, in the words of an error: "training".
+        works
+            What a process does there, in the words of an error: "trains".
+        after
+            What happens after a save that fails, in the words of an error.
+        """
         folder = as_path(folder, "the folder")
         folder.mkdir(parents=True, exist_ok=True)
         names = sorted(path.name for path in folder.iterdir())

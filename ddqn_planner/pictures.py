@@ -168,7 +168,7 @@ def _draw_value(axes: Axes, value: NDArray[np.float32], label: str) -> None:
 
 
 def _draw_path(axes: Axes, cells: Sequence[Cell]) -> None:
-    """Draw a line through cells (x, y), and a marker at the first and the last one."""
+    """Draw a line through cells (x, y), and a marker at the first and the last cell."""
     from matplotlib.patheffects import withStroke
 
     x, y = np.transpose(cells)

@@ -51,7 +51,11 @@ OPTIONS = (
 
 
 def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
-    """Learn from all drives of the recordings, and write the experience; return 0."""
+    """Learn from all drives of the recordings, and write the experience.
+
+    `parser` gets the command's options, which `arguments` give. Returns the exit code
+    0.
+    """
     parser.add_argument(
         "drives",
         type=file_of,

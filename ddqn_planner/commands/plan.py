@@ -110,8 +110,8 @@ class Report(NamedTuple):
 def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
     """Plan, print the plan, and write the files that the options name.
 
-    `arguments` are those of the command line after the command's name. Returns the exit
-    code: 0, or 1 without a path.
+    `parser` gets the command's options, which `arguments` give. Returns the exit code:
+    0, or 1 without a path.
     """
     add_map_options(parser, None)
     add_options(parser, *OPTIONS)
@@ -168,8 +168,9 @@ def _refuse_options(
 ) -> None:
     """Raise a ValueError if the arguments contain an option that `model` cannot follow.
 
-    `names` are the options that only models "with" or "without" a body can follow: that
-    word is the `preposition`. `model` is the name of a model of which this is not true.
+    `parser` knows all options. `names` are the options that only models "with" or
+    "without" a body can follow: that word is the `preposition`. `model` is the name of
+    a model of the other kind.
     """
     # Parsed again without defaults, an option is None unless the arguments contain it.
     no_defaults = Namespace(**dict.fromkeys(names))
@@ -307,7 +308,11 @@ def _plan_poses(
 
 
 def _print(options: Namespace, grid: GridMap, report: Report) -> None:
-    """Print a plan as JSON or as text, or on stderr why there is no path."""
+    """Print a plan as JSON or as text, or on stderr why there is no path.
+
+    `options` are the parsed arguments, `grid` is the map of the plan, and `report` has
+    the plan and what to print of it.
+    """
     plan = report.plan
     milliseconds = plan.field_ms + plan.rollout_ms
     if options.json:

@@ -12,7 +12,11 @@ from ddqn_planner.training.hyper_parameters import HyperParameters
 
 
 def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
-    """Train, and print how many starts the greedy rollout solves; return 0."""
+    """Train, and print how many starts the greedy rollout solves.
+
+    `parser` gets the command's options, which `arguments` give. Returns the exit code
+    0.
+    """
     add_map_options(parser, "corner_cutting")
     add_training_options(parser, "runs/train", HyperParameters())
     options = parser.parse_args(arguments)

@@ -44,7 +44,8 @@ OPTIONS = (
 def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
     """Train until the body is proved, and save the model.
 
-    Returns the exit code: 0, or 1 without a proof after ``--steps``.
+    `parser` gets the command's options, which `arguments` give. Returns the exit code:
+    0, or 1 without a proof after ``--steps``.
     """
     add_options(parser, *OPTIONS)
     options = parser.parse_args(arguments)

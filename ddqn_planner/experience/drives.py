@@ -133,9 +133,9 @@ class Drive(NamedTuple):
 
 
 def read_drives(path: str | Path) -> Iterator[Drive]:
-    """Yield the drives of an ``episodes.csv``; rows that are no drive are left out.
+    """Yield the drives of the ``episodes.csv`` at `path`.
 
-    An OSError says why the file cannot be read.
+    Rows that are no drive are left out. An OSError says why the file cannot be read.
     """
     outcomes = {end.value.encode(): end for end in DriveEnd}
     for line in read_rows(as_path(path)):
@@ -266,18 +266,7 @@ def _distance(first: Sample, second: Sample) -> float:
 
 
 class DriveFolder(WorkFolder):
-    """Records a robot's drives in a folder, and saves there what they teach.
-
-    Parameters
-    ----------
-    folder : path
-        It is made if it is missing, and locked until it is closed.
-    nominal_speed, robot_width : float
-        See `Experience`.
-    older : str
-        A file with older experience, or a folder with one. A new folder begins with
-        this experience; empty for none.
-    """
+    """Records a robot's drives in a folder, and saves there what they teach."""
 
     def __init__(
         self,
@@ -286,7 +275,18 @@ class DriveFolder(WorkFolder):
         robot_width: float,
         older: str = "",
     ) -> None:
-        """Lock a folder, and load its experience; the class tells the parameters."""
+        """Lock a folder, and load its experience.
+
+        Parameters
+        ----------
+        folder : path
+            It is made if it is missing, and locked until it is closed.
+        nominal_speed, robot_width : float
+            Of the robot: metres per second, and metres; see `Experience`.
+        older : str
+            A file with older experience, or a folder with one. A new folder begins with
+            this experience; empty for none.
+        """
         consequence = "the recording continues, and saving is tried again"
         super().__init__(folder, [LOCK], "drives", "records", consequence)
         self.record_path = self.folder / RECORD

@@ -263,7 +263,8 @@ class Evidence:
     def posterior_over(self, grid: GridMap) -> Posterior:
         """Return the posterior over a map, solved with all that was seen until now.
 
-        If the last map had the same cells, its posterior is updated and returned.
+        If the last map had the same cells as `grid`, its posterior is updated and
+        returned. The posterior is kept for the next call.
         """
         check_grid(grid)
         posterior = self.posterior
@@ -364,7 +365,11 @@ def _level_of(prior: Prior | None) -> float:
 def _is_consistent(
     table: Float64, driven: Float64, errors: Float64, surprises: Float64
 ) -> bool:
-    """Return whether arrays can be those of evidence; see `Evidence.restore`."""
+    """Return whether arrays of a file can be those of evidence.
+
+    They must have the right shapes and finite numbers, and sums of 0 or more. The
+    arrays are those of `Evidence.restore`.
+    """
     if table.ndim != 2 or table.shape[1] != COLUMNS:
         return False
     if (driven.ndim, errors.ndim, surprises.ndim) != (0, 1, 1):

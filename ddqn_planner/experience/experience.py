@@ -268,7 +268,8 @@ class Experience:
     def merge(self, other: Experience) -> None:
         """Learn all that another experience of a robot of this kind has learned.
 
-        Merge each experience once: what is merged twice counts twice.
+        The experience `other` is copied. Merge each experience once: what is merged
+        twice counts twice.
 
         Raises
         ------
@@ -444,10 +445,10 @@ class Experience:
         return ExpectedTime(mean, low, high)
 
     def save(self, path: str | Path) -> None:
-        """Save to a file, atomically; an OSError leaves an old file unchanged.
+        """Save to the file at `path`; an OSError leaves an old file unchanged.
 
-        What the file holds from others is kept: two processes may save to one file.
-        Delete the file to begin anew.
+        What other processes have saved to the file is kept: their evidence is joined
+        with that of this experience. Delete the file to begin anew.
 
         Raises
         ------

@@ -91,7 +91,8 @@ class Posterior:
     def __init__(self, grid: GridMap, side: float, nominal_speed: float) -> None:
         """Divide a map into places and link neighbours; `update` solves the field.
 
-        `side` is that of a place, in metres, and `nominal_speed` in metres per second.
+        `grid` is the map of H x W cells, `side` the side of a place in metres, and
+        `nominal_speed` is in metres per second.
         """
         from scipy.ndimage import distance_transform_edt
 
@@ -336,9 +337,10 @@ class Posterior:
 
 
 def _places_of(grid: GridMap, block: int) -> Int64:
-    """Return the number of each cell's place, (H, W); NO_PLACE for occupied cells.
+    """Return the number of each cell's place: (H, W); NO_PLACE for occupied cells.
 
-    A place is a connected part of a block of `block` x `block` cells.
+    The map `grid` is divided into blocks of `block` x `block` cells, and a place is a
+    connected part of the free cells of a block.
     """
     from scipy.ndimage import label
 

@@ -21,10 +21,10 @@ UNUSUAL = 3.0  # standard deviations: features are no farther off than those of 
 
 
 def map_features(grid: GridMap) -> Float32:
-    """Return what a map says of the surroundings of each cell, for a `Prior`.
+    """Return what a map says of the surroundings of each of its cells, for a `Prior`.
 
-    A wall stands around the map. A robot's body, for which cells are inflated, is left
-    out.
+    Beyond the border of `grid` stands a wall. Cells that are occupied only because of
+    the robot's body count as free.
 
     Returns
     -------

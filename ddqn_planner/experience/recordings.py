@@ -119,8 +119,9 @@ def read_recording(
 def _divided_into_drives(path: Path, name: str, samples: Sequence[Sample]) -> Recording:
     """Divide the poses of a recording into drives.
 
-    `path` and `name`, which the poses come from, are for the words of an error: a
-    ValueError if the times of the poses run backwards or stand still.
+    `samples` are the poses in the order of the recording; those that are not finite are
+    left out. A ValueError if their times run backwards or stand still; its text names
+    `path` and the source of the poses, `name`.
     """
     finite = [sample for sample in samples if all(map(math.isfinite, sample))]
     elapsed = np.diff([sample.seconds for sample in finite])
@@ -186,9 +187,10 @@ def _mcap_files_of(path: Path) -> Sequence[Path]:
 
 
 def read_csv(path: Path) -> list[Sample]:
-    """Return the poses of a CSV file with the columns seconds, x and y.
+    """Return the poses of the CSV file at `path`, with the columns seconds, x and y.
 
-    A ValueError says which column is missing, or which row has no numbers.
+    Empty rows are left out. A ValueError says which column is missing, or which row has
+    no numbers.
     """
     content = open_regular(path, MAX_CSV_BYTES)
     samples = []
@@ -265,7 +267,7 @@ def read_mcap(
 def _robots_of(
     samples_of_source: Mapping[PoseSource, list[Sample]], best: PoseSource
 ) -> list[str]:
-    """Return the names of one source for each robot, sorted.
+    """Return the names of one source of samples for each robot, sorted.
 
     One robot is that of the source `best`. A source whose poses lie elsewhere at the
     same times is of another robot. Sources that differ in `dated_by` alone are one.
@@ -318,7 +320,7 @@ class _Bag:
         return ", ".join(words) or "none"
 
     def read(self, path: Path) -> None:
-        """Add the poses of a file; a ValueError if it is broken."""
+        """Add the poses of the MCAP file at `path`; a ValueError if it is broken."""
         from mcap.reader import make_reader
         from mcap_ros2.decoder import DecoderFactory
 
@@ -429,7 +431,8 @@ def _position_by(
 ) -> tuple[float, float]:
     """Return where the origin of the first frame of a chain lies: x and y, in metres.
 
-    They are in the parent frame of the last frame of the chain; see `_chain`.
+    They are in the parent frame of the last frame of the chain, see `_chain`. `tree`
+    has the transform of each frame to its parent, by the frame's name.
     """
     x = 0.0
     y = 0.0

@@ -181,10 +181,10 @@ def _visits_of_steps(
 
 
 def speeds_of(poses: Poses, window: float) -> Float64:
-    """Return the speed of a robot from each window of time to the next one.
+    """Return the speeds of a robot from each window of time to the next one, in m/s.
 
-    `window` is in seconds, the speeds are in metres per second. Windows whose times are
-    equal have no speed.
+    The poses are averaged over windows of `window` seconds. A speed is that from a mean
+    pose to the next one; two mean poses at the same time have none.
     """
     means = averaged(poses, window)
     elapsed = np.abs(np.diff(means.time))
@@ -251,7 +251,8 @@ def _believed_parts(poses: Poses, limits: Limits) -> Iterator[Poses]:
     A drive is cut where the pose jumps or the clock pauses or goes back. A part is left
     out if it has one pose, or if the robot cannot have driven to its first pose from
     the last pose of the last part that was believed; for the first part, from the first
-    pose of the drive.
+    pose of the drive. `limits` say how fast the robot may be, and how long it may
+    pause.
     """
     time, position = poses
     elapsed = np.diff(time)  # (N - 1,): seconds from each pose to the next one

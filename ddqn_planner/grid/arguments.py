@@ -57,7 +57,11 @@ def is_flag(value: Any) -> bool:
 
 
 def as_cell(cell: Any, name: str = "the cell") -> Cell:
-    """Return a pair of whole numbers, as a list or an array, as Python ints."""
+    """Return a cell (x, y) as a tuple of Python ints.
+
+    `cell` may be a tuple, a list or an array of whole numbers of any type; anything
+    else is a ValueError, which calls it `name`.
+    """
     if type(cell) is tuple and len(cell) == 2:  # at once, as most cells are such pairs
         x, y = cell
         if type(x) is int and type(y) is int:
@@ -223,10 +227,11 @@ def _check_range(
     whole: bool,
     remedy: str,
 ) -> None:
-    """Raise a ValueError for numbers out of a range, for NaN, and for fractions.
+    """Raise a ValueError if an array holds numbers out of a range, NaN or fractions.
 
-    Fractions are allowed unless `whole`. The error names the first wrong number and
-    says what to give: the remedy, or the range.
+    `limits` are the lowest and the highest number. Fractions are wrong if `whole` is
+    True. The error calls the array `name`, names the first wrong number and says what
+    to give: the remedy, or the range.
     """
     lowest, highest = limits
     has_fractions = False
@@ -253,7 +258,10 @@ def _refuse_flags(name: str, values: ArrayLike) -> None:
 
 
 def as_pose(name: str, pose: Any) -> tuple[float, float, float]:
-    """Return three finite numbers as floats."""
+    """Return a pose as three floats x, y, yaw; a ValueError unless they are finite.
+
+    `pose` is a sequence of three numbers, which the error calls `name`.
+    """
     try:
         x, y, yaw = numbers(name, pose, (3,)).astype(np.float64).tolist()
     except ValueError:
@@ -268,7 +276,11 @@ def as_pose(name: str, pose: Any) -> tuple[float, float, float]:
 def as_mask(
     name: str, cells: ArrayLike, shape: tuple[int, ...] | None = None
 ) -> Occupancy:
-    """Return a copy in C order, (H, W) bool."""
+    """Return a copy of a mask in C order, (H, W) bool, at least 1 x 1.
+
+    `cells` holds truth values, or the numbers 0 and 1. Anything else, or another shape
+    than `shape`, is a ValueError, which calls the mask `name`.
+    """
     remedy = "True or False (for percent, see from_occupancy_values)"
     array = numbers(name, cells, shape, "biuf", (0, 1), remedy=remedy)
     if array.ndim != 2 or array.size == 0:

@@ -104,6 +104,7 @@ class GridMap:
     body_radius: float = 0.0
 
     def __post_init__(self) -> None:
+        """Check all fields, and replace the arrays by read-only copies."""
         occupancy = arguments.as_mask("occupancy", self.occupancy)
         shape = occupancy.shape
         resolution = as_number(
@@ -392,8 +393,8 @@ class GridMap:
     def labels(self, move_rule: MoveRule | str) -> NDArray[np.int32]:
         """Return the number of each free cell's component, from 1 on: (H, W) int32.
 
-        Occupied cells have 0. Cells belong to one component if moves join them, also
-        forbidden moves.
+        Occupied cells have 0. Two cells belong to one component if moves of the move
+        rule join them, legal or forbidden by one-way zones.
         """
         from scipy import ndimage
 
@@ -569,9 +570,10 @@ class GridMap:
         return np.stack([x, y], axis=-1)
 
     def _from_metres(self, x: Number, y: Number) -> tuple[Number, Number]:
-        """Return the column and the row of a point in metres; numbers, or arrays.
+        """Return the column and the row of points at x and y, metres in the map frame.
 
-        They are not rounded, and count from the corner of cell (0, 0).
+        Points and results are numbers, or arrays of one shape. Columns and rows are
+        not rounded, and count from the corner of cell (0, 0).
         """
         origin_x, origin_y, yaw = self.origin
         dx = x - origin_x

@@ -113,7 +113,7 @@ def _clearance_costs(
 
 
 def with_unknown_free(grid: GridMap) -> GridMap:
-    """Return a map as it might be if its unknown cells were free.
+    """Return a map as `grid` might be if its unknown cells were free.
 
     The costs of the map stay, and cells that become free have the cost 0.
     """
@@ -241,7 +241,12 @@ def grid_from_costmap(
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
     allow_unknown: bool = False,
 ) -> GridMap:
-    """Make a grid map from a costmap that Nav2 publishes as an ``OccupancyGrid``."""
+    """Make a grid map from a costmap that Nav2 publishes as an ``OccupancyGrid``.
+
+    `values` are (H, W) integers: 0 to 98 are costs of free cells, 99 is a cell in which
+    the robot would touch an obstacle, 100 an obstacle, and -1 unknown. The other
+    parameters are those of `GridMap.from_occupancy_values`.
+    """
     # A robot that starts in a cell of value 99 (inscribed) may leave: such cells are
     # occupied, but no obstacles.
     grid = GridMap.from_occupancy_values(

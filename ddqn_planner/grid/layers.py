@@ -138,7 +138,7 @@ def is_legal(x: int, y: int, action: int, layers: Layers) -> Any:
 
 @inlined
 def multiplier_at(x: int, y: int, one: Any, layers: Layers) -> Any:
-    """Return the cost multiplier of a cell, see `GridMap.cost_multiplier`.
+    """Return the cost multiplier of cell (x, y): that of its cost times its slowness.
 
     `one` is the number 1 of the type in which the product is computed: float64 for
     paths of cells, float32 for primitives.

@@ -19,9 +19,9 @@ CHANGED_SHARE = 0.02
 
 
 def shift_between(old: GridMap, new: GridMap) -> Cell | None:
-    """Return the cell of a newer map in which cell (0, 0) of an older map lies.
+    """Return the cell of the map `new` in which cell (0, 0) of the map `old` lies.
 
-    It may lie outside the newer map. None if the maps have different layers, or if
+    It may lie outside of `new`. None if the maps have different layers, or if
     their cells do not coincide.
     """
     for layer in LAYERS:

@@ -249,7 +249,10 @@ def _read_moving_ai(path: Path) -> MapFile:
 
 
 def _read_ros(path: Path, only_below: bool) -> MapFile:
-    """Read a ROS map, whose YAML file names its images; see `read_map_file`."""
+    """Read a ROS map from the YAML file `path`, which names its images.
+
+    With `only_below`, images outside the YAML file's folder are refused.
+    """
     document = read_yaml(_read_bytes(path, MAX_YAML_BYTES, MapMetadataError))
     if not isinstance(document, dict):
         raise ValueError(
@@ -405,7 +408,10 @@ def _read_image(file: Path, formats: tuple[str, ...], layouts: set[str]) -> Pixe
 
 
 def _check_layout(image: Any, layouts: set[str]) -> None:
-    """Raise a ValueError for an image that is too large, or of another layout."""
+    """Raise a ValueError for an image that is too large, or of another layout.
+
+    `image` is Pillow's, opened but not decoded; `layouts` are the names of right ones.
+    """
     if image.width * image.height > MAX_CELLS:
         raise ValueError(f"{image.width} x {image.height} pixels")
     # How Pillow will decode the image: first the decoder's name, last its arguments,
@@ -440,7 +446,7 @@ def _pixels(image: Any) -> Pixels:
 
 
 def _grey(image: Any) -> NDArray[np.integer[Any]]:
-    """Return map_server's grey values, 0 to 255: (H, W).
+    """Return the grey values that map_server gives to a Pillow image: (H, W), 0 to 255.
 
     map_server computes the luma of Rec. 601 with 16 bits, and cuts it to 8 bits. Values
     of 16 bits are 257 times those of 8 bits.

@@ -64,10 +64,11 @@ class _Loader(yaml.BaseLoader):
 
 
 def read_yaml(content: bytes) -> Any:
-    """Return the first document of a YAML file: text, lists and dictionaries.
+    """Return the first document in the content of a YAML file.
 
-    Bytes that are no UTF-8 are kept as `os.fsdecode` keeps them; a ValueError says what
-    is no YAML.
+    It is made of texts, lists and dictionaries, or None if there is none. Bytes that
+    are no UTF-8 are kept as `os.fsdecode` keeps them; a ValueError says what is no
+    YAML.
     """
     text = content.decode("utf-8-sig", "surrogateescape")
     try:
@@ -88,9 +89,9 @@ def as_float(text: Any) -> float:
 
 
 def as_truth(text: Any) -> bool:
-    """Return whether a scalar is true: a whole number except 0, or a word for yes.
+    """Return whether the text of a scalar means true: a number except 0, or "yes".
 
-    A scalar that is neither true nor false is a ValueError.
+    A text that is neither true nor false, or no text, is a ValueError.
     """
     if not isinstance(text, str):
         raise ValueError(f"{text!r} is no truth value")

@@ -87,8 +87,9 @@ def random_requests(
 ) -> list[tuple[Cell, Cell]]:
     """Draw `count` pairs of a start and a goal, joined by a path.
 
-    Starts are uniform over the free cells with a legal move, goals over the cells that
-    paths from the start lead to, without the start.
+    Starts are uniform over the free cells of `occupancy` (H, W) with a legal move, and
+    goals over the cells that paths from the start lead to, without the start. Cells are
+    (x, y).
     """
     label = GridMap(occupancy).labels(move_rule).ravel()  # (C,): 0 where occupied
     # The numbers y * W + x of the free cells, component by component: the cells of

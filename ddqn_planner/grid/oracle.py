@@ -48,7 +48,7 @@ class ShortestPaths(NamedTuple):
 def _shortest_paths(
     grid: GridMap, goal: Cell, move_rule: MoveRule | str
 ) -> ShortestPaths:
-    """Return the cheapest paths to a goal, found by scipy's Dijkstra.
+    """Return the cheapest paths from all cells to a goal, found by scipy's Dijkstra.
 
     The graph is a sparse matrix of move costs: rows are the cells where moves begin,
     columns the cells where they end.

@@ -35,17 +35,6 @@ class Directions:
 
     The zones of the message stay in effect when the publisher ends, until the next
     message.
-
-    Parameters
-    ----------
-    node
-        The planner's node, with its parameters.
-    diagnostics
-        Where refused messages are reported.
-    on_change
-        Called after each message that is not refused.
-    clock
-        Returns seconds of a steady clock.
     """
 
     def __init__(
@@ -55,7 +44,19 @@ class Directions:
         on_change: Callable[[], None],
         clock: Callable[[], float],
     ) -> None:
-        """Subscribe to the directions; the class tells the parameters."""
+        """Subscribe to the directions.
+
+        Parameters
+        ----------
+        node
+            The planner's node, with its parameters.
+        diagnostics
+            Where refused messages are reported.
+        on_change
+            Called after each message that is not refused.
+        clock
+            Returns seconds of a steady clock.
+        """
         self._node = node
         self._diagnostics = diagnostics
         self._on_change = on_change

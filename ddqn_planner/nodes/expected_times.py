@@ -22,19 +22,7 @@ CHANGED_SHARE = 0.02
 
 
 class ExpectedTimes:
-    """Puts on maps the times that an experience expects; the trainer's or a file's.
-
-    Parameters
-    ----------
-    node
-        The planner's node, with its parameters.
-    diagnostics
-        Where refused messages and files are reported.
-    worker
-        Loads experience and computes the time of a plan.
-    on_change
-        Called when maps cost other times.
-    """
+    """Puts on maps the times that an experience expects; the trainer's or a file's."""
 
     def __init__(
         self,
@@ -45,7 +33,16 @@ class ExpectedTimes:
     ) -> None:
         """Load the parameter's file, and listen to the trainer if parameters say so.
 
-        The class tells the parameters.
+        Parameters
+        ----------
+        node
+            The planner's node, with its parameters.
+        diagnostics
+            Where refused messages and files are reported.
+        worker
+            Loads experience and computes the time of a plan.
+        on_change
+            Called when maps cost other times.
         """
         self._node = node
         self._diagnostics = diagnostics

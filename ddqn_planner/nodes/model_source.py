@@ -44,22 +44,22 @@ def read_model(name: str) -> ModelOfFile:
 
 
 class ModelSource:
-    """Has the planner with the last model that could be loaded, and its file.
-
-    Parameters
-    ----------
-    node
-        The planner's node, with its parameters.
-    diagnostics
-        Where a model that cannot be loaded is reported.
-    worker
-        Its thread loads the first model.
-    """
+    """Has the planner with the last model that could be loaded, and its file."""
 
     def __init__(
         self, node: BaseNode, diagnostics: PlannerDiagnostics, worker: Worker
     ) -> None:
-        """Begin without a model; the class tells the parameters."""
+        """Begin without a model.
+
+        Parameters
+        ----------
+        node
+            The planner's node, with its parameters.
+        diagnostics
+            Where a model that cannot be loaded is reported.
+        worker
+            Its thread loads the first model.
+        """
         self.planner: Planner | None = None
         self.file = ""
         # Of the trainer's message that the model came in; it holds the digest.

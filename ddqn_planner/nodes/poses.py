@@ -114,20 +114,23 @@ class CheckedTransforms:
 
 
 class Frames:
-    """Transforms poses to the map's frame by TF, to which it listens when first needed.
+    """Transforms poses to the map's frame by TF.
 
-    Parameters
-    ----------
-    node
-        Subscribes to TF.
-    tolerance
-        Returns how many seconds the newest transform may be old, or in the future.
+    It listens to TF from the first transform that is needed.
     """
 
     def __init__(
         self, node: BaseNode, tolerance: Callable[[], float] = lambda: math.inf
     ) -> None:
-        """Begin without listening; the class tells the parameters."""
+        """Begin without listening.
+
+        Parameters
+        ----------
+        node
+            Subscribes to TF.
+        tolerance
+            Returns how many seconds the newest transform may be old, or in the future.
+        """
         self.available = has_tf()
         self._node = node
         self._tolerance = tolerance
@@ -413,22 +416,7 @@ def listen(
 
 
 class Poses(Frames):
-    """Poses in the map's frame, and the robot's pose by the parameter ``start_source``.
-
-    Parameters
-    ----------
-    node
-        Subscribes to the source.
-    diagnostics
-        Where refused poses are reported.
-    settings
-        Returns the parameters of now.
-    map_frame
-        Returns the frame of the map; empty without a map.
-    on_start
-        Called with the first pose of odometry, and with each `initialpose`: the active
-        goal may be planned for.
-    """
+    """Poses in the map's frame, and the robot's pose from its ``start_source``."""
 
     def __init__(
         self,
@@ -438,7 +426,22 @@ class Poses(Frames):
         map_frame: Callable[[], str],
         on_start: Callable[[], None],
     ) -> None:
-        """Listen to the source of the robot's pose; the class tells the parameters."""
+        """Listen to the source of the robot's pose.
+
+        Parameters
+        ----------
+        node
+            Subscribes to the source.
+        diagnostics
+            Where refused poses are reported.
+        settings
+            Returns the parameters of now.
+        map_frame
+            Returns the frame of the map; empty without a map.
+        on_start
+            Called with the first pose of odometry, and with each `initialpose`: the
+            active goal may be planned for.
+        """
         super().__init__(node, lambda: settings().transform_tolerance)
         self._diagnostics = diagnostics
         self._settings = settings

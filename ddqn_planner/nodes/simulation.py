@@ -50,18 +50,18 @@ def hyper_parameters(values: Mapping[str, Any]) -> HyperParameters:
 
 
 class Simulation:
-    """Trains on the node's map from the last ``initialpose`` to the last ``goal_pose``.
-
-    Parameters
-    ----------
-    node
-        The node that publishes the results.
-    map_file
-        A map with a start and a goal, used until a pose comes; or None.
-    """
+    """Trains on the node's map, from the last ``initialpose`` to ``goal_pose``."""
 
     def __init__(self, node: LearningNode, map_file: MapFile | None) -> None:
-        """Listen to start and goal, and begin to import torch."""
+        """Listen to start and goal, and begin to import torch.
+
+        Parameters
+        ----------
+        node
+            The node that publishes the results.
+        map_file
+            A map with a start and a goal, used until a pose comes; or None.
+        """
         self._node = node
         self._poses: dict[str, PoseStamped] = {}  # by "start" and "goal"
         if map_file is not None and node.map is not None:

@@ -287,7 +287,8 @@ def _network_of(tensors: dict[str, Floats], windows: Windows, states: int) -> Ne
     """Return a network of weights, with buffers for up to `states` states.
 
     `tensors` are the initial weights by name, as torch shapes them: each value of the
-    dictionary is replaced by a tensor that shares the network's memory.
+    dictionary is replaced by a tensor that shares the network's memory. `windows` are
+    those of the maps, whose dtype the network gets.
     """
     # Weights and biases of the convolution, of the layer after it, and with a hidden
     # layer those of the last layer, each with the inputs as its first axis.
@@ -618,7 +619,7 @@ def choose_actions(
     """Write each robot's action: with probability ε a random one, else the best by θ.
 
     `steps` is the number of steps that all robots have made since the training began; ε
-    changes linearly over the first `epsilon_steps`.
+    changes linearly over the first `epsilon_steps`. The generator `exploration` draws.
     """
     settings = learning.settings
     share = min(steps / settings.epsilon_steps, 1.0)
@@ -638,7 +639,8 @@ def move_robots(game: Game, learning: Learning, robots: Robots, replayed: int) -
     """Move each robot by its action, and put the transitions into the replay buffer.
 
     The buffer is a ring, into which `replayed` transitions have been put before: the
-    new transitions replace the oldest ones. The result is whether an episode ended.
+    new transitions replace the oldest ones. `game` tells what moves lead to. Changes
+    `robots` and ``learning.replay``, and returns whether an episode ended.
     """
     settings = learning.settings
     replay = learning.replay
@@ -728,7 +730,7 @@ def update(
 
 @inner
 def draw_batch(learning: Learning, sampling: Generator, replayed: int) -> None:
-    """Draw the batch from the replay buffer, uniformly and with replacement.
+    """Draw ``learning.batch`` from ``learning.replay``, uniformly, with replacement.
 
     The buffer is a ring, into which `replayed` transitions have been put: it holds the
     last of them.
@@ -787,8 +789,9 @@ def differentiate(
 def differentiate_last_layer(network: Network, gradient: Network, n: int) -> None:
     """Backpropagate from Q of state n through the last layer and the ReLU before it.
 
-    The gradient by the layer's weights and biases is added to; the gradient by the
-    hidden layer's output before ReLU, ``gradient.output[n]``, is written.
+    `network` has evaluated the state. The gradient by the layer's weights and biases is
+    added to; the gradient by the hidden layer's output before ReLU,
+    ``gradient.output[n]``, is written.
     """
     add_to(gradient.last_bias, gradient.q[n])
     for u in range(network.common_output.size):

@@ -39,6 +39,7 @@ class Scenario:
     move_rule: MoveRule = MoveRule.CORNER_CUTTING  # the paper's, likely
 
     def __post_init__(self) -> None:
+        """Check the fields, and that a path leads from the start to the goal."""
         check_grid(self.grid)
         start = as_cell(self.start, "the start")
         goal = as_cell(self.goal, "the goal")
@@ -311,7 +312,13 @@ class GridEnvironment(gymnasium.Env[Observations, np.int64]):
     def step(
         self, action: np.int64
     ) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
-        """Move the robot once.
+        """Move the robot once by an action, 0 to 7.
+
+        Returns
+        -------
+        The observation (H, W) after the move, the reward, whether the episode has ended
+        at the goal or by a collision, whether it has ended for lack of steps, and an
+        empty dictionary.
 
         Raises
         ------

@@ -42,7 +42,7 @@ class Episode(NamedTuple):
 
 
 def open_record(path: Path, episodes: int) -> Appender:
-    """Open an ``episodes.csv`` to append to it; a missing file is made.
+    """Open the ``episodes.csv`` at `path` to append to it; a missing file is made.
 
     Only the rows of the episodes 1 to `episodes` stay. Later rows are newer than the
     checkpoint from which the training continues.
@@ -74,7 +74,8 @@ def record(episode: Episode) -> bytes:
 def read_cells(path: str | Path, every: int) -> Iterator[tuple[Cell, ...]]:
     """Yield the cells of the episodes `every`, 2 * `every`, ... of an ``episodes.csv``.
 
-    Rows that are not complete are left out. An OSError without a file.
+    `path` is that of the file; cells are (x, y), in the order of the episode. Rows that
+    are not complete are left out. An OSError without a file.
     """
     for line in read_rows(as_path(path)):
         row = ROW.fullmatch(line)

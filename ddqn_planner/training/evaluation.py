@@ -25,8 +25,9 @@ def length_ratios(
 ) -> NDArray[np.float64]:
     """Return the cost of the greedy rollout from each cell over that of the best path.
 
-    (H, W): infinite where the rollout is trapped, NaN at the goal and in cells without
-    a path.
+    `field` is a Q field on the map `grid`, and `move_rule` the rule of its moves. The
+    result is (H, W): infinite where the rollout is trapped, NaN at the goal and in
+    cells without a path.
     """
     optimum = shortest_distances(grid, field.goal, move_rule)
     ratios = np.full(optimum.shape, np.nan)

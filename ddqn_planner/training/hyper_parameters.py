@@ -69,6 +69,7 @@ class HyperParameters:
     environments: int = _number(1, "ours: environments stepped at once", 1, 4096)
 
     def __post_init__(self) -> None:
+        """Check all values, and make them Python's numbers."""
         for entry in fields(self):
             value = getattr(self, entry.name)
             if "choices" in entry.metadata:
@@ -98,7 +99,8 @@ def _checked_number(
 ) -> float:
     """Return the value of a parameter as a Python number, an int if `is_whole`.
 
-    A ValueError if it is no such number, or outside its limits.
+    `name` is the parameter's. A ValueError if the value is no such number, or outside
+    its limits (lowest, highest).
     """
     number = real(value)
     low, high = limits

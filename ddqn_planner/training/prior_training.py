@@ -41,10 +41,11 @@ MIN_SUM = 1e-9  # in place of a sum of 0 that divides
 def prior_of(
     grid: GridMap, places: Places, older: Prior | None, seed: int = 0
 ) -> Prior | None:
-    """Train a prior on the places that were driven and are free on a map.
+    """Train a prior on the places that were driven and are free on the map `grid`.
 
     `places` has sums of what was seen at N places of the world. Fewer than
     FEWEST_PLACES places on free cells change nothing: the result is the prior `older`.
+    The same `seed` gives the same prior.
     """
     cells, is_inside = cells_of(places.position, grid)
     x, y = cells.T
@@ -295,7 +296,7 @@ def _initial_weights(
 
     `x_NI` are the I inputs of N places, `target_N` is their log slowness, and
     `weight_KN` how much each network counts each place. The hidden layers have random
-    weights, and add nothing to the prediction before the first step.
+    weights of the `seed`, and add nothing to the prediction before the first step.
     """
     networks = len(weight_KN)
     weights = _Weights(

@@ -30,21 +30,7 @@ FUSED: Final = TORCH_VERSION >= (2, 4)  # from then on, fused Adam runs on the C
 
 
 class PropagationLearner:
-    """Trains a propagation network in place.
-
-    Parameters
-    ----------
-    network
-        Gives the features of cells, and says whether costs are learned.
-    parts
-        Four dictionaries of tensors by name: of θ, of θ⁻ and of Adam's two moments. An
-        update changes them in place.
-    environment
-        Its maps, rewards and goals are those of the training.
-    next_q_of
-        Takes Q of the next states by θ and by θ⁻, (B, 8) each, and returns which of
-        them selects the next action and which evaluates that action.
-    """
+    """Trains a propagation network in place."""
 
     def __init__(
         self,
@@ -53,7 +39,21 @@ class PropagationLearner:
         environment: GridVectorEnvironment,
         next_q_of: Callable[[Q, Q], NextQ],
     ) -> None:
-        """Tabulate the features of all cells; the class tells the parameters."""
+        """Tabulate the features of all cells.
+
+        Parameters
+        ----------
+        network
+            Gives the features of cells, and says whether costs are learned.
+        parts
+            Four dictionaries of tensors by name: of θ, of θ⁻ and of Adam's two moments.
+            An update changes them in place.
+        environment
+            Its maps, rewards and goals are those of the training.
+        next_q_of
+            Takes Q of the next states by θ and by θ⁻, (B, 8) each, and returns which of
+            them selects the next action and which evaluates that action.
+        """
         self.environment = environment
         self.uses_costs = network.uses_costs
         self._next_q_of = next_q_of

@@ -17,7 +17,8 @@ def move_reward(
 
     R_t = α (d_re(t-1) - d_re(t)) + β (d_rs(t) - d_rs(t-1) - d(t, t-1)): d_re is the
     distance to the end (the goal), d_rs that to the start of the scenario, and
-    d(t, t-1) is the length of the move. A move onto the goal has the goal's reward.
+    d(t, t-1) is the length of the move, all in cells. A move onto the goal has the
+    goal's reward. With the reward "path_cost", R_t is minus the cost of the move.
     """
     if parameters.reward == "path_cost":
         # The best return is the cheapest path, and a reward depends only on the cells

@@ -70,18 +70,9 @@ FREE_BORDER: Final = 5  # cells by which a map is larger than what the robot see
 
 
 class RobotTrainer:
-    """Trains a `RobotNetwork` by Double DQN; the same arguments give the same network.
+    """Trains a `RobotNetwork` by Double DQN.
 
-    Parameters
-    ----------
-    footprint, padding
-        The body, see `read_footprint`.
-    motion, turning_radius, resolution
-        See `make_motions`; metres, and metres per cell.
-    lattice
-        A file of motions that replaces the three; then `motion` must be None.
-    seed
-        Of all random draws.
+    The same arguments give the same network.
     """
 
     def __init__(
@@ -94,7 +85,19 @@ class RobotTrainer:
         seed: int,
         padding: float = 0.0,
     ) -> None:
-        """Make maps, tables and first weights; the class tells the parameters."""
+        """Make maps, tables and first weights.
+
+        Parameters
+        ----------
+        footprint, padding
+            The body, see `read_footprint`.
+        motion, turning_radius, resolution
+            See `make_motions`; metres, and metres per cell.
+        lattice
+            A file of motions that replaces the three; then `motion` must be None.
+        seed
+            Of all random draws.
+        """
         motions = _read_motions(motion, turning_radius, resolution, lattice)
         self.network = RobotNetwork.untrained(
             read_footprint(footprint, padding), motions

@@ -310,7 +310,7 @@ class Trainer:
         write_atomically(as_path(path), safetensors.numpy.save(tensors, metadata))
 
     def restore(self, path: Path) -> None:
-        """Continue from a checkpoint of this training.
+        """Continue from the checkpoint at `path`, which must be of this training.
 
         The checkpoint's parameters may differ in `steps` alone.
 
@@ -425,7 +425,8 @@ def _initial_tensors(
 ) -> dict[str, NDArray[np.float32]]:
     """Return random weights and biases by name, drawn as torch draws them for layers.
 
-    `shapes` are those of all tensors, ``LAYER.weight`` and ``LAYER.bias``.
+    `shapes` are those of all tensors, ``LAYER.weight`` and ``LAYER.bias``. The same
+    `seed` gives the same weights.
     """
     generator = torch.Generator().manual_seed(seed)
     tensors = {}
