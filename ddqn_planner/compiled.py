@@ -24,7 +24,8 @@ def compiled(function: Function, **options: Any) -> Function:
     @cache
     def dispatcher() -> Any:
         """Return numba's object for the function, made at the first call."""
-        # Numba knows its own objects alone: the globals become those of its objects.
+        # Code that numba compiles can call numba's objects alone: compiled functions
+        # among the globals are replaced by their objects.
         scope = dict(function.__globals__)
         for name in global_names(function.__code__):
             if hasattr(scope.get(name), "dispatcher"):

@@ -233,8 +233,10 @@ class Evidence:
     def _add_error(self, visits: Visits) -> None:
         """Append to `errors` by how much a drive's time differs from the expected time.
 
-        The error is that of `ErrorRange`. The time is expected on the last map; without
-        a map, or on a drive mostly off the map, nothing is appended.
+        `visits` are the V visits and the waits of the drive. The error is the logarithm
+        of the ratio of both times, in the standard deviations that were expected. The
+        time is expected on the last map; without a map, or on a drive mostly off the
+        map, nothing is appended.
         """
         posterior = self.posterior
         if posterior is None:
@@ -243,8 +245,8 @@ class Evidence:
         is_on_map = places != NO_PLACE
         if np.count_nonzero(is_on_map) < FEWEST_VISITS:
             return
-        places = places[is_on_map]  # (K,)
-        nominal_seconds = visits.metres[is_on_map] / self.nominal_speed
+        places = places[is_on_map]  # (K,): the numbers of places on the map
+        nominal_seconds = visits.metres[is_on_map] / self.nominal_speed  # (K,)
         # The slowness of a place includes the waits that are expected there.
         expected_seconds = nominal_seconds * posterior.slowness[places]  # (K,)
         deviation = posterior.deviation_of(expected_seconds, places)
@@ -367,8 +369,9 @@ def _is_consistent(
 ) -> bool:
     """Return whether arrays of a file can be those of evidence.
 
-    They must have the right shapes and finite numbers, and sums of 0 or more. The
-    arrays are those of `Evidence.restore`.
+    They must have the right shapes and finite numbers, and sums of 0 or more: `table`
+    (N, 7) of `Places.table`, `driven` () seconds, and `errors` and `surprises` (D,) of
+    the last D drives.
     """
     if table.ndim != 2 or table.shape[1] != COLUMNS:
         return False

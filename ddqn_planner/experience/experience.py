@@ -239,9 +239,10 @@ class Experience:
         )
 
     def record_failure(self, position: Sequence[float]) -> None:
-        """Learn that the robot failed at a place, as if it had waited for `max_pause`.
+        """Learn that the robot failed at a place, as if it had waited there.
 
-        `position` is x and y in metres, in the frame of the map.
+        The wait takes `max_pause` seconds. `position` is x and y in metres, in the
+        frame of the map; a ValueError unless it is finite and near enough.
         """
         point = numbers(
             "the position",
@@ -487,14 +488,14 @@ class Experience:
         self.evidence = saved.evidence
 
     def to_bytes(self) -> bytes:
-        """Return all as bytes, for a file or a message."""
+        """Return all that was learned as bytes, an .npz file of named arrays."""
         evidence = self.evidence
         arrays: dict[str, Any] = {
             "version": VERSION,
             "options": list(self.options.values()),
-            "evidence": evidence.places.table(),
-            "driven": evidence.driven,
-            "errors": evidence.errors,
+            "evidence": evidence.places.table(),  # (N, 7)
+            "driven": evidence.driven,  # seconds
+            "errors": evidence.errors,  # (D,): of the last D drives, as the surprises
             "surprises": evidence.surprises,
         }
         if evidence.prior is not None:

@@ -105,6 +105,9 @@ def _regression(
     weighted = design.T / variances / ALIKE_PLACES
     inverse_variances = INVERSE_VARIANCE_OF_LEVEL, INVERSE_VARIANCE_OF_PRIOR_WEIGHT
     covariance = np.linalg.inv(np.diag(inverse_variances) + weighted @ design)  # (2, 2)
+    # The mean of the posterior of the weight. As always with normal distributions, it
+    # is the covariance times the sum of all means that were assumed or measured, each
+    # over its variance.
     assumed = [0, INVERSE_VARIANCE_OF_PRIOR_WEIGHT * PRIOR_WEIGHT]
     fitted_weight = float(covariance[1] @ (assumed + weighted @ log))
     # Few places may be slow by chance where the prior says so: the weight is less than

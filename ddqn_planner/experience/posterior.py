@@ -272,7 +272,7 @@ class Posterior:
         waited : (P,) float64
             The seconds that robots waited at each place, in all passages.
         """
-        reach = round(2 * self.side / self._spacing)  # links
+        reach = round(2 * self.side / self._spacing)  # links: two sides of a place
         seconds_around = self._mean_around(waited, reach)
         passages_around = self._mean_around(passages, reach)
         waits = seconds_around / (passages_around + WAIT_PLACES) / self.side

@@ -94,7 +94,9 @@ def read_recording(
     grid : GridMap
         The map on which the robot drove.
     topic, frame, robot_frame : str
-        See `read_mcap`.
+        Of MCAP files: the topic of poses or transforms, by default the one with most
+        poses; the map's frame; and the robot's frame, by default any that ends in
+        ``base_link``.
 
     Raises
     ------

@@ -94,11 +94,12 @@ def visits_of(poses: Poses, side: float, limits: Limits) -> Visits:
     Parameters
     ----------
     poses : Poses
-        All poses of the drive.
+        All poses of the drive: times in seconds, and positions in metres.
     side : float
-        Of a place, which is a square; metres.
+        The side of a place, which is a square; metres.
     limits : Limits
-        What of the drive is believed, and what counts as a wait.
+        The seconds over which poses are averaged (`window`), the usual and the greatest
+        speed in metres per second, and the longest wait in seconds (`max_pause`).
     """
     step_length = max(side, WINDOW) / 2  # metres
     steps_of_parts = []
@@ -109,7 +110,7 @@ def visits_of(poses: Poses, side: float, limits: Limits) -> Visits:
         # robot may stand at its first pose and at the last spot: that is no wait on the
         # way. So the first spot is left out, and no stand at the last one is computed.
         spots = np.array(indices_apart(means.position, STAND_DISTANCE), np.int64)[1:]
-        if not len(spots):
+        if not len(spots):  # the robot stood all the time
             continue
         # (S - 1,) for S spots: the seconds from each spot to the next one, standing at
         # the spot and then driving.

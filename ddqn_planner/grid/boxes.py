@@ -38,8 +38,8 @@ def boxes_of(is_set: NDArray[np.bool_], max_gap: int = MAX_GAP) -> list[Box]:
     ----------
     is_set : (H, W) bool
     max_gap : int
-        Two rows, or columns, with set cells lie in one box if at most so many rows or
-        columns lead from one to the next.
+        Two neighbouring rows with set cells lie in one box if the second one comes at
+        most `max_gap` rows after the first one; columns likewise.
     """
     boxes = []
     for rows in _runs(np.any(is_set, axis=1), max_gap):
@@ -51,13 +51,15 @@ def boxes_of(is_set: NDArray[np.bool_], max_gap: int = MAX_GAP) -> list[Box]:
 
 
 def _runs(is_set: NDArray[np.bool_], max_gap: int) -> list[slice]:
-    """Return slices of an array (N,) that hold all of its True elements.
+    """Return slices that hold all True elements of `is_set` (N,).
 
-    A slice goes on over a gap if the next True element lies at most `max_gap` further.
+    Two neighbouring True elements lie in one slice if the second one comes at most
+    `max_gap` elements after the first one.
     """
     indices = np.flatnonzero(is_set)
     if indices.size == 0:
         return []
+    # Indices in `indices`.
     last_of_run = np.flatnonzero(np.diff(indices) > max_gap)
     runs = np.split(indices, last_of_run + 1)
     return [slice(int(run[0]), int(run[-1]) + 1) for run in runs]

@@ -21,16 +21,18 @@ def forbidden_on(grid: GridMap, zones: GridMap) -> NDArray[np.uint8] | None:
     Parameters
     ----------
     grid : GridMap
+        The map, H x W cells.
     zones : GridMap
-        Its layer ``forbidden`` counts alone.
+        The other map, of which the layer ``forbidden`` alone counts.
 
     Returns
     -------
     (H, W) uint8 or None
-        As `GridMap.forbidden`. A cell of ``grid`` forbids what the zone at its centre
-        forbids; a cell as large as those of ``zones``, or larger, forbids what any
-        zone's cell forbids whose centre lies in it, so that no zone is lost. None if
-        the zones forbid nothing on the map.
+        For each cell of ``grid`` a bit set of forbidden moves, as `GridMap.forbidden`.
+        If the cells of ``grid`` are smaller than those of ``zones``, a cell forbids
+        what the cell of ``zones`` at its centre forbids. Otherwise it forbids all that
+        the cells of ``zones`` forbid whose centres lie in it, so that no zone is lost.
+        None if the zones forbid nothing on the map.
 
     Raises
     ------

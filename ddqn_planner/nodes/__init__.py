@@ -22,8 +22,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 def run(name: str) -> NoReturn:
     """Run a node, and end the process; its exit code is 1 if the node cannot start."""
-    # Until the node listens to signals, one of them ends the process: nothing is there
-    # to be saved. Not by an exception, as Python drops those that come inside a
+    # Until the node listens to signals, a signal ends the process at once, as there is
+    # nothing to be saved. It raises no exception, as Python drops exceptions inside a
     # callback of the import system.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: os._exit(0))
@@ -34,10 +34,10 @@ def run(name: str) -> NoReturn:
         print(f"{name}: {with_remedy(error)}", file=sys.stderr)
     except Exception:
         traceback.print_exc()
-    # Python's own end frees all that numba has compiled, for seconds on a busy machine.
-    # It stops threads in the middle of LLVM, too, and may then wait without end for a
-    # lock that one holds. The node has saved what it has to save, DDS has left the
-    # graph, and these are written:
+    # The process ends without Python's own end, which frees all that numba has
+    # compiled: that takes seconds on a busy machine, or forever if a thread is stopped
+    # in LLVM while it holds a lock. The node has saved what it has to save, and DDS has
+    # left the graph; only the logs and the output are to be written.
     logging.shutdown()
     for stream in (sys.stdout, sys.stderr):
         with suppress(

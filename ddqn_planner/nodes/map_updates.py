@@ -65,9 +65,10 @@ def values_of_update(message: OccupancyGrid, update: MapUpdate) -> NDArray[np.in
 
 
 def _check_header(map_header: Header, update_header: Header) -> None:
-    """Check that an update is of its map's frame, and has no earlier stamp than it.
+    """Raise a ValueError if an update is of another frame than its map, or is older.
 
-    An update without a stamp passes. A ValueError names the remedy.
+    It is older if its stamp is earlier than the map's; an update without a stamp
+    passes.
     """
     frame = update_header.frame_id
     map_frame = map_header.frame_id

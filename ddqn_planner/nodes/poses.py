@@ -458,7 +458,11 @@ class Poses(Frames):
         node.jump_back_callbacks.append(self._forget_odometry)
 
     def listen_to_source(self) -> None:
-        """Listen to the source that the parameter names now, if it is another one."""
+        """Listen to the source that the parameter ``start_source`` names now.
+
+        Nothing happens if the node listens to it already. Otherwise the last pose is
+        forgotten.
+        """
         source = self._settings().start_source
         if source == "odometry":
             source = "odom"

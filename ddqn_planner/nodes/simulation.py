@@ -142,8 +142,9 @@ class Simulation:
     def _open_run(self, map_in_frame: MapInFrame | None) -> TrainingRun:
         """Return a training as the node's parameters, map and poses say.
 
-        A training with a checkpoint in the output folder continues from there. A
-        ValueError or another error says why it cannot begin.
+        `map_in_frame` is the node's map and its frame; None without a map. A training
+        with a checkpoint in the output folder continues from there. A ValueError or
+        another error says why it cannot begin.
         """
         if map_in_frame is None:
             raise ValueError(NO_MAP)

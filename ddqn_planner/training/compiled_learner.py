@@ -436,7 +436,7 @@ def evaluate(
         for row in range(windows.first_changed[n], windows.first_changed[n + 1]):
             correct_output(network, windows, n, row)
         has_hidden_layer = len(network.eight) == 0
-        if has_hidden_layer:
+        if has_hidden_layer:  # otherwise ``network.output`` is ``network.q``
             apply_last_layer(network, n)
 
 

@@ -55,6 +55,7 @@ def prior_of(
     weight = places.weight[is_usable]  # (M,), as the arrays that follow
     log_slowness = places.sum_of_log[is_usable] / weight
     features = map_features(grid)[y[is_usable], x[is_usable]]  # (M, FEATURES)
+    # The columns are those of `Prior.replay`.
     rows = np.column_stack(
         [
             places.position[is_usable],

@@ -148,8 +148,9 @@ class RobotTrainer:
     def _tabulate_moves(self, motions: Motions) -> None:
         """Tabulate where each primitive leads from each pose, and its reward.
 
-        Sets `primitive_KN`, the numbers of the primitives that start with each heading,
-        and `next_KC` and `reward_KC`, by the action 0 to K - 1 and the pose.
+        With K primitives for each of N headings, and C poses of a map, it sets
+        `primitive_KN`, the numbers of the primitives that start with each heading, and
+        `next_KC` and `reward_KC`, by the action 0 to K - 1 and the pose.
         """
         primitives = [
             np.flatnonzero(motions.start == heading) for heading in range(HEADINGS)

@@ -261,7 +261,10 @@ class Trainer:
         return Planner(type(network)(network.sizes, tensors), metadata)
 
     def model_bytes(self) -> bytes:
-        """Return the present network's file; a ValueError if the training diverged."""
+        """Return the bytes of a model file with the present network.
+
+        A ValueError if the training diverged: a weight is not finite.
+        """
         if not all(
             np.isfinite(tensor).all() for tensor in self.network.tensors.values()
         ):
