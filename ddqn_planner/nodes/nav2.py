@@ -48,9 +48,10 @@ ERROR_NAMES = {
 
 
 def error_code(status: str, result_type: Any) -> int:
-    """Return the code of an outcome's status in an action's Result; 0 if canceled.
+    """Return the code of an outcome's status in an action's Result.
 
-    The type of the Result has the codes by their names.
+    `result_type` is the type of the Result, which has the codes by their names. The
+    code is 0 after a success, and for a goal that was canceled.
     """
     if status in (PlanStatus.SUCCEEDED.name, CANCELED.status):
         return 0
@@ -111,16 +112,7 @@ class NavigationServer(NamedTuple):
 
 
 class PathAction:
-    """Answers the goals of an action; the newest goal preempts the goal before it.
-
-    Parameters
-    ----------
-    action_type : type
-        Of the action. Releases have added fields: its messages tell which they have.
-    server : NavigationServer
-    others : OtherPlanners, optional
-        The server of the same action of other planners.
-    """
+    """Answers the goals of an action; the newest goal preempts the goal before it."""
 
     def __init__(
         self,
@@ -128,6 +120,17 @@ class PathAction:
         server: NavigationServer,
         others: OtherPlanners | None = None,
     ) -> None:
+        """Begin without goals.
+
+        Parameters
+        ----------
+        action_type : type
+            The type of the action. Releases of Nav2 have added fields to its messages.
+        server : NavigationServer
+            The functions of the node that answer.
+        others : OtherPlanners, optional
+            Sends the goals of other planners to their server; by default there is none.
+        """
         self._result_type = action_type.Result
         self._server = server
         self._others = others
@@ -153,6 +156,7 @@ class PathAction:
         """
 
         def given_up() -> Outcome | None:
+            """Return the outcome if a client or a newer goal has ended this goal."""
             if handle.is_cancel_requested:
                 return CANCELED
             return None if handle is self._newest_goal else PREEMPTED
@@ -178,7 +182,10 @@ class PathAction:
         return self._result(path, outcome, seconds)
 
     def _result(self, path: Path, outcome: Outcome, seconds: float) -> Any:
-        """Return the action's Result for a path that took some seconds to plan."""
+        """Return the action's Result for a path and the outcome of its planning.
+
+        `seconds` is the time that the planning took.
+        """
         result = self._result_type(path=path)
         result.planning_time = Duration(seconds=seconds).to_msg()
         result.error_code = error_code(outcome.status, self._result_type)
@@ -205,9 +212,14 @@ class PathAction:
     async def _ask_other(
         self, others: OtherPlanners, handle: GoalHandle, given_up: GivenUp
     ) -> GoalAnswer | Outcome:
-        """Return another planner's answer to a goal, or an outcome without one."""
+        """Return another planner's answer to a goal, or an outcome without an answer.
+
+        `others` sends the goal of `handle`; `given_up` returns the outcome if the goal
+        is given up now, else None.
+        """
 
         def is_preempted_there() -> bool:
+            """Return whether a newer goal was sent to the same server."""
             # The other server lets the newest goal preempt this one.
             newest = self._newest_goal
             return (
@@ -228,9 +240,11 @@ class PathAction:
 
 
 def set_state_of_other(handle: GoalHandle, status: int) -> None:
-    """End a goal as another server has ended it, with a status of its answer.
+    """End a goal as another server has ended it.
 
-    rclpy allows `canceled` only if a client asked for that.
+    `handle` is that of the goal at this node, and `status` that of the other server's
+    answer, of action_msgs/msg/GoalStatus. rclpy allows `canceled` only if a client
+    asked for that.
     """
     if handle.is_cancel_requested and status == GoalStatus.STATUS_CANCELED:
         handle.canceled()

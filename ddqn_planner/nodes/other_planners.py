@@ -86,19 +86,10 @@ def check_prefix(node: BaseNode, prefix: str) -> None:
 
 
 class OtherPlanners:
-    """The server of one action, to which goals are sent as they are.
-
-    Parameters
-    ----------
-    node
-        Sends the goals.
-    action_type
-        The type of the action.
-    name
-        The name of the action.
-    """
+    """The server of one action, to which goals are sent as they are."""
 
     def __init__(self, node: BaseNode, action_type: Any, name: str) -> None:
+        """Make a client of the action `name` of a type, which `node` uses."""
         self._node = node
         self._action_type = action_type
         self._name = name
@@ -110,7 +101,7 @@ class OtherPlanners:
         self._connect()
 
     def _connect(self) -> None:
-        """Make a client of the server, for which there may be an older client."""
+        """Make a new client of the server, in place of an older client."""
         self._client = ActionClient(
             self._node,
             self._action_type,
@@ -136,13 +127,15 @@ class OtherPlanners:
         goal : message
             The action's Goal.
         goal_id : message
-            The UUID of the goal, also at the server. So a goal that comes back to a
-            node in a circle is rejected there.
+            The UUID with which the goal came to this node. It is sent on with the same
+            UUID: if the server sends it back to this node, this node has the UUID
+            already, and rejects it.
         given_up : callable
-            Returns the outcome if the goal is given up now; then it is canceled.
+            Returns the outcome if the goal is given up now, else None. A goal that is
+            given up is canceled at the server.
         is_preempted_there : callable
-            Returns whether a newer goal preempts this one at the server. Then a goal
-            that is given up is not canceled.
+            Returns whether a newer goal was sent to the server, which then ends this
+            goal itself: there is nothing to cancel.
         """
         planner = f"the planner {planner_id!r}"
         sent_goal = await self._send(planner, goal, goal_id, given_up)
@@ -155,8 +148,9 @@ class OtherPlanners:
                 sent_goal.cancel_goal_async()
             return outcome
         if answer is None or answer.status == GoalStatus.STATUS_UNKNOWN:
-            # rclpy's client ends its node if a goal comes again whose end the client
-            # has not seen.
+            # The client has not seen the end of this goal. If a goal with the same UUID
+            # were sent again, rclpy's client would raise an error that ends the node.
+            # So a new client takes its place.
             self._client.destroy()
             self._connect()
             return Outcome(LOST, f"{planner} ended before it answered; ask again")
@@ -167,8 +161,16 @@ class OtherPlanners:
     ) -> SentGoal | Outcome:
         """Send a goal as soon as there is a server, and wait until it is accepted.
 
-        Return the accepted goal, or the outcome of a goal that is not. The parameters
-        are as of `ask`; ``planner`` names the planner in reasons.
+        Returns the accepted goal, or the outcome of a goal that was not accepted.
+
+        Parameters
+        ----------
+        planner : str
+            What outcomes call the planner that the goal names.
+        goal, goal_id : message
+            The action's Goal, and its UUID.
+        given_up : callable
+            Returns the outcome if the goal is given up now, else None.
         """
         await self._wait(
             lambda: self._client.server_is_ready() or given_up(), SERVER_WAIT
@@ -199,12 +201,17 @@ class OtherPlanners:
     async def _answer(
         self, sent_goal: SentGoal, given_up: GivenUp
     ) -> GoalAnswer | None:
-        """Return the answer to a goal; None if it is given up or the server is gone."""
+        """Return the answer to an accepted goal.
+
+        None if the goal is given up, as `given_up` tells, or if the server is gone. The
+        server is asked again each ASK_PERIOD, as a new server lacks the goal.
+        """
         while True:
             asking = sent_goal.get_result_async()
             asking.add_done_callback(self._wake)
 
             def is_over(asking: Future = asking) -> object:
+                """Return something true if there is an answer, or will be none."""
                 return asking.done() or given_up() or not self._client.server_is_ready()
 
             if await self._wait(is_over, ASK_PERIOD):
@@ -237,7 +244,10 @@ class OtherPlanners:
 
 
 def _cancel(sending: Future) -> None:
-    """Cancel a goal that is accepted after it was given up."""
+    """Cancel a goal that was accepted after it was given up.
+
+    `sending` is the future of the goal, which is done.
+    """
     sent_goal: SentGoal = sending.result()
     if sent_goal.accepted:
         sent_goal.cancel_goal_async()

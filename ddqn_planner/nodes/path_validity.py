@@ -93,9 +93,10 @@ async def check_path(
 async def poses_in_map(
     requests: Requests, inputs: PlanInputs, path: Path, has_body: bool
 ) -> Float64:
-    """Return the poses of a path in the map's frame, (N, 3): metres and radians.
+    """Return the N poses of a path in the map's frame, (N, 3): metres and radians.
 
-    Without a body the headings do not count, and are 0 in the frame of the path.
+    `inputs` has the map. Without a body the headings do not count: they are taken for 0
+    in the frame of the path. The transform of another frame is waited for.
     """
     poses = poses_of(path, with_yaw=has_body)
     map_frame: str = inputs.header.frame_id
