@@ -110,7 +110,8 @@ class Evidence:
         """Learn from a drive: its V visits of places and its W waits.
 
         If the drive differs from what was seen before, older evidence hardly counts any
-        more. All evidence fades by the time that the drive took.
+        more. All evidence fades by the time that the drive took. Slowness is the time
+        in a place over that at nominal speed.
         """
         self._add_error(visits)
         slowness = visits.seconds / visits.metres * self.nominal_speed  # (V,)
@@ -177,7 +178,8 @@ class Evidence:
         Parameters
         ----------
         rows, log : (V,) int64, (V,) float64
-            The row in `places` of each visit of the drive, and its log slowness.
+            The row in `places` of each visit of the drive, and its log slowness: the
+            logarithm of its time over that at nominal speed.
         """
         weight = self.places.weight[rows]  # (V,)
         visits = np.flatnonzero(weight >= KNOWN_WEIGHT)  # (K,): those of known places

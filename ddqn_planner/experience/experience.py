@@ -168,7 +168,8 @@ class Experience:
         Raises
         ------
         ValueError
-            If the shapes or types are wrong. Values that cannot be true are left out.
+            If the shapes or types are wrong. Poses that cannot be true, as their
+            numbers are too large or not finite, are left out.
         """
         count = numbers("seconds", seconds).size
         time = numbers("seconds", seconds, (count,)).astype(np.float64)

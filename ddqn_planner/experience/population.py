@@ -53,13 +53,15 @@ class Population(NamedTuple):
 def population_of(places: Places) -> Population:
     """Return the distribution of the log slowness, fitted to places.
 
-    `places` has sums of what was seen at N places: the level, the weight of the prior
-    and the variance are fitted to the M places that were visited.
+    The log slowness of a place is the logarithm of the time there over that at nominal
+    speed. `places` has sums of what was seen at N places: for the M places that were
+    visited, the log slowness is normal around a level plus the prediction of the prior
+    times a weight. The level, this weight and the variance are fitted.
     """
     has_visits = places.weight >= SMALLEST_WEIGHT
     weight = places.weight[has_visits]  # (M,), as the following arrays
-    mean_log = places.sum_of_log[has_visits] / weight
-    noise = NOISE / weight  # the variance of each mean
+    mean_log = places.sum_of_log[has_visits] / weight  # of the visits of each place
+    noise = NOISE / weight  # the variance of each mean, by visits that differ
     # (M, 2): the log slowness is about `design @ (level, prior_weight)`.
     design = np.column_stack([np.ones(len(weight)), places.predicted[has_visits]])
 
@@ -68,7 +70,8 @@ def population_of(places: Places) -> Population:
     for _ in range(ITERATIONS):
         level, prior_weight = _regression(mean_log, design, variance + noise)
         residual = mean_log - design @ (level, prior_weight)
-        # The part of each square that is not noise.
+        # The part of each square that is not noise. The mean is over these squares and
+        # over ASSUMED_PLACES more, of the variance VARIANCE.
         squares = residual**2 - noise
         total = ASSUMED_PLACES * VARIANCE + squares.sum() / ALIKE_PLACES
         mean_square = total / (ASSUMED_PLACES + count)
@@ -77,6 +80,8 @@ def population_of(places: Places) -> Population:
     # The log of the mean of a lognormal is half of the variance above the mean of the
     # log. The surplus counts less while few places were visited.
     surplus = (variance + NOISE) / 2 * len(weight) / (FEW_PLACES + len(weight))
+    # Quantiles over known places: the robot's speed in the open, and where it is
+    # fastest. With few known places, both are the nominal speed.
     known_log = mean_log[weight >= KNOWN_WEIGHT]
     open_log = 0.0
     fastest_log = 0.0

@@ -155,7 +155,12 @@ class Posterior:
     def update(
         self, places: Places, population: Population, prior: Prior | None
     ) -> None:
-        """Compute `known`, `unknown`, `mean` and `slowness` from what was seen.
+        """Compute `known`, `unknown`, `mean` and `slowness` of each of P places.
+
+        `mean` is the expected log slowness, the logarithm of the time in a place over
+        that at nominal speed; `slowness` is that ratio, with waits. `known` is the
+        share of the log slowness that was seen, and `unknown` the share of its standard
+        deviation that remains.
 
         Parameters
         ----------

@@ -29,10 +29,10 @@ def map_features(grid: GridMap) -> Float32:
     Returns
     -------
     (H, W, FEATURES) float32
-        Two nearnesses of the nearest wall, 0 to 1, of which the first ends sooner; the
-        distance from the wall in metres, at most REACH; for each width of NARROW
-        whether the passage is narrower, from 0 to 1; and the logarithm of the passage's
-        length in metres.
+        Two nearnesses of the nearest wall, which fall with the distance from 1 to 0,
+        the first one faster; the distance from the wall in metres, at most REACH; for
+        each width of NARROW whether the passage is narrower, from 0 to 1; and the
+        logarithm of the passage's length in metres.
     """
     occupied = grid.uninflated
     with_wall = np.pad(occupied, 1, constant_values=True)
@@ -46,7 +46,8 @@ def map_features(grid: GridMap) -> Float32:
     # (H, W): the free metres around each cell in its row, and in its column.
     width_of_rows = _free_widths(occupied, grid.resolution)
     width_of_columns = _free_widths(occupied.T, grid.resolution).T
-    # A robot drives through a passage in the direction that is free for longer.
+    # A passage leads along the row or the column, whichever is free for longer; the
+    # other one is its width.
     width = np.minimum(width_of_rows, width_of_columns)
     length = np.maximum(width_of_rows, width_of_columns)
     # Smooth steps: 1 where the passage is much narrower, 0 where it is much wider.

@@ -116,9 +116,9 @@ def listed(values: Any, name: str, remedy: str = "give a list") -> list[Any]:
 
 
 def real(value: Any) -> float:
-    """Return a number of any type as a float; anything else as NaN.
+    """Return a number of any type as a float, and anything else as NaN.
 
-    No range contains NaN.
+    So a comparison with a range refuses it, as no range contains NaN.
     """
     if not isinstance(value, Real) or is_flag(value):
         return math.nan

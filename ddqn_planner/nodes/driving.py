@@ -134,7 +134,10 @@ class DrivingRobot:
         return position.x, position.y
 
     def _on_status(self, message: GoalStatusArray) -> None:
-        """End the drive as aborted once the robot's navigation has aborted a goal."""
+        """End the drive if the robot's navigation has aborted another goal.
+
+        `message` has the status of the navigation's goals.
+        """
         aborted_goals = {
             bytes(status.goal_info.goal_id.uuid)
             for status in message.status_list

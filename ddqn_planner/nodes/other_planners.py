@@ -63,7 +63,8 @@ def action_name(prefix: str, action: str) -> str:
 def check_prefix(node: BaseNode, prefix: str) -> None:
     """Raise a ValueError if the parameter ``other_planners`` is no prefix to use.
 
-    No action can have such a name, or the actions are those of the node.
+    That is so if no action can have a name with the prefix, or if its actions would be
+    those of `node` itself. An empty prefix is right.
     """
     remedy = (
         "give the prefix to which the actions of Nav2's planner_server are remapped, "

@@ -171,7 +171,11 @@ class TrainerNode(LearningNode):
         return Answer(answer.success, f"{answer.message}; the replay was stopped")
 
     def _on_replay(self) -> Answer:
-        """Begin to publish the recorded episodes, growing place by place."""
+        """Begin to publish the recorded episodes, and answer whether there are any.
+
+        Each episode is published from its beginning on, longer by one position each
+        time.
+        """
         if self.map is None:
             return Answer(False, NO_MAP)
         file = self.folder / "episodes.csv"

@@ -86,7 +86,9 @@ def train_prior(new: Float32, older: Prior | None = None, seed: int = 0) -> Prio
 
     Several networks are trained, of which all but the last leave out some places. Their
     errors for the places left out tell how long to train, and by which share to believe
-    the predictions; a prior that cannot predict these places is believed by 0.
+    the predictions; a prior that cannot predict these places is believed by 0. The
+    prediction is the log slowness of a place: the logarithm of the time there over that
+    at nominal speed.
 
     Parameters
     ----------
