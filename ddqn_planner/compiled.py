@@ -17,8 +17,9 @@ _importing = Lock()
 def compiled(function: Function, **options: Any) -> Function:
     """Return a function that is compiled at its first call, and kept on disk.
 
-    Compiled functions that it calls are compiled with it. `options` are those of
-    `numba.njit`. The attribute `dispatcher` of the result returns numba's object.
+    Functions of this package that it calls are compiled with it. `options` are those of
+    `numba.njit`. The result has an attribute `dispatcher`: a function without
+    parameters that returns numba's object, which compiled code can call.
     """
 
     @cache

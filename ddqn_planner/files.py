@@ -301,8 +301,8 @@ def _is_same(path: Path, other: Path) -> bool:
 def locked(path: Path) -> Iterator[None]:
     """Hold the lock of a file while the block runs; wait if another process holds it.
 
-    The lock is a file of its own, beside the file, in folders that are made if they are
-    missing. A FileWriteError names the file at `path`, not its lock.
+    `path` is that of the file. The lock is another file in the same folder, which is
+    made if it is missing. A FileWriteError names the file at `path`, not the lock.
     """
     try:
         _refuse_other_kinds(path)
@@ -363,7 +363,7 @@ class WorkFolder(ExitStack):
         content
             What the folder should hold, in the words of an error: "training".
         works
-            What a process does there, in the words of an error: "trains".
+            What a process does in the folder, in the words of an error: "trains".
         after
             What happens after a save that fails, in the words of an error.
         """

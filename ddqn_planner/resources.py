@@ -81,7 +81,8 @@ def find_map(name: str) -> Path:
 def _package_path(url: str) -> Path:
     """Return the file of ``package://PACKAGE/PATH``: in the share folder of a package.
 
-    A FileNotFoundError if there is no such package, or the path leads out of it.
+    `url` is the URL. A FileNotFoundError if the package is unknown, or if PATH leads
+    out of the package.
     """
     package, _, path = url.removeprefix("package://").partition("/")
     if path.startswith("/") or ".." in Path(path).parts:

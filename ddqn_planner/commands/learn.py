@@ -90,10 +90,10 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
 
 
 def _experience_to_teach(options: Namespace) -> Experience:
-    """Return the experience that the drives add to.
+    """Return the experience to which the drives are added.
 
-    It is that of the file ``--experience``, or without it a new one. A ValueError if
-    other options contradict the file.
+    The option ``--experience`` names a file with older experience; without this option
+    the experience is new. A ValueError if another option contradicts the file.
     """
     robot = {}
     for name in ("nominal_speed", "robot_width"):
@@ -139,8 +139,8 @@ def _teach(
 ) -> None:
     """Let an experience learn from drives on a map, and train its prior.
 
-    A ValueError if no drive taught anything. Its text says that the file `out` stays as
-    it is, as the caller has not written it yet.
+    A ValueError if no drive taught anything: its text says that the file `out`, which
+    the caller writes later, is unchanged.
     """
     reasons = []
     for number, drive in enumerate(drives, 1):

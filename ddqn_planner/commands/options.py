@@ -80,10 +80,10 @@ def add_map_options(parser: ArgumentParser, move_rule: str | None) -> None:
 
 
 def read_map(options: Namespace) -> tuple[MapFile, Cell, Cell]:
-    """Return the map file that the options name, and a start and goal (x, y) on it.
+    """Return the map file that the options name, and its start and goal cells (x, y).
 
-    They are the options' cells, else those in the map file; a ValueError if there are
-    none. `options` are those of `add_map_options`.
+    `options` are those of `add_map_options`. Start and goal are the options' cells; by
+    default, those that the map file names. A ValueError if neither names them.
     """
     map_file = read_map_file(find_map(options.map))
     start = options.start or map_file.start

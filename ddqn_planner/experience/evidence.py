@@ -284,9 +284,9 @@ class Evidence:
     def merge(self, other: Evidence) -> None:
         """Add all that other evidence has seen to this evidence.
 
-        If this evidence has no prior, it takes that of the other evidence. Predictions
-        of the other prior move by the difference of the levels of both priors, see
-        `use_prior`.
+        Evidence without a prior takes the prior of `other`. The predictions that came
+        from the prior of `other` are shifted by the level of this evidence's prior
+        minus the level of that prior, see `use_prior`.
         """
         self.use_prior(other.prior if self.prior is None else self.prior)
         shift = _level_of(self.prior) - _level_of(other.prior)

@@ -468,11 +468,11 @@ class Experience:
         self._unsaved = []
 
     def _join_content_of(self, path: Path) -> None:
-        """Join what others have saved to a file with what this experience has learned.
+        """Replace the evidence by that of a file, joined with what was learned here.
 
-        The evidence becomes that of the file, and then learns what is new in this
-        experience: all that it learned since it was saved to this file or loaded from
-        it, or all evidence if the file is another.
+        If this experience was last saved to the file at `path` or loaded from it, only
+        what was learned since then is joined; with any other file, all evidence is.
+        Nothing changes if no other process has saved to the file since.
         """
         checksum = crc32(read_file(path, MAX_FILE_BYTES))
         is_own_file = path == self._saved_path
@@ -523,9 +523,10 @@ class Experience:
 
     @classmethod
     def _from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Experience:
-        """Return the experience in the arrays of a file, by their names.
+        """Return the experience that a file holds.
 
-        A ValueError, KeyError or TypeError if they are not those of an experience.
+        `arrays` are those of the file, by name. A ValueError, KeyError or TypeError if
+        they cannot be those of an experience.
         """
         version = int(arrays["version"])
         if version not in (FIRST_VERSION, VERSION):

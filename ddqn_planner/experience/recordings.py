@@ -168,8 +168,8 @@ def _check_on_map(path: Path, drives: Sequence[Drive], grid: GridMap) -> None:
 def _mcap_files_of(path: Path) -> Sequence[Path]:
     """Return the MCAP files of a bag in the order of their numbers.
 
-    `path` is a file, or a folder with files. A path that does not exist is returned,
-    too: opening it says so. A ValueError if there is no MCAP file.
+    `path` is an MCAP file, or a folder with such files. A ValueError if there are none.
+    A path that does not exist is returned, too: opening the file raises the error.
     """
     if path.is_dir():
         # The number is the end of a name, without leading zeros.
@@ -271,8 +271,9 @@ def _robots_of(
 ) -> list[str]:
     """Return the names of one source of samples for each robot, sorted.
 
-    One robot is that of the source `best`. A source whose poses lie elsewhere at the
-    same times is of another robot. Sources that differ in `dated_by` alone are one.
+    The source `best` is of the first robot. A source is of another robot if its poses
+    lie elsewhere at the same times. Sources that differ in `dated_by` alone have the
+    same name, and count once.
     """
     robots = {best._replace(dated_by="")}
     for source, samples in samples_of_source.items():
@@ -284,8 +285,9 @@ def _robots_of(
 def _are_apart(samples: Sequence[Sample], reference: Sequence[Sample]) -> bool:
     """Return whether samples are those of another robot than the reference samples.
 
-    They are if most of them lie more than DISTANCE_OF_ROBOTS from where the reference
-    robot was at the same time. Too few samples are not taken for a robot's.
+    That is so if most samples lie more than DISTANCE_OF_ROBOTS from the place of the
+    reference robot at the same time. Samples that are much fewer than the reference
+    samples are not taken for those of a robot.
     """
     if len(samples) < SMALLEST_SHARE * len(reference):
         return False

@@ -344,10 +344,11 @@ class GridMap:
         )
 
     def with_layers(self, **layers: object) -> GridMap:
-        """Return the map with other values of some fields or cached properties.
+        """Return the map with new values of some fields or cached properties.
 
-        They are neither checked nor copied. Without new cells (`PATCHED`), the map has
-        the same history, so that `patches_since` still knows it.
+        `layers` are the new values by name, which are neither checked nor copied. If
+        none of them is in `PATCHED`, the result keeps the map's history, for
+        `patches_since`.
         """
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         if layers.keys().isdisjoint(PATCHED):

@@ -102,9 +102,10 @@ class Declared(NamedTuple):
         return value
 
     def _in_type(self, value: Any) -> Any:
-        """Return a whole number as a float, or 65.0 as 65, where the default is such.
+        """Return a number in the type of the parameter's default, if nothing is lost.
 
-        Any other value is returned as it is.
+        65 becomes 65.0 for a float, and 65.0 becomes 65 for an int. Any other value is
+        returned unchanged.
         """
         default_type = type(self.default)
         if default_type is float and type(value) is int:

@@ -192,9 +192,9 @@ class Driving:
         self.start()
 
     def _on_drive(self, by_robot: str, drive: Drive) -> None:
-        """Record a drive, learn from it, and draw it.
+        """Record a drive of a robot, let the experience learn from it, and publish it.
 
-        `by_robot` says in the log whose drive it is, such as " by r1".
+        `by_robot` are the words for the robot in the log, such as " by r1".
         """
         map_in_frame = self._node.map
         folder = self._folder

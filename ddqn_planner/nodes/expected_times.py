@@ -129,9 +129,10 @@ class ExpectedTimes:
         return Experience.load(file) if experience is None else experience
 
     def apply(self, grid: GridMap) -> GridMap:
-        """Return a map whose moves cost expected time; the same map before a drive.
+        """Return the map with the expected times of its cells.
 
-        On a map that is nearly the same as the last one, the times are the same, too.
+        Before the first drive, `grid` itself is returned. A map with nearly the same
+        obstacles as the last one gets the times that were computed on the last map.
         """
         if self._experience is None or not len(self._experience.evidence.places):
             return grid

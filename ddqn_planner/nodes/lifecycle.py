@@ -288,8 +288,9 @@ class ManagedNode(BaseNode):
     ) -> ChangeState.Response:
         """Answer ``~/change_state``: do the transition that the request names.
 
-        The request names it by a label, or without a label by its number. It is refused
-        if the state does not have it, or while the node changes its state or stops.
+        The request has the label of the transition, or an empty label and its number. A
+        transition is refused if it does not begin at the present state, and while the
+        node changes its state or stops.
         """
         labels = {change.number: change.label for change in self._changes()}
         number = request.transition.id

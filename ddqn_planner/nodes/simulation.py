@@ -78,7 +78,7 @@ class Simulation:
     def _use_poses_of(self, map_file: MapFile, grid: GridMap) -> None:
         """Use the start and the goal of a map file, if it names them.
 
-        They are cells of `grid`; their poses are at the centres of the cells.
+        The poses of start and goal are at the centres of these cells of `grid`.
         """
         for name, cell in (("start", map_file.start), ("goal", map_file.goal)):
             if cell is None:

@@ -201,8 +201,8 @@ class RobotTrainer:
     def run(self, until: int) -> Iterator[BodyCertificate]:
         """Train until the body is proved with a margin, or until step `until`.
 
-        A generator: it yields what is proved so far. A step is one transition of one
-        robot.
+        A generator: it yields the certificate of the network, before the training and
+        after each UPDATES_PER_PROOF updates. A step is one transition of one robot.
         """
         until = as_whole("the number of steps", until, 1, MOST_STEPS)
         self._settle()
@@ -221,9 +221,9 @@ class RobotTrainer:
             yield certificate
 
     def metadata(self) -> ModelMetadata:
-        """Return what the model file says of the network as it is now.
+        """Return what the model file says of the network in its present state.
 
-        The fingerprint is that of the first of the maps, which have one obstacle each.
+        Its map's fingerprint is that of the training's first map.
         """
         occupancy = np.zeros((self.width, self.width), dtype=np.bool_)
         occupancy[self.obstacle_y_M[0], self.obstacle_x_M[0]] = True
@@ -241,7 +241,8 @@ class RobotTrainer:
     def _step(self, robots: int) -> None:
         """Let robots try one random primitive each, and remember the transitions.
 
-        `robots` is their number B. Each one starts in a random pose of a random map.
+        `robots` is the number B of robots. Each robot starts in a random pose of a
+        random map.
         """
         p = self.parameters
         maps = len(self.goal_M)
