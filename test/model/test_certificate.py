@@ -128,6 +128,30 @@ def test_no_margin_of_any_network_is_above_a_sampled_one(
     assert (margins.margin <= sampled_BA).all()
 
 
+@pytest.mark.parametrize("layer", ["convolution", "hidden", "moves"])
+def test_a_margin_counts_the_rounding_errors_of_every_layer(layer: str) -> None:
+    network = random_network("any_map", scale=0, filters=2)
+    assert isinstance(network, PropagationQNetwork)
+    tensors = network.tensors
+    # Two units are 1, and are passed on. In one layer they are added to 2**25, in which
+    # float32 has no place for them, before that is taken away.
+    tensors["convolution.bias"][:] = 1
+    tensors["hidden.weight"][:] = np.eye(2)
+    tensors["moves.weight"][:, 0] = 1
+    tensors[f"{layer}.weight"][:, 1] = 2.0**25
+    if layer == "convolution":
+        tensors["convolution.weight"][:, 0] = 1
+        tensors["convolution.bias"][:] = 0
+    tensors[f"{layer}.bias"][:] = -(2.0**25)
+    patch_B9 = np.full((1, 9), OCCUPIED, np.int8)
+    patch_B9[:, 4] = 0
+    feature_BI = network.features(patch_B9, MoveRule.ROBOT_SAFE)
+    logit_BA = logits(network, feature_BI)
+    assert (logit_BA == 0).all()  # exactly they are 1
+    margins = logit_margins(network, feature_BI, np.ones((1, 8), np.bool_))
+    assert (margins.margin <= logit_BA).all()
+
+
 @cache
 def unsure_and_noisy(
     share: float, noise: float

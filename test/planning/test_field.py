@@ -476,6 +476,42 @@ def test_after_too_many_changes_both_fields_are_kept(
     assert kept[:2] == kept[2:]
 
 
+def test_a_field_is_repaired_at_the_place_where_it_was_used_last() -> None:
+    planner, cells = new_planner(), np.zeros((20, 20))
+    planner.q_field(GridMap(cells), (0, 0))
+    moved = GridMap(cells, origin=(1.0, 2.0, 0.0))
+    planner.q_field(moved, (0, 0))
+    planner.q_field(moved.with_patch([[True]], 10, 10), (0, 0))
+    assert len(planner.fields.kept) == 1
+
+
+def test_the_field_used_last_is_repaired_whatever_older_ones_there_are(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.undo()
+    planner, maps = new_planner(), list(islice(new_maps(20, "maps"), 5))
+    for grid in maps:  # they differ in too many cells for a repair
+        planner.q_field(grid, (0, 0))
+    x, y = maps[-1].free_cells()[-1]
+    changed = maps[-1].with_patch([[True]], x, y)
+    planner.q_field(changed, (0, 0))
+    kept = [id(field.grid) for field in planner.fields.kept]
+    assert kept == [id(grid) for grid in (*maps[:-1], changed)]
+
+
+def test_maps_are_compared_if_at_most_2_percent_of_their_cells_differ(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.undo()
+    old = GridMap(np.zeros((10, 10)))
+    changed = old.with_patch([[True, True]], 3, 7)
+    cells = map_changes.changed_cells(old, changed)
+    assert cells is not None
+    assert cells.tolist() == [[3, 7], [4, 7]]
+    changed = changed.with_patch([[True]], 0, 0)
+    assert map_changes.changed_cells(old, changed) is None
+
+
 def test_maps_are_compared_where_one_is_the_other_shifted_by_whole_cells() -> None:
     cells = np.zeros((9, 9))
     old = GridMap(cells, 0.05)
