@@ -3,7 +3,6 @@
 import hashlib
 import logging
 import pickle
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -37,12 +36,12 @@ def read_checked(path: Path) -> Any:
 
 
 class CodeFiles:
-    """The files of one function: an index, and the code for each of its signatures.
+    """The files of one function: a file for the code of each signature.
 
-    They replace numba's ``IndexDataCacheFile``, with files of the same names. After a
-    power cut, files of that class may be empty or have blocks of zeros; numba would
-    unpickle them, and run the machine code in them, which can end the process. So the
-    checksum of a file is compared before the file is unpickled.
+    They replace numba's ``IndexDataCacheFile``. After a power cut, files of that class
+    may be empty or have blocks of zeros; numba would unpickle them, and run the machine
+    code in them, which can end the process. So the checksum of a file is compared
+    before the file is unpickled.
     """
 
     def __init__(self, folder: Path, base: str, source_stamp: object) -> None:
@@ -58,72 +57,33 @@ class CodeFiles:
         """
         self._folder = folder
         self._base = base
-        self._index = folder / f"{base}.nbi"
         self._state = (numba.__version__, source_stamp)
-        self.last_read = self._index  # the path of the file that was read last
+        self.last_read = folder  # the path of the file that was read last
 
     def load(self, key: object) -> Any:
         """Return the data that was saved for a key, or None without any.
 
         A key is a signature of the function. An error is raised if a file is damaged.
         """
-        name = self._read_index().get(key)
-        if name is None:
-            return None
+        self.last_read = self._path(key)
         try:
-            saved_key, data = self._read(self._folder / name)
+            state, pickled = read_checked(self.last_read)
         except FileNotFoundError:
             return None
-        # Two processes that saved at once may have chosen the same name.
+        if state != self._state:
+            return None  # of another numba or an older source: to be overwritten
+        saved_key, data = pickle.loads(pickled)
         return data if saved_key == key else None
 
     def save(self, key: object, data: object) -> None:
-        """Save data for a key, and then its file's name in the index.
+        """Save data for a key; an error is raised if that fails."""
+        pickled = dumps((key, data))  # type: ignore[no-untyped-call]
+        write_checked(self._path(key), (self._state, pickled))
 
-        In this order, as the index then names complete files only.
-        """
-        try:
-            names = self._read_index()
-        except Exception:  # the new index replaces a damaged one
-            names = {}
-        if key not in names:
-            names[key] = self._free_name(set(names.values()))
-        write_checked(self._folder / names[key], (key, data))
-        write_checked(self._index, (self._state, names))
-
-    def _free_name(self, names: set[str]) -> str:
-        """Return a name for a file of data that is not in `names`."""
-        for number in count(1):
-            name = f"{self._base}.{number}.nbc"
-            if name not in names:
-                break
-        return name
-
-    def flush(self) -> None:
-        """Write an index without entries; numba calls this to drop all code."""
-        write_checked(self._index, (self._state, {}))
-
-    def remove_last_read(self) -> None:
-        """Remove the file that was read last; an OSError if that fails."""
-        if self.last_read.is_dir() and not self.last_read.is_symlink():
-            self.last_read.rmdir()
-        else:
-            self.last_read.unlink(missing_ok=True)
-
-    def _read_index(self) -> dict[object, str]:
-        """Return the names of the files of data, by key; none without an index."""
-        try:
-            state, names = self._read(self._index)
-        except FileNotFoundError:
-            return {}
-        if state != self._state:
-            return {}  # of another numba or an older source: to be overwritten
-        return dict(names)
-
-    def _read(self, path: Path) -> Any:
-        """Return the value of a file, and note its path in `last_read`."""
-        self.last_read = path
-        return read_checked(path)
+    def _path(self, key: object) -> Path:
+        """Return the path of the file for a key."""
+        digest = hashlib.sha256(repr(key).encode()).hexdigest()[:16]
+        return self._folder / f"{self._base}.{digest}.nbc"
 
 
 class CheckedCache(FunctionCache):
@@ -150,7 +110,7 @@ class CheckedCache(FunctionCache):
         except Exception as error:
             problem = _reason(error)
         try:
-            self._files.remove_last_read()
+            self._files.last_read.unlink(missing_ok=True)
             result = "removed, and compiled again"
         except OSError as error:
             result = f"compiled at each start; remove it by hand ({_reason(error)})"
