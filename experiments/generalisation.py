@@ -7,10 +7,8 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import groupby
-from operator import itemgetter
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 # Before NumPy is imported. On a busy machine, several threads are ten times as slow as
 # one.
@@ -51,15 +49,29 @@ COSTS: Final[dict[str, Callable[[Occupancy, Random], NDArray[np.int8] | None]]] 
 GOALS = 10  # of a generated map: each needs a Q field and exact distances
 OPTIMAL = 1 + 1e-6  # ratio to the optimum up to which a rollout is optimal
 AGREES = 1e-4  # relative difference from a file's optimum, which is rounded
+SHORTEST_GROUP = 16  # cells: the optima of the first row of the second table
 SUFFIXES: Final = (".map", ".scen", ".yaml", ".yml")  # of MovingAI and ROS
+# Columns of a scenario's lines: width, height, start x and y, goal x and y, and the
+# length of the best path.
+ENDS: Final = slice(2, 6)
+OPTIMUM: Final = 6
 COLUMNS: Final = (
     "maps | requests | success | without action masking | optimal | mean | worst "
-    "| illegal | "
-    "field ms | Dijkstra ms"
+    "| illegal | field ms | Dijkstra ms"
+)
+EXPLANATION: Final = (
+    "Every request has a path. Without action masking: solved too by a rollout "
+    "that may choose illegal moves, which end it. "
+    "Optimal, mean, worst: cost of the rollout over that of the "
+    "best path. Times are medians; Dijkstra's includes its graph."
 )
 
 
-Drawn = tuple[GridMap, list[tuple[Cell, Cell]]]  # requests: start and goal
+class Request(NamedTuple):
+    """A start and a goal, free cells with a path between them."""
+
+    start: Cell
+    goal: Cell
 
 
 @dataclass(frozen=True)
@@ -90,7 +102,7 @@ class BenchmarkMap:
     set_name: str
     name: str
     grid: GridMap
-    requests: list[tuple[Cell, Cell]]
+    requests: Sequence[tuple[Cell, Cell]]
     optima: Sequence[float] | None = None
 
 
@@ -104,28 +116,29 @@ def generated_maps(
                 name = f"{kind}-{size}-{number}"
                 random = settings.random(name)
                 occupancy = generate_map(kind, (size, size), random)
-                yield BenchmarkMap(
-                    kind, name, *_draw(occupancy, GOALS, settings, random)
-                )
+                grid = settings.grid(occupancy, random)
+                requests = draw_requests(grid, GOALS, settings, random)
+                yield BenchmarkMap(kind, name, grid, requests)
 
 
-def _draw(
-    occupancy: Occupancy, goals: int, settings: RequestSettings, random: Random
-) -> Drawn:
-    """Draw costs and requests for a map.
-
-    Each of the goals has the same number of requests.
-    """
-    grid, requests = settings.grid(occupancy, random), []
-    parts = np.array_split(range(settings.requests), goals)
-    drawn = random_requests(occupancy, settings.move_rule, goals, random)
-    for part, (start, goal) in zip(parts, drawn, strict=True):
-        connected = GridMap(occupancy).reachable([goal], settings.move_rule)
-        connected[goal[::-1]] = False
-        more = random.choice(np.argwhere(connected), max(len(part) - 1, 0)).tolist()
-        starts = [start, *((x, y) for y, x in more)]
-        requests += [(cell, goal) for cell in starts[: len(part)]]
-    return grid, requests
+def draw_requests(
+    grid: GridMap, n_goals: int, settings: RequestSettings, random: Random
+) -> list[Request]:
+    """Draw requests for a map, about the same number for each of some goals."""
+    requests: list[Request] = []
+    first_requests = random_requests(
+        grid.occupancy, settings.move_rule, n_goals, random
+    )
+    numbers = [len(part) for part in np.array_split(range(settings.requests), n_goals)]
+    for number, (start, goal) in zip(numbers, first_requests, strict=True):
+        is_start = GridMap(grid.occupancy).reachable([goal], settings.move_rule)
+        goal_x, goal_y = goal
+        is_start[goal_y, goal_x] = False
+        starts = [start]
+        for y, x in random.choice(np.argwhere(is_start), max(number - 1, 0)).tolist():
+            starts.append((x, y))
+        requests += [Request(cell, goal) for cell in starts[:number]]
+    return requests
 
 
 def find_files(folder: Path) -> list[Path]:
@@ -150,28 +163,34 @@ def read_maps(
 
     Files that cannot be read are named on stderr, and left out.
     """
-    suffix_of = {path: path.suffix.lower() for path in files}
-    scenarios = {
-        p.stem.removesuffix(".map"): p for p in files if suffix_of[p] == ".scen"
-    }
-    for path, suffix in suffix_of.items():
+    suffixes = {path: path.suffix.lower() for path in files}
+    scenarios = {}
+    for path, suffix in suffixes.items():
+        if suffix == ".scen":
+            scenarios[path.stem.removesuffix(".map")] = path
+    for path, suffix in suffixes.items():
         try:
             if suffix == ".map" and path.stem in scenarios:
-                yield _scenario_map(path, scenarios[path.stem], settings)
+                yield _map_with_scenario(path, scenarios[path.stem], settings)
             elif suffix != ".scen":
-                name = f"{'movingai' if suffix == '.map' else 'ros'} {path.stem}"
-                occupancy, random = (
-                    read_map_file(path).grid().occupancy,
-                    settings.random(path.stem),
-                )
-                drawn = _draw(occupancy, settings.requests, settings, random)
-                yield BenchmarkMap(name, str(path), *drawn)
+                yield _map_without_scenario(path, settings)
         except (OSError, ValueError) as error:
-            known = "" if str(path) in str(error) else f"{path}: "
-            tqdm.write(f"skipped: {known}{error}", file=sys.stderr)
+            message = str(error)
+            if str(path) not in message:
+                message = f"{path}: {message}"
+            tqdm.write(f"skipped: {message}", file=sys.stderr)
 
 
-def _scenario_map(
+def _map_without_scenario(path: Path, settings: RequestSettings) -> BenchmarkMap:
+    """Read a map, and draw requests to as many goals."""
+    random = settings.random(path.stem)
+    grid = settings.grid(read_map_file(path).grid().occupancy, random)
+    requests = draw_requests(grid, settings.requests, settings, random)
+    source = "movingai" if path.suffix.lower() == ".map" else "ros"
+    return BenchmarkMap(f"{source} {path.stem}", str(path), grid, requests)
+
+
+def _map_with_scenario(
     path: Path, scenario: Path, settings: RequestSettings
 ) -> BenchmarkMap:
     """Read a MovingAI map, and requests of its scenario file.
@@ -179,27 +198,38 @@ def _scenario_map(
     Short and long paths are drawn alike.
     """
     random = settings.random(path.stem)
-    rule = settings.move_rule
     grid = settings.grid(read_map_file(path).grid().occupancy, random)
     lines = _scenario_lines(scenario)
-    lines = lines[lines[:, -1].argsort(kind="stable")]  # by the optimal length
+    optima = lines[:, OPTIMUM]
+    lines = lines[optima.argsort(kind="stable")]
     # One from each of as many equal parts as requests.
     count = min(settings.requests, len(lines))
     edges = np.arange(count + 1) * len(lines) // count
-    drawn = lines[random.integers(edges[:-1], edges[1:])]
-    ends = drawn[:, 2:-1].astype(np.int64).tolist()
-    requests = [((x, y), (goal_x, goal_y)) for x, y, goal_x, goal_y in ends]
-    labels = grid.labels(rule)
+    drawn_lines = lines[random.integers(edges[:-1], edges[1:])]
+    requests = []
+    for start_x, start_y, goal_x, goal_y in drawn_lines[:, ENDS].astype(int).tolist():
+        requests.append(Request((start_x, start_y), (goal_x, goal_y)))
+    _check_requests(requests, grid, settings.move_rule, scenario)
+    if settings.move_rule is MoveRule.ROBOT_SAFE and grid.cost is None:
+        # As in the file.
+        optima_of_file = drawn_lines[:, OPTIMUM].tolist()
+    else:
+        optima_of_file = None
+    name = f"movingai {path.stem}"
+    return BenchmarkMap(name, str(path), grid, requests, optima_of_file)
+
+
+def _check_requests(
+    requests: Iterable[Request], grid: GridMap, move_rule: MoveRule, scenario: Path
+) -> None:
+    """Raise ValueError if a request of a scenario file has no path."""
+    labels = grid.labels(move_rule)
     for start, goal in requests:
         are_free = grid.is_free(start) and grid.is_free(goal)
         if not are_free or labels[start[::-1]] != labels[goal[::-1]]:
             raise ValueError(
                 f"{scenario}: no path joins {start} and {goal} on this map"
             )
-    optima = None
-    if rule is MoveRule.ROBOT_SAFE and grid.cost is None:  # as in the file
-        optima = drawn[:, -1].tolist()
-    return BenchmarkMap(f"movingai {path.stem}", str(path), grid, requests, optima)
 
 
 def _scenario_lines(scenario: Path) -> NDArray[np.float64]:
@@ -225,9 +255,8 @@ class Rollout:
     map_name: str
     size: str
     optimum: float  # exact cost of the best path; without costs its length in cells
-    agrees: (
-        bool | None
-    )  # whether the benchmark's file says the same, if it says anything
+    agrees: bool | None
+    """Whether the file gives the same optimum; None if the file gives none."""
     ratio: float  # cost of the rollout over the optimum; infinite if it misses the goal
     unmasked: bool  # whether the rollout without action masking reaches the goal too
     illegal: int  # number of illegal moves
@@ -242,60 +271,84 @@ def measure(
 
     ValueError if the model has another size.
     """
-    warm = False
-    for drawn in maps:
-        grid, requests = drawn.grid, drawn.requests
+    is_warm = False
+    for benchmark_map in maps:
+        grid = benchmark_map.grid
+        if not is_warm:  # the first field of a process also loads compiled code
+            _, goal = benchmark_map.requests[0]
+            compare_with_dijkstra(planner, grid, goal, move_rule)
+            is_warm = True
         legal = legal_moves(grid.occupancy, move_rule)
-        given = drawn.optima or [math.nan] * len(requests)
-        cases = [
-            (goal, start, o) for (start, goal), o in zip(requests, given, strict=True)
-        ]
-        for goal, of_goal in groupby(
-            sorted(cases, key=itemgetter(0)), key=itemgetter(0)
-        ):
-            if not warm:  # the first field of a process also loads compiled code
-                compare_with_dijkstra(planner, grid, goal, move_rule)
-                warm = True
-            field, optima, *times = compare_with_dijkstra(
-                planner, grid, goal, move_rule
-            )
-            unmasked = field.unmasked()
-            for _, start, told in of_goal:
-                cells = field.rollout(start).cells
-                arrived = cells[:1] == (start,) and cells[-1:] == (goal,)
-                cost = cost_along(cells, grid, move_rule) if arrived else math.inf
-                optimum = float(optima[start[::-1]])
-                agrees = math.isclose(told, optimum, rel_tol=AGREES)
+        for goal, cases in cases_by_goal(benchmark_map).items():
+            comparison = compare_with_dijkstra(planner, grid, goal, move_rule)
+            unmasked_field = comparison.field.unmasked()
+            for case in cases:
+                cells = comparison.field.rollout(case.start).cells
+                cost = math.inf
+                if cells and (cells[0], cells[-1]) == (case.start, goal):
+                    cost = cost_along(cells, grid, move_rule)
+                x, y = case.start
+                optimum = float(comparison.distances[y, x])
+                agrees = None
+                if case.optimum is not None:
+                    agrees = math.isclose(case.optimum, optimum, rel_tol=AGREES)
                 yield Rollout(
-                    drawn.set_name,
-                    drawn.name,
+                    benchmark_map.set_name,
+                    benchmark_map.name,
                     f"{grid.width}x{grid.height}",
-                    optimum,
-                    None if math.isnan(told) else agrees,
-                    cost / optimum if start != goal else 1.0,
-                    bool(unmasked.rollout(start).cells),
-                    illegal_moves(cells, legal),
-                    *times,
+                    optimum=optimum,
+                    agrees=agrees,
+                    ratio=cost / optimum if case.start != goal else 1.0,
+                    unmasked=bool(unmasked_field.rollout(case.start).cells),
+                    illegal=illegal_moves(cells, legal),
+                    field_ms=comparison.field_ms,
+                    dijkstra_ms=comparison.dijkstra_ms,
                 )
+
+
+class Case(NamedTuple):
+    """A request to a goal, with the optimum that the map's file gives, if any."""
+
+    start: Cell
+    optimum: float | None
+
+
+def cases_by_goal(benchmark_map: BenchmarkMap) -> dict[Cell, list[Case]]:
+    """Return the requests of a map: of each goal, in the order of their starts."""
+    requests = benchmark_map.requests
+    optima = benchmark_map.optima or [None] * len(requests)
+    cases: dict[Cell, list[Case]] = {}
+    for (start, goal), optimum in zip(requests, optima, strict=True):
+        cases.setdefault(goal, []).append(Case(start, optimum))
+    return cases
+
+
+class Comparison(NamedTuple):
+    """A goal's Q field, exact distances (H, W), and how long both took."""
+
+    field: QField
+    distances: NDArray[np.float64]
+    field_ms: float
+    dijkstra_ms: float
 
 
 def compare_with_dijkstra(
     planner: Planner, grid: GridMap, goal: Cell, move_rule: MoveRule
-) -> tuple[QField, NDArray[np.float64], float, float]:
-    """Return a goal's Q field, exact distances (H, W), and both times.
-
-    The times are in milliseconds.
-    """
-    began = time.perf_counter()
+) -> Comparison:
+    """Compute a goal's Q field and exact distances."""
     # A new planner, as one that knows the goal would look the field up.
-    field = Planner(planner.network, planner.metadata).q_field(grid, goal, move_rule)
-    field.policy  # noqa: B018  # from it, as from the distances, the path of any start can be read
-    middle = time.perf_counter()
-    distances = shortest_distances(
-        grid, goal, move_rule
-    )  # with the graph that scipy needs
+    new_planner = Planner(planner.network, planner.metadata)
+    began = time.perf_counter()
+    field = new_planner.q_field(grid, goal, move_rule)
+    # From the policy, as from the distances, the path of any start can be read.
+    _ = field.policy
+    has_field = time.perf_counter()
+    # With the graph that scipy needs.
+    distances = shortest_distances(grid, goal, move_rule)
     ended = time.perf_counter()
-    return field, distances, 1e3 * (middle - began), 1e3 * (ended - middle)
+    field_ms = 1e3 * (has_field - began)
+    dijkstra_ms = 1e3 * (ended - has_field)
+    return Comparison(field, distances, field_ms, dijkstra_ms)
 
 
 def illegal_moves(cells: Sequence[Cell], legal: NDArray[np.bool_]) -> int:
@@ -303,42 +356,46 @@ def illegal_moves(cells: Sequence[Cell], legal: NDArray[np.bool_]) -> int:
 
     `legal` is what `legal_moves` returns.
     """
-    array = np.array(cells, dtype=np.int64).reshape(-1, 2)
-    x, y = array[:-1].T
-    is_action = (np.diff(array, axis=0)[:, None] == MOVES).all(axis=2)
-    return int(np.count_nonzero(~(is_action & legal[:, y, x].T).any(axis=1)))
+    path = np.array(cells, dtype=np.int64).reshape(-1, 2)  # (N, 2)
+    x, y = path[:-1].T
+    steps = np.diff(path, axis=0)  # (N - 1, 2)
+    is_move = (steps[:, None] == MOVES).all(axis=2)  # (N - 1, A): which move it is
+    is_legal_move = is_move & legal[:, y, x].T
+    return int(np.count_nonzero(~is_legal_move.any(axis=1)))
 
 
 def markdown(rollouts: Sequence[Rollout]) -> str:
     """Return the report: a table by set and size, and a table by optimum.
 
-    The classes of the optimum are 0-16, 16-32, and so on.
+    The groups of the optimum are 0-16, 16-32, and so on.
     """
     by_set: dict[tuple[str, str], list[Rollout]] = {}
-    by_optimum: dict[str, list[Rollout]] = {}
     for rollout in rollouts:
         by_set.setdefault((rollout.set_name, rollout.size), []).append(rollout)
+    by_group: dict[str, list[Rollout]] = {}
     for rollout in sorted(rollouts, key=lambda rollout: rollout.optimum):
-        upper = max(16, 2 ** math.frexp(rollout.optimum)[1])
-        group = f"{upper // 2 if upper > 16 else 0}-{upper}"
-        by_optimum.setdefault(group, []).append(rollout)
-    by_optimum["all"] = [*rollouts]
-    sets = [[*names, *_row(members)] for names, members in by_set.items()]
-    optima = [[name, *_row(members)] for name, members in by_optimum.items()]
-    text = (
-        "Every request has a path. Without action masking: solved too by a rollout "
-        "that may choose illegal moves, which end it. "
-        "Optimal, mean, worst: cost of the rollout over that of the "
-        "best path. Times are medians; Dijkstra's includes its graph."
-    )
-    if given := [rollout.agrees for rollout in rollouts if rollout.agrees is not None]:
-        agreement = f"{sum(given)}/{len(given)}"
+        by_group.setdefault(optimum_group(rollout.optimum), []).append(rollout)
+    by_group["all"] = [*rollouts]
+    set_rows = [[*names, *_row(members)] for names, members in by_set.items()]
+    group_rows = [[name, *_row(members)] for name, members in by_group.items()]
+    text = EXPLANATION
+    agreements = [rollout.agrees for rollout in rollouts if rollout.agrees is not None]
+    if agreements:
+        agreement = f"{sum(agreements)}/{len(agreements)}"
         text += f"\nOptima given by files: the oracle agrees with {agreement}."
-    tables = (
-        table(f"set | size | {COLUMNS}", sets),
-        table(f"optimum | {COLUMNS}", optima),
-    )
-    return "\n\n".join((text, *tables))
+    set_table = table(f"set | size | {COLUMNS}", set_rows)
+    group_table = table(f"optimum | {COLUMNS}", group_rows)
+    return "\n\n".join((text, set_table, group_table))
+
+
+def optimum_group(optimum: float) -> str:
+    """Return the name of the group that an optimum is in, such as 16-32."""
+    lower = 0
+    upper = SHORTEST_GROUP
+    while optimum >= upper:
+        lower = upper
+        upper *= 2
+    return f"{lower}-{upper}"
 
 
 def _row(rollouts: Sequence[Rollout]) -> list[object]:
@@ -346,19 +403,23 @@ def _row(rollouts: Sequence[Rollout]) -> list[object]:
 
     The ratios are those of solved requests, NaN if none is solved.
     """
-    requests = len(rollouts)
+    count = len(rollouts)
+    maps = {(rollout.set_name, rollout.size, rollout.map_name) for rollout in rollouts}
     ratios = np.array([rollout.ratio for rollout in rollouts])
-    solved = ratios[np.isfinite(ratios)]
+    solved_ratios = ratios[np.isfinite(ratios)]
+    n_unmasked = sum(rollout.unmasked for rollout in rollouts)
+    mean = worst = math.nan
+    if solved_ratios.size:
+        mean = float(solved_ratios.mean())
+        worst = float(solved_ratios.max())
     return [
-        len(
-            {(rollout.set_name, rollout.size, rollout.map_name) for rollout in rollouts}
-        ),
-        requests,
-        f"{len(solved)}/{requests}",
-        f"{sum(rollout.unmasked for rollout in rollouts)}/{requests}",
-        f"{np.count_nonzero(ratios <= OPTIMAL)}/{requests}",
-        f"{solved.mean() if len(solved) else math.nan:.4f}",
-        f"{solved.max() if len(solved) else math.nan:.4f}",
+        len(maps),
+        count,
+        f"{len(solved_ratios)}/{count}",
+        f"{n_unmasked}/{count}",
+        f"{np.count_nonzero(ratios <= OPTIMAL)}/{count}",
+        f"{mean:.4f}",
+        f"{worst:.4f}",
         sum(rollout.illegal for rollout in rollouts),
         f"{np.median([rollout.field_ms for rollout in rollouts]):.2f}",
         f"{np.median([rollout.dijkstra_ms for rollout in rollouts]):.2f}",
@@ -408,27 +469,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """Print the tables of the maps that the options ask for; return the exit code."""
-    for name, least in (("maps", 1), ("requests", 1), ("seed", 0)):
-        if getattr(options, name) < least:
-            raise ValueError(
-                f"--{name} is {getattr(options, name)}; give at least {least}"
-            )
+    for name, minimum in (("maps", 1), ("requests", 1), ("seed", 0)):
+        value = getattr(options, name)
+        if value < minimum:
+            raise ValueError(f"--{name} is {value}; give at least {minimum}")
     rule = MoveRule(options.move_rule)
     settings = RequestSettings(rule, options.requests, options.costs, options.seed)
     planner = Planner.load(options.model)
-    maps = generated_maps(options.kinds, options.sizes, options.maps, settings)
     if options.data:
         maps = read_maps(find_files(options.data), settings)
+    else:
+        maps = generated_maps(options.kinds, options.sizes, options.maps, settings)
     rollouts: list[Rollout] = []
-    code, model = 0, planner.metadata
+    code = 0
     try:
-        rollouts.extend(measure(planner, tqdm(maps, unit="map", disable=None), rule))
+        for rollout in measure(planner, tqdm(maps, unit="map", disable=None), rule):
+            rollouts.append(rollout)
     except KeyboardInterrupt:
         code = 130
         print("interrupted; the tables hold the maps so far", file=sys.stderr)
     if not rollouts and not code:
         raise ValueError(f"{options.data}: none of its files has a request; see above")
     if rollouts:
+        model = planner.metadata
         print(
             f"Model {options.model} ({model.network}, {model.steps:,} steps, "
             f"seed {model.seed}), move rule {rule.value}, costs {options.costs}, "
