@@ -59,6 +59,14 @@ ARGUMENTS = {
 }
 """The arguments, each with its default and its description."""
 
+# Those that Nav2's own launch files have, too.
+COMMON_ARGUMENTS = (
+    "use_sim_time",
+    "params_file",
+    "autostart",
+    "use_respawn",
+    "log_level",
+)
 SWITCHES = (
     "use_sim_time",
     "slam",
@@ -206,20 +214,22 @@ def nodes_of(document, namespace):
 
 def parameters_of(nodes, namespace, name):
     """Return the parameters that a node takes; its full name goes before wildcards."""
-    together = {}
+    parameters = {}
     for key in ("/**", f"/**/{name}", f"{namespace}/{name}"):
-        together.update(nodes.get(key, {}))
-    return together
+        parameters.update(nodes.get(key, {}))
+    return parameters
 
 
-def raise_parameter(nodes, namespace, node, name, least):
-    """Let a parameter be at least so large.
+def raise_parameter(nodes, namespace, node, name, minimum):
+    """Let a parameter be at least as large as the minimum.
 
     A substitution, which is a string, stays.
     """
-    value = parameters_of(nodes, namespace, node).get(name, least)
-    if not isinstance(value, str) and not isinstance(least, str):
-        nodes.setdefault(f"{namespace}/{node}", {})[name] = max(value, least)
+    value = parameters_of(nodes, namespace, node).get(name, minimum)
+    if isinstance(value, str) or isinstance(minimum, str):
+        return
+    parameters = nodes.setdefault(f"{namespace}/{node}", {})
+    parameters[name] = max(value, minimum)
 
 
 def with_zones(value, zones):
@@ -228,7 +238,9 @@ def with_zones(value, zones):
         return {key: with_zones(entry, zones) for key, entry in value.items()}
     if isinstance(value, list):
         return [with_zones(entry, zones) for entry in value]
-    return zones.get(value, value) if isinstance(value, str) else value
+    if isinstance(value, str):
+        return zones.get(value, value)
+    return value
 
 
 def saved(nodes):
@@ -251,14 +263,13 @@ def nav2_parameters(arguments, namespace):
         "SPEED_ZONE_ENABLED": bool(arguments["speed_mask"]),
     }
     nodes = nodes_of(with_zones(document, zones), namespace)
-    least = milliseconds("server_timeout", arguments["server_timeout"])
-    raise_parameter(nodes, namespace, "bt_navigator", "default_server_timeout", least)
+    timeout = milliseconds("server_timeout", arguments["server_timeout"])
+    raise_parameter(nodes, namespace, "bt_navigator", "default_server_timeout", timeout)
     # The planner sees of the costmap what is published.
     costmap = f"{namespace}/global_costmap"
-    updates = parameters_of(nodes, costmap, "global_costmap").get(
-        "update_frequency", 5.0
-    )
-    raise_parameter(nodes, costmap, "global_costmap", "publish_frequency", updates)
+    costmap_parameters = parameters_of(nodes, costmap, "global_costmap")
+    frequency = costmap_parameters.get("update_frequency", 5.0)
+    raise_parameter(nodes, costmap, "global_costmap", "publish_frequency", frequency)
     if arguments["graph"]:
         route = nodes.setdefault(f"{namespace}/route_server", {})
         route["graph_filepath"] = arguments["graph"]
@@ -296,19 +307,23 @@ def servers_of(nodes, namespace):
 
     An optional one needs its package and its parameters.
     """
-    return [
-        server
-        for server in SERVERS
-        if server[2] not in OPTIONAL
-        or (is_installed(server[0]) and parameters_of(nodes, namespace, server[2]))
-    ]
+    servers = []
+    for server in SERVERS:
+        package, _, name, _ = server
+        if name in OPTIONAL:
+            has_parameters = bool(parameters_of(nodes, namespace, name))
+            if not has_parameters or not is_installed(package):
+                continue
+        servers.append(server)
+    return servers
 
 
 def nav2_nodes(arguments, namespace):
     """Return Nav2's nodes with the planner, and the manager of their lifecycle."""
     nodes = nav2_parameters(arguments, namespace)
     parameter_file = saved(nodes)
-    own = {f"{namespace}/{PLANNER}": planner_parameters(nodes, arguments, namespace)}
+    parameters = planner_parameters(nodes, arguments, namespace)
+    planner_file = saved({f"{namespace}/{PLANNER}": parameters})
     servers = servers_of(nodes, namespace)
     names = [name for _, _, name, _ in servers]
     options = {
@@ -318,8 +333,13 @@ def nav2_nodes(arguments, namespace):
     }
     actions = []
     for package, executable, name, remaps in servers:
-        is_planner = name == PLANNER
-        remappings = TRANSFORMS + remaps + (PLANNER_REMAPS if is_planner else [])
+        remappings = [*TRANSFORMS, *remaps]
+        parameters = [parameter_file]
+        respawn_delay = 2.0
+        if name == PLANNER:
+            remappings += PLANNER_REMAPS
+            parameters = [planner_file]
+            respawn_delay = 1.0  # it is back before the manager gives up
         if name == "velocity_smoother" and "collision_monitor" not in names:
             # Else nothing would pass the velocities on.
             remappings.append(("cmd_vel_smoothed", "cmd_vel"))
@@ -327,11 +347,10 @@ def nav2_nodes(arguments, namespace):
             package=package,
             executable=executable,
             name=name,
-            parameters=[saved(own) if is_planner else parameter_file],
+            parameters=parameters,
             remappings=remappings,
             respawn=arguments["use_respawn"],
-            # The planner is back before the manager gives up.
-            respawn_delay=1.0 if is_planner else 2.0,
+            respawn_delay=respawn_delay,
             **options,
         )
         actions.append(node)
@@ -343,10 +362,10 @@ def nav2_nodes(arguments, namespace):
         parameters=[parameter_file, managed],
         **options,
     )
-    left_out = ", ".join(name for name in OPTIONAL if name not in names)
-    if left_out:
+    not_started = ", ".join(name for name in OPTIONAL if name not in names)
+    if not_started:
         reason = "no package, or no parameters in params_file"
-        actions.append(LogInfo(msg=f"not started: {left_out} ({reason})"))
+        actions.append(LogInfo(msg=f"not started: {not_started} ({reason})"))
     return [*actions, manager]
 
 
@@ -356,18 +375,20 @@ def nav2_launch_file(name, arguments, namespace, **options):
     path = os.path.join(folder, name)
     if not os.path.exists(path):
         raise RuntimeError(f"{folder} has no {name}; leave out what needs it")
-    common = ("use_sim_time", "params_file", "autostart", "use_respawn", "log_level")
-    options.update({name: str(arguments[name]) for name in common})
+    launch_arguments = {
+        "namespace": namespace,  # absolute, as some releases go into it once more
+        "use_composition": "False",
+        **options,
+    }
+    for argument in COMMON_ARGUMENTS:
+        launch_arguments[argument] = str(arguments[argument])
+    actions = []
+    if namespace:
+        actions.append(PushROSNamespace(namespace))
     include = IncludeLaunchDescription(
-        PythonLaunchDescriptionSource(path),
-        # Absolute, as some releases go into the namespace once more.
-        launch_arguments={
-            "namespace": namespace,
-            "use_composition": "False",
-            **options,
-        }.items(),
+        PythonLaunchDescriptionSource(path), launch_arguments=launch_arguments.items()
     )
-    return GroupAction([*([PushROSNamespace(namespace)] if namespace else []), include])
+    return GroupAction([*actions, include])
 
 
 def localization(arguments, namespace):
@@ -377,12 +398,9 @@ def localization(arguments, namespace):
         if arguments["slam"]:
             actions.append(nav2_launch_file("slam_launch.py", arguments, namespace))
         else:
+            file = "localization_launch.py"
             options = {"map": arguments["map"]}
-            actions.append(
-                nav2_launch_file(
-                    "localization_launch.py", arguments, namespace, **options
-                )
-            )
+            actions.append(nav2_launch_file(file, arguments, namespace, **options))
     for zone in ("keepout", "speed"):
         mask = f"{zone}_mask"
         if arguments[mask]:
@@ -395,12 +413,14 @@ def localization(arguments, namespace):
 def rviz(arguments, namespace):
     """Return RViz, which in a namespace shows the robot of that namespace."""
     share = get_package_share_directory("ddqn_planner")
-    default = os.path.join(share, "rviz", "ddqn_planner.rviz")
+    config = arguments["rviz_config"]
+    if not config:
+        config = os.path.join(share, "rviz", "ddqn_planner.rviz")
     return Node(
         package="rviz2",
         executable="rviz2",
         namespace=namespace or "/",
-        arguments=["-d", arguments["rviz_config"] or default],
+        arguments=["-d", config],
         remappings=TRANSFORMS + list(RVIZ_TOPICS.items()),
         output="screen",
     )
@@ -427,15 +447,11 @@ def actions_of(context):
 
 def generate_launch_description():
     """Return the arguments, and what starts Nav2."""
-    return LaunchDescription(
-        [
-            SetEnvironmentVariable("RCUTILS_LOGGING_BUFFERED_STREAM", "1"),
-            *(
-                DeclareLaunchArgument(
-                    name, default_value=default, description=description
-                )
-                for name, (default, description) in ARGUMENTS.items()
-            ),
-            OpaqueFunction(function=actions_of),
-        ]
-    )
+    actions = [SetEnvironmentVariable("RCUTILS_LOGGING_BUFFERED_STREAM", "1")]
+    for name, (default, description) in ARGUMENTS.items():
+        argument = DeclareLaunchArgument(
+            name, default_value=default, description=description
+        )
+        actions.append(argument)
+    actions.append(OpaqueFunction(function=actions_of))
+    return LaunchDescription(actions)
