@@ -21,18 +21,20 @@ sys.path.insert(0, str(FilePath(__file__).resolve().parents[1] / "experiments"))
 from client import RobotPoses
 from driving_worlds import NOISE, SPEED, World, generated_world
 
-WORLD, SEED, SPEED_UP = "office-mixture", 9, 40.0
+WORLD = "office-mixture"
+SEED = 9
+SPEED_UP = 40.0  # simulated seconds per second
 STEP = 0.2  # simulated seconds from one pose to the next
 MORNING = 3000.0
 """Seconds at which the simulated time begins: the first crowd goes 10 minutes later."""
-JOIN_DISTANCE = (
-    2.0  # metres from which the robot drives to the nearest point of a new path
-)
+JOIN_DISTANCE = 2.0
+"""Metres from which the robot drives to the nearest point of a new path."""
 SIGHT = 0.005
 """Metres between the points of a straight line that are tried for obstacles."""
-PATIENCE = (
-    60.0  # simulated seconds that the robot stands before it asks for a path again
-)
+PATIENCE = 60.0
+"""Simulated seconds that the robot stands before it asks for a path again."""
+LONGEST_STRETCH = 0.05
+"""Simulated seconds that the robot drives at one speed."""
 
 
 class Robot:
@@ -48,7 +50,8 @@ class Robot:
         self.yaw = 0.0
         self._random = np.random.default_rng([seed, 7])
         self._path = np.empty((0, 2))
-        self._cell, self._noise = (-1, -1), 1.0
+        self._cell = (-1, -1)  # where the noise was drawn
+        self._noise = 1.0
 
     @property
     def is_driving(self) -> bool:
@@ -62,44 +65,50 @@ class Robot:
 
     def follow(self, path: NDArray[np.float64]) -> None:
         """Follow a path from now on, (N, 2) in metres; an empty one stops the robot."""
-        away = np.hypot(*(path - (self.x, self.y)).T)
-        near = (
-            n
-            for n in away.argsort()
-            if away[n] <= JOIN_DISTANCE and self._sees(path[n])
-        )
-        self._path = path[next(near, len(path)) :]
+        distances = np.hypot(*(path - (self.x, self.y)).T)
+        for index in distances.argsort():
+            if distances[index] <= JOIN_DISTANCE and self._sees(path[index]):
+                self._path = path[index:]
+                return
+        self._path = path[len(path) :]
 
     def step(self) -> None:
         """Drive for `STEP` seconds."""
         self.now += STEP
-        left = STEP
-        while left > 1e-9 and self.is_driving:
-            ahead = self._path[0] - (self.x, self.y)
-            away, speed = math.hypot(*ahead), self._speed()
-            metres = min(away, speed * min(left, 0.05))
-            if metres < away:
-                self.x, self.y = (self.x, self.y) + metres / away * ahead
+        seconds_left = STEP
+        while seconds_left > 1e-9 and self.is_driving:
+            offset = self._path[0] - (self.x, self.y)
+            distance = math.hypot(*offset)
+            speed = self._speed()
+            metres = min(distance, speed * min(seconds_left, LONGEST_STRETCH))
+            if metres < distance:
+                self.x, self.y = (self.x, self.y) + metres / distance * offset
             else:
-                (self.x, self.y), self._path = self._path[0], self._path[1:]
-            if away:
-                self.yaw = math.atan2(ahead[1], ahead[0])
-            left -= metres / speed
+                self.x, self.y = self._path[0]
+                self._path = self._path[1:]
+            if distance > 0:
+                self.yaw = math.atan2(offset[1], offset[0])
+            seconds_left -= metres / speed
 
     def _sees(self, point: NDArray[np.float64]) -> bool:
         """Return whether a straight line leads to a point without an obstacle."""
-        grid, here = self.world.grid, (self.x, self.y)
-        line = np.linspace(here, point, int(math.dist(here, point) / SIGHT) + 2)
+        grid = self.world.grid
+        position = (self.x, self.y)
+        points = int(math.dist(position, point) / SIGHT) + 2
+        line = np.linspace(position, point, points)
         cells = {grid.world_to_cell(x, y) for x, y in line}
-        # A robot on an obstacle may leave.
-        return all(grid.is_free(cell) for cell in cells - {grid.world_to_cell(*here)})
+        cells.discard(grid.world_to_cell(*position))  # a robot on an obstacle may leave
+        return all(grid.is_free(cell) for cell in cells)
 
     def _speed(self) -> float:
+        """Return the speed where the robot is, with a noise of its own in each cell."""
         cell = self.world.grid.world_to_cell(self.x, self.y)
         if cell != self._cell:
             self._cell = cell
             self._noise = math.exp(self._random.normal(0, NOISE) - NOISE**2 / 2)
-        return SPEED / (float(self.world.slowness(self.now)[cell[::-1]]) * self._noise)
+        x, y = cell
+        slowness = float(self.world.slowness(self.now)[y, x])
+        return SPEED / (slowness * self._noise)
 
 
 class RobotNode(Node):
@@ -113,32 +122,43 @@ class RobotNode(Node):
         self._robot = Robot(generated_world(WORLD, SEED), SEED)
         self._poses = RobotPoses(self)
         self._goal: PoseStamped | None = None
-        self._stood = 0.0  # simulated seconds without a path
+        self._seconds_without_path = 0.0
         self._goals = self.create_publisher(PoseStamped, "goal_pose", 10)
         self.create_subscription(PoseStamped, "goal_pose", self._on_goal, 10)
         self.create_subscription(Path, "plan", self._on_plan, LATCHED)
         self.create_timer(STEP / SPEED_UP, self._step, clock=STEADY)
 
     def _on_plan(self, message: Path) -> None:
-        positions = [(it.pose.position.x, it.pose.position.y) for it in message.poses]
+        positions = []
+        for stamped in message.poses:
+            position = stamped.pose.position
+            positions.append((position.x, position.y))
         self._robot.follow(np.array(positions).reshape(-1, 2))
 
     def _on_goal(self, message: PoseStamped) -> None:
-        self._goal, self._stood = message, 0.0
+        self._goal = message
+        self._seconds_without_path = 0.0
 
     def _step(self) -> None:
         robot = self._robot
         robot.step()
         self._poses.publish(robot.header(), robot.x, robot.y, robot.yaw)
-        self._stood = 0.0 if robot.is_driving else self._stood + STEP
-        # Where it stands without a path that it can join, it sends the goal again.
-        if self._goal is not None and self._stood > PATIENCE:
-            self._stood, goal = 0.0, self._goal.pose.position
-            if math.dist((goal.x, goal.y), (robot.x, robot.y)) > ARRIVAL_DISTANCE:
-                self.get_logger().warning(
-                    "standing without a path; the goal is sent again"
-                )
-                self._goals.publish(self._goal)
+        if robot.is_driving:
+            self._seconds_without_path = 0.0
+        else:
+            self._seconds_without_path += STEP
+        if self._goal is not None and self._seconds_without_path > PATIENCE:
+            self._seconds_without_path = 0.0
+            self._send_again(self._goal)
+
+    def _send_again(self, goal: PoseStamped) -> None:
+        """Send the goal again, unless the robot stands there."""
+        position = goal.pose.position
+        distance = math.dist((position.x, position.y), (self._robot.x, self._robot.y))
+        if distance > ARRIVAL_DISTANCE:
+            warning = "standing without a path; the goal is sent again"
+            self.get_logger().warning(warning)
+            self._goals.publish(goal)
 
 
 if __name__ == "__main__":
