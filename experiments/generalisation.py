@@ -316,7 +316,9 @@ class Case(NamedTuple):
 def cases_by_goal(benchmark_map: BenchmarkMap) -> dict[Cell, list[Case]]:
     """Return the requests of a map: of each goal, in the order of their starts."""
     requests = benchmark_map.requests
-    optima = benchmark_map.optima or [None] * len(requests)
+    optima: Sequence[float | None] = [None] * len(requests)
+    if benchmark_map.optima is not None:
+        optima = benchmark_map.optima
     cases: dict[Cell, list[Case]] = {}
     for (start, goal), optimum in zip(requests, optima, strict=True):
         cases.setdefault(goal, []).append(Case(start, optimum))

@@ -17,7 +17,10 @@ from ddqn_planner.grid import read_map_file
 from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.resources import find_map
 
-PLANS, LARGE, RELOADS, FIRST_RELOADS = 8, 2000, 1500, 50
+PLANS = 8
+LARGE = 2000  # cells of a side of the large map
+RELOADS = 1500
+FIRST_RELOADS = 50  # after which the memory is measured first
 SETTLED = 5.0  # seconds until all is compiled, and what is not needed given back
 KINDS = {"RssAnon": "own", "RssFile": "of files", "RssShmem": "shared", "VmRSS": "all"}
 STEPS = str(Path(__file__).with_name("memory_steps.py"))
@@ -25,24 +28,23 @@ STEPS = str(Path(__file__).with_name("memory_steps.py"))
 
 def measure_layers(fixture: ros.MapFixture) -> None:
     """Print the sizes of the arrays of a map, and those of one field on it."""
-    grid, planner = fixture.grid, Planner.load("any_map")
+    grid = fixture.grid
     (request,) = fixture.requests(1, np.random.default_rng(0))
-    start, goal = (ros.cell_of(grid, pose) for pose in (request.start, request.goal))
-    field = planner.q_field(grid, goal, ros.RULE)
+    start = ros.cell_of(grid, request.start)
+    goal = ros.cell_of(grid, request.goal)
+    field = Planner.load("any_map").q_field(grid, goal, ros.RULE)
     field.rollout(start)
     layers = [
         value.nbytes for value in vars(grid).values() if isinstance(value, np.ndarray)
     ]
-    patches = field.costs.patch_number.nbytes if field.costs is not None else 0
-    cells = grid.occupancy.size
-    sizes = {
-        "message": cells,
+    nbytes = {
+        "message": grid.occupancy.size,  # a byte for each cell
         "map": sum(layers),
-        "patches": patches,
+        "patches": field.costs.patch_number.nbytes if field.costs is not None else 0,
         "a field": field.nbytes,
     }
-    words = ", ".join(f"{name} {size / 1e6:.1f} MB" for name, size in sizes.items())
-    print(f"{grid.width}x{grid.height}: {words}")
+    sizes = ", ".join(f"{name} {size / 1e6:.1f} MB" for name, size in nbytes.items())
+    print(f"{grid.width}x{grid.height}: {sizes}")
 
 
 def measure_node(
@@ -68,10 +70,10 @@ def measure_node(
         for request in requests:
             ros.ask(get_plan, request)
             greatest = max(greatest, processes.memory(node.pid))
-        split = ", ".join(
-            f"{words} {processes.memory(node.pid, kind):.0f}"
-            for kind, words in KINDS.items()
-        )
+        megabytes = {
+            words: processes.memory(node.pid, kind) for kind, words in KINDS.items()
+        }
+        split = ", ".join(f"{words} {size:.0f}" for words, size in megabytes.items())
         peak = processes.memory(node.pid, "VmHWM")
         print(
             f"{name}: MB after {PLANS} plans: {split}; "
@@ -101,14 +103,14 @@ def measure_reloads() -> Iterator[bool]:
 def main(_: Sequence[str]) -> int:
     """Print tables, and each figure beside its bound; return 1 if one is missed."""
     office = find_map("office")
-    of_office = ros.MapFixture(read_map_file(office))
-    large = ros.generated_map("office", LARGE, seed=np.random.default_rng(0))
+    office_fixture = ros.MapFixture(read_map_file(office))
+    large_fixture = ros.generated_map("office", LARGE, seed=np.random.default_rng(0))
     with processes.claim_ros_domain():
         subprocess.run([sys.executable, STEPS], check=True)
-        for fixture in (of_office, large):
+        for fixture in (office_fixture, large_fixture):
             measure_layers(fixture)
-        missed = [*measure_node("office", of_office, 210, office)]
-        missed += measure_node(f"{LARGE}x{LARGE}", large, 250)
+        missed = [*measure_node("office", office_fixture, 210, office)]
+        missed += measure_node(f"{LARGE}x{LARGE}", large_fixture, 250)
         missed += measure_reloads()
     return int(any(missed))
 

@@ -1,6 +1,6 @@
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -206,7 +206,7 @@ def test_optima_lie_in_groups_that_double_and_a_millionth_more_is_optimal() -> N
 def test_the_same_seed_draws_the_same_whichever_other_maps_there_are(
     costs: str,
 ) -> None:
-    def drawn(kinds: list[str], seed: int) -> tuple[str, list[tuple[Cell, Cell]]]:
+    def drawn(kinds: list[str], seed: int) -> tuple[str, Sequence[tuple[Cell, Cell]]]:
         settings = replace(SAFE, requests=30, costs=costs, seed=seed)
         *_, other, last = generalisation.generated_maps(kinds, [20], 2, settings)
         assert other.grid.fingerprint != last.grid.fingerprint
