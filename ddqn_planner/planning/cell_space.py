@@ -87,7 +87,7 @@ class StepCosts(NamedTuple):
 
 
 def step_costs(costs: MoveCosts) -> StepCosts:
-    """Return the part of some costs that compiled code uses."""
+    """Return the fields of a `MoveCosts` that compiled code uses."""
     return StepCosts(
         costs.patch_number,
         costs.table,
@@ -117,7 +117,10 @@ class CellSpace(NamedTuple):
 
 @inlined
 def after_move(cell: int, action: int, costs: Any) -> Any:
-    """Return the number of the cell to which an action leads from a cell."""
+    """Return the number of the cell to which an action, 0 to 7, leads from a cell.
+
+    Cells are numbered row by row on the padded map, of `costs.width` columns.
+    """
     # Unsigned, as numba then looks for no index that counts from the end.
     return np.uint64(cell + MOVE_Y[action] * costs.width + MOVE_X[action])
 
@@ -126,7 +129,9 @@ def after_move(cell: int, action: int, costs: Any) -> Any:
 def cost_of(cell: int, action: int, costs: Any) -> Any:
     """Return the cost of a move from a cell, infinite if it is not possible.
 
-    How it is made of the table, the terms and the multipliers, `MoveCosts` says.
+    `cell` is a number on the padded map, `action` is 0 to 7, and `costs` a `StepCosts`.
+    The cost is a row of the table for the cell's 3x3 patch; times the mean multiplier
+    of both cells, or times the sum of a term of each cell, if the map has these.
     """
     begin = np.uint64(cell)
     end = after_move(cell, action, costs)
@@ -150,7 +155,11 @@ def cost_of(cell: int, action: int, costs: Any) -> Any:
 
 @inlined
 def remaining_cost(dx: int, dy: int, bound: Any) -> Any:
-    """Return what a path over dx columns and dy rows, of any sign, costs at least."""
+    """Return a lower bound of the cost of a path over dx columns and dy rows.
+
+    Both may be negative. `bound` is a `LowerBound`, with the least costs of a straight
+    and of a diagonal move.
+    """
     columns = abs(dx)
     rows = abs(dy)
     diagonals = columns if columns < rows else rows
@@ -162,44 +171,39 @@ def remaining_cost(dx: int, dy: int, bound: Any) -> Any:
 def _expand_cell(
     cell_number: int, distance: Any, mark: Any, queue: Any, space: Any
 ) -> None:
-    """Lower the distance of each neighbour that is nearer to a goal by way of a cell.
+    """Lower the distance of each neighbour from which a path by way of a cell is cheaper.
 
-    Such a neighbour is marked as open and queued. The cell was just closed; `distance`
-    and `mark` (C,) are those of `Known`.
+    A distance is the cost of a path to a goal. A neighbour whose distance falls is
+    marked as open and queued; its key is the distance plus a lower bound of the cost
+    from the start to the neighbour.
+
+    Parameters
+    ----------
+    cell_number : int
+        The cell, which was just closed: a number on the padded map of C cells.
+    distance : (C,) float64
+        0 where no path was found; changes in place.
+    mark : (C,) uint8
+        Changes in place.
+    queue : Buckets
+    space : CellSpace
     """
     costs = space.costs
     bound = space.bound
     cell = np.uint64(cell_number)
     cost_from_cell = distance[cell]
-    # First a set of actions, bit a for action a: those whose move from a neighbour to
-    # the cell may lower the neighbour's distance. It is judged by the cost without the
-    # multipliers, which is no greater than the exact one. Impossible moves, of infinite
-    # cost, take no branch, which the processor would often predict wrong.
-    cheaper_by = np.uint64(0)
-    term_of_cell = TERMS_OF_END
-    if costs.terms.size > 0:
-        term_of_cell += np.uint64(costs.cost_code[cell])
-    for number in range(8):
-        action = np.uint64(number)
-        neighbour = cell - space.offset[action]
-        patch = np.uint64(costs.patch_number[neighbour])
-        step = costs.table[ACTIONS * patch + action]
-        if costs.terms.size > 0:
-            first = TERMS_OF_ACTION * action
-            term_of_neighbour = costs.terms[first + costs.cost_code[neighbour]]
-            step *= term_of_neighbour + costs.terms[first + term_of_cell]
-        cost_before = _cost_before(distance, neighbour)
-        cheaper_by |= np.uint64(cost_from_cell + step < cost_before) << action
-    # Columns and rows from the start. Divisions of 32 bits take half as long as those
-    # of 64.
+    # Columns and rows from the start to the cell. Divisions of 32 bits take half as
+    # long as those of 64.
     dx = np.int64(np.uint32(cell) % np.uint32(costs.width)) - bound.start_x
     dy = np.int64(np.uint32(cell) // np.uint32(costs.width)) - bound.start_y
-    while cheaper_by:
-        action = LOWEST_BIT[cheaper_by]
-        cheaper_by &= cheaper_by - ONE  # without the lowest bit
+    promising = _promising_actions(cell, distance, space)
+    while promising:
+        action = LOWEST_BIT[promising]
+        promising &= promising - ONE  # without the lowest bit
+        # The action leads from the neighbour to the cell.
         neighbour = cell - space.offset[action]
         cost = cost_from_cell + cost_of(np.int64(neighbour), np.int64(action), costs)
-        if cost < _cost_before(distance, neighbour):
+        if cost < _known_cost(distance, neighbour):
             distance[neighbour] = cost
             mark[neighbour] = OPEN
             remaining = remaining_cost(dx - MOVE_X[action], dy - MOVE_Y[action], bound)
@@ -207,7 +211,38 @@ def _expand_cell(
 
 
 @inlined
-def _cost_before(distance: Any, cell: Any) -> float:
+def _promising_actions(cell: Any, distance: Any, space: Any) -> Any:
+    """Return the actions by which a neighbour may reach a goal more cheaply.
+
+    An action leads from a neighbour to the cell. The result is a set of bits, bit a for
+    action a. Each action is judged by its cost without multipliers, which is no greater
+    than the exact one. `distance` (C,) is the cost from each cell to a goal.
+    """
+    costs = space.costs
+    cost_from_cell = distance[cell]
+    promising = np.uint64(0)
+    has_terms = costs.terms.size > 0
+    term_of_cell = TERMS_OF_END
+    if has_terms:
+        term_of_cell += np.uint64(costs.cost_code[cell])
+    for number in range(8):
+        action = np.uint64(number)
+        neighbour = cell - space.offset[action]
+        patch = np.uint64(costs.patch_number[neighbour])
+        cost_of_step = costs.table[ACTIONS * patch + action]
+        if has_terms:
+            first = TERMS_OF_ACTION * action
+            term_of_neighbour = costs.terms[first + costs.cost_code[neighbour]]
+            cost_of_step *= term_of_neighbour + costs.terms[first + term_of_cell]
+        # No branch: the processor would often predict it wrong. An impossible move has
+        # an infinite cost.
+        is_cheaper = cost_from_cell + cost_of_step < _known_cost(distance, neighbour)
+        promising |= np.uint64(is_cheaper) << action
+    return promising
+
+
+@inlined
+def _known_cost(distance: Any, cell: Any) -> float:
     """Return the cost that was found from a cell to a goal, infinite if none was."""
     return distance[cell] if distance[cell] > 0 else np.inf
 
@@ -225,24 +260,38 @@ spread_over_cells = specialised(
 def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known, bool]:
     """Close cells until a start's distance is known, or more than `limit` were closed.
 
-    The start is the number of a cell. No path reaches cell 0, of the border: with it as
-    the start, all of the map is visited. Return what is known then, and whether that is
-    enough for the start. The arrays of `known` change in place.
+    Parameters
+    ----------
+    known : Known
+        The distances from cells to a goal up to now; its arrays change in place.
+    costs : MoveCosts
+        Of the map.
+    start : int
+        The number of a cell on the padded map. No path reaches cell 0, of the border:
+        with cell 0 as the start, all of the map is visited.
+    limit : int
+
+    Returns
+    -------
+    known : Known
+        The same arrays, and the cells that are open now.
+    is_known : bool
+        Whether the start's distance is known, or known to be none.
     """
     # In the order of A*, so that few cells are visited (resumable reverse A*, Silver
     # 2005); all of the map without lower bounds (Dijkstra), and then with one bucket
-    # per unit, as no move costs less than 1.
+    # per unit of cost, as no move costs less than 1.
     space = _space_toward(start, costs)
-    per_unit = BUCKETS if start else 1
-    # A queued key is greater than that of the front bucket by one move and its bound at
-    # most. So many buckets the ring needs, rounded up to a power of 2.
-    highest_step = (costs.highest + space.bound.diagonal) * per_unit
-    buckets = 1 << int(highest_step + 2).bit_length()
-    capacity = 9 + int(CAPACITY * math.sqrt(known.distance.size))
+    buckets_per_unit = BUCKETS if start else 1
+    # The keys of queued cells differ by the cost of one move and its lower bound at
+    # most. The ring needs a bucket for each of these keys, rounded up to a power of 2.
+    highest_step = (costs.highest + space.bound.diagonal) * buckets_per_unit
+    ring_size = 1 << int(highest_step + 2).bit_length()
+    capacity = 9 + int(CAPACITY * math.sqrt(known.distance.size))  # cells of a bucket
     opened = known.opened
     visits_left = limit + 1
     while True:
-        queue = _queue_of(known, opened, space, buckets, capacity, per_unit)
+        queue = _queue_of(known, opened, space, ring_size, capacity, buckets_per_unit)
         progress: Progress = spread_over_cells(
             known.distance,
             known.mark,
@@ -261,14 +310,20 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
 
 
 def _space_toward(start: int, costs: MoveCosts) -> CellSpace:
-    """Return the space with lower bounds of the cost to a start; all 0 for cell 0."""
-    rounded_down = costs.least_multiplier * (1 - 1e-7) if start else 0.0
+    """Return the space of a map, with lower bounds of the cost to a start.
+
+    `start` is the number of a cell on the padded map. For cell 0, which stands for no
+    start, all lower bounds are 0.
+    """
+    # No cell has a smaller multiplier than this, which is rounded down.
+    multiplier = costs.least_multiplier * (1 - 1e-7) if start else 0.0
     bound = LowerBound(
         start_x=start % costs.width,
         start_y=start // costs.width,
-        straight=costs.cheapest_straight * rounded_down,
-        diagonal=costs.cheapest_diagonal * rounded_down,
+        straight=costs.cheapest_straight * multiplier,
+        diagonal=costs.cheapest_diagonal * multiplier,
     )
+    # (8,): what each action adds to a cell's number.
     offset = (MOVE_Y * costs.width + MOVE_X).astype(np.uint64)
     return CellSpace(step_costs(costs), bound, offset)
 
@@ -277,14 +332,28 @@ def _queue_of(
     known: Known,
     candidates: NDArray[np.int32],
     space: CellSpace,
-    buckets: int,
+    ring_size: int,
     capacity: int,
     per_unit: int,
 ) -> Buckets:
-    """Return a queue of those candidates (K,) that are open, each once.
+    """Return a queue of those candidates that are open, each once.
 
-    It has a ring of so many buckets, of that capacity, `per_unit` for a unit of cost.
+    Parameters
+    ----------
+    known : Known
+        Tells which cells are open, and their distances.
+    candidates : (K,)
+        Numbers of cells; some may occur twice.
+    space : CellSpace
+    ring_size : int
+        Buckets of the queue.
+    capacity : int
+        Cells for which a bucket has room.
+    per_unit : int
+        Buckets per unit of cost.
     """
+    # The open candidates, and the number of each one's bucket: (K,), of which the first
+    # `count` are written.
     opened = np.empty(candidates.size, np.int32)
     number = np.empty(candidates.size, np.int64)
     count = _number_buckets(
@@ -303,7 +372,7 @@ def _queue_of(
         order = np.argsort(number)
         opened = opened[order]
         number = number[order]
-    return make_buckets(opened, number, buckets, capacity, per_unit)
+    return make_buckets(opened, number, ring_size, capacity, per_unit)
 
 
 @in_place
@@ -319,16 +388,18 @@ def _number_buckets(
 ) -> int:
     """Write each open candidate once, and the number of its bucket; return how many.
 
+    Cells are numbers on the padded map of C cells.
+
     Parameters
     ----------
     distance : (C,)
         The cost of a path from each cell to a goal.
     mark : (C,)
-        Is OPEN for the cells that wait.
+        OPEN for the open cells. It is the same again at the end.
     candidates : (K,)
-        Cells; some of them may be there twice.
+        Cells, of which some may occur twice.
     opened, bucket_number : (K,)
-        What is written.
+        Where the open candidates and the numbers of their buckets are written.
     bound : LowerBound
     width : int
         Columns of the padded map.
@@ -339,7 +410,7 @@ def _number_buckets(
     for index in range(candidates.size):
         cell = np.int64(candidates[index])
         if mark[cell] == OPEN:
-            mark[cell] = COUNTED  # so that it is not written again
+            mark[cell] = COUNTED  # so that the cell is not written again
             dx = cell % width - bound.start_x
             dy = cell // width - bound.start_y
             key = distance[cell] + remaining_cost(dx, dy, bound)
@@ -361,14 +432,24 @@ def cheapest_move(
 ) -> tuple[float, int]:
     """Return the least cost of a path from a cell to a goal, and its first action.
 
-    Without a path, they are infinity and `NO_ACTION`. The first action whose path costs
-    at most `cost_enough` is taken without a look at the others.
+    Without a path, they are infinity and `NO_ACTION`.
+
+    Parameters
+    ----------
+    distance : (C,)
+        The cost of a path from each cell to a goal: 0 without a path, below 0 where a
+        repair takes the path back.
+    cell : int
+        A number on the padded map of C cells.
+    cost_enough : float
+        The first action whose path costs no more is returned, without a look at the
+        actions after it.
+    costs : StepCosts
     """
     cheapest = np.inf
     cheapest_action = NO_ACTION
     for action in range(8):
         end = after_move(cell, action, costs)
-        # It is 0 without a path, and less where a repair takes it back.
         if distance[end] <= 0:
             continue
         cost = distance[end] + cost_of(cell, action, costs)
@@ -385,10 +466,13 @@ def take_back(
 ) -> Known | None:
     """Take back distances that no longer hold, and open the cells from which to grow.
 
+    Cells are numbers on the padded map. A distance is the cost of a path from a cell to
+    a goal.
+
     Parameters
     ----------
     known : Known
-        Of a map before some changes; its arrays change in place.
+        The distances on the map before some changes; its arrays change in place.
     costs : MoveCosts
         Of the map after the changes.
     changed : (N,)
@@ -401,13 +485,15 @@ def take_back(
     Known or None
         None, and nothing is changed, if more cells would lose their distance.
     """
-    # Ramalingam and Reps 1996; LPA* (Koenig and Likhachev 2002) is it for one start.
+    # The repair of Ramalingam and Reps (1996), which LPA* (Koenig and Likhachev 2002)
+    # does for one start.
     costs_of_steps = step_costs(costs)
-    lost = np.empty(limit, np.int32)
-    # A cell that loses its distance makes at most its 8 neighbours wait.
+    distance, mark = known.distance, known.mark
+    # The cells to judge, which the kernel appends to: a cell that loses its distance
+    # adds at most its 8 neighbours.
     waiting = np.empty(changed.size + 8 * limit, np.int32)
     waiting[: changed.size] = changed
-    distance, mark = known.distance, known.mark
+    lost = np.empty(limit, np.int32)  # the kernel writes the cells that lose theirs
     lost_count = lose_unsupported(distance, waiting, changed.size, lost, costs_of_steps)
     if lost_count == TOO_MANY:
         return None
@@ -428,8 +514,9 @@ def lose_unsupported(
 ) -> int:
     """Make the distance of each cell negative that no neighbour supports any more.
 
-    A neighbour supports the distance of a cell if a path by way of the neighbour costs
-    no more.
+    A neighbour supports the distance of a cell if a path from the cell to a goal by way
+    of the neighbour costs no more than the distance. Cells are numbers on the padded
+    map.
 
     Parameters
     ----------
@@ -447,18 +534,18 @@ def lose_unsupported(
         How many cells were lost; `TOO_MANY`, and no distance is changed, if they would
         be more than `lost` has room for.
     """
-    first = 0
+    judged = 0  # cells of `waiting`
     count = 0
-    while first < waiting_end:
-        cell = np.int64(waiting[first])
-        first += 1
+    while judged < waiting_end:
+        cell = np.int64(waiting[judged])
+        judged += 1
         cost_before = distance[cell]
         if cost_before <= AT_GOAL:  # a goal, or a cell without a distance
             continue
         cheapest, _ = cheapest_move(distance, cell, cost_before, costs)
         if cheapest <= cost_before:
             continue
-        if count == lost.size:
+        if count == lost.size:  # too many: all lost cells get their distances back
             for number in range(count):
                 distance[lost[number]] = -distance[lost[number]]
             return TOO_MANY
@@ -478,10 +565,25 @@ def lose_unsupported(
 
 @in_place
 def reopen(distance: Any, mark: Any, cells: Any, opened: Any, costs: Any) -> int:
-    """Open each of some cells (N,) whose neighbours lead to a goal at a lower cost.
+    """Open each of some cells from which a path to a goal costs less than its distance.
 
-    A cell of which a repair took back the distance, which is then negative, has no cost
-    at first. The cells that are open then are written to `opened`; return how many.
+    Parameters
+    ----------
+    distance : (C,)
+        The cost from each cell to a goal; below 0 where a repair took it back: such a
+        cell has no path at first. Changes in place.
+    mark : (C,)
+        Changes in place.
+    cells : (N,)
+        The cells to judge, as numbers on the padded map of C cells.
+    opened : (N,)
+        Where the cells that were opened are written.
+    costs : StepCosts
+
+    Returns
+    -------
+    int
+        How many cells were opened.
     """
     count = 0
     for number in range(cells.size):
@@ -509,26 +611,27 @@ def roll_out(
 ) -> int:
     """Write the cells of greedy moves from a start to a goal; return how many.
 
-    Of moves that are as good as each other, it takes those that end nearest to the
-    straight line from the start to (`toward_x`, `toward_y`).
+    Of moves on paths of the same cost, it takes those that end nearest to the straight
+    line from the start to the cell (`toward_x`, `toward_y`).
 
     Parameters
     ----------
     distance : (C,)
         The cost of a path from each cell to a goal, 0 without a path.
     start : int
-        The number of a closed cell.
+        The number of a closed cell on the padded map of C cells.
     path : (N, 2)
-        Where the x and y of the cells are written, the start's first.
+        Where the x and y of the cells on the map are written, the start's first.
     toward_x, toward_y : int
+        A cell on the map.
     costs : StepCosts
     """
-    cell = start
     # The padded map has a border of one cell.
-    start_x = cell % costs.width - 1
-    start_y = cell // costs.width - 1
-    line_x = toward_x - start_x
+    start_x = start % costs.width - 1
+    start_y = start // costs.width - 1
+    line_x = toward_x - start_x  # along the straight line
     line_y = toward_y - start_y
+    cell = start
     x = start_x
     y = start_y
     count = 0
@@ -564,7 +667,10 @@ def roll_out(
 
 @in_place
 def write_value(distance: Any, value: Any, _: Any) -> None:
-    """Write the value (C,) of each reached cell but the goals: minus its distance."""
+    """Write the value of each reached cell but the goals: minus its distance.
+
+    `value` (C,) and `distance` (C,), 0 without a path, are by cell of the padded map.
+    """
     for cell in range(distance.size):
         if distance[cell] > AT_GOAL:
             value[cell] = -distance[cell]
@@ -572,9 +678,10 @@ def write_value(distance: Any, value: Any, _: Any) -> None:
 
 @in_place
 def write_policy(distance: Any, policy: Any, costs: Any) -> None:
-    """Write the greedy action of each cell that has one to a policy (C,).
+    """Write the greedy action of each cell from which a path leads to a goal.
 
-    The field has grown over the whole map.
+    `policy` (C,) gets the actions, by cell of the padded map. `distance` (C,) is the
+    cost from each cell to a goal, 0 without a path, and known of all cells.
     """
     # The first and the last row are the border.
     for cell in range(costs.width + 1, distance.size - costs.width - 1):
@@ -586,7 +693,11 @@ def write_policy(distance: Any, policy: Any, costs: Any) -> None:
 
 @in_place
 def write_q(distance: Any, q: Any, costs: Any) -> None:
-    """Write Q (8, C): minus the cost of the best path that begins with each action."""
+    """Write Q: minus the cost of the cheapest path that begins with each action.
+
+    `q` (8, C) is by action and cell of the padded map, and stays where no path leads to
+    a goal. `distance` (C,) is the cost from each cell to a goal, 0 without a path.
+    """
     for action in range(8):
         for cell in range(costs.width + 1, distance.size - costs.width - 1):
             end = after_move(cell, action, costs)

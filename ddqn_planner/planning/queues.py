@@ -46,39 +46,54 @@ def make_buckets(
     capacity: int,
     per_unit: int,
 ) -> Buckets:
-    """Return a ring of `buckets` empty buckets with room for `capacity` states each.
+    """Return a ring of empty buckets, and states that wait beside the ring.
 
-    The states `opened` (K,), sorted by the numbers of their buckets (K,), wait beside
-    the ring. There are `per_unit` buckets per unit of a key.
+    Parameters
+    ----------
+    opened, opened_bucket : (K,)
+        The states beside the ring, sorted by the numbers of their buckets, and these
+        numbers.
+    buckets : int
+        Buckets of the ring, a power of 2.
+    capacity : int
+        States for which each bucket has room.
+    per_unit : int
+        Buckets per unit of a key.
     """
     cursor = np.zeros(5, np.int64)
     if opened_bucket.size:
-        # The bucket before is empty: so the first state is one of a next key.
+        # The front is the empty bucket before that of the first state: so the first
+        # state has a greater key, and `advance_buckets` returns NEXT_KEY.
         cursor[FRONT] = opened_bucket[0] - 1
     bucket = np.empty((buckets, capacity), np.int32)
-    used = np.zeros(buckets, np.int64)
+    used = np.zeros(buckets, np.int64)  # states in each bucket
     return Buckets(opened, opened_bucket, bucket, used, cursor, per_unit)
 
 
 def states_in_buckets(queue: Buckets) -> NDArray[np.int32]:
     """Return the states in a queue, and some that were popped from its front bucket."""
-    waiting = [
-        queue.bucket[number, : queue.used[number]] for number in queue.used.nonzero()[0]
+    states_in_ring = [
+        queue.bucket[place, : queue.used[place]] for place in queue.used.nonzero()[0]
     ]
-    return np.concatenate([queue.opened[queue.cursor[TAKEN] :], *waiting])
+    states_beside_ring = queue.opened[queue.cursor[TAKEN] :]
+    return np.concatenate([states_beside_ring, *states_in_ring])
 
 
 @inlined
 def _place_in_ring(number: Any, queue: Any) -> Any:
-    """Return where the bucket of a number is in the ring."""
-    # The size of the ring is a power of 2, so that this takes no division. Unsigned, as
-    # numba then looks for no index that counts from the end.
+    """Return the row of `queue.bucket` that holds the bucket of a number.
+
+    It is the number modulo the size of the ring.
+    """
+    # The size is a power of 2, so that this takes no division. Unsigned, as numba then
+    # looks for no index that counts from the end.
     return np.uint64(number & (queue.bucket.shape[0] - 1))
 
 
 @inlined
 def push_to_bucket(key: Any, state: Any, queue: Any) -> None:
-    """Add a state to a ring of buckets."""
+    """Add a state with a key (a cost) to the bucket of the key, in a `Buckets`."""
+    # No bucket is before the front: a state of a smaller key is added to the front.
     number = max(np.int64(key * queue.per_unit), queue.cursor[FRONT])
     place = _place_in_ring(number, queue)
     used = queue.used[place]
@@ -92,28 +107,36 @@ def push_to_bucket(key: Any, state: Any, queue: Any) -> None:
 
 @inlined
 def advance_buckets(queue: Any) -> int:
-    """Make the next bucket that holds a state the front bucket, if the front is empty.
+    """Move the front on, bucket by bucket, until the front bucket holds a state.
 
-    Return SAME_KEY if the front bucket still holds a state, NEXT_KEY if another bucket
-    became the front, NONE_WAITS if no bucket holds a state.
+    A bucket holds states in the ring, and beside it those of `queue.opened` that have
+    its number. `queue.cursor` tells which of both were popped.
+
+    Returns
+    -------
+    int
+        SAME_KEY if the front bucket held a state before, NEXT_KEY if another bucket
+        became the front, NONE_WAITS if no bucket holds a state.
     """
     step = SAME_KEY
     while True:
         front = queue.cursor[FRONT]
         place = _place_in_ring(front, queue)
-        if queue.cursor[READ] < queue.used[place]:
+        popped_in_ring = queue.cursor[READ]
+        if popped_in_ring < queue.used[place]:
             return step
-        # Of the states beside the ring, the first that was not popped.
+        # The first state beside the ring that was not popped.
         next_opened = queue.cursor[TAKEN]
         has_opened = next_opened < queue.opened.size
         if has_opened and queue.opened_bucket[next_opened] <= front:
             return step
+        # The front bucket is empty. The ring uses its memory for a later bucket.
         step = NEXT_KEY
         queue.used[place] = 0
         queue.cursor[READ] = 0
         if front < queue.cursor[LAST]:
             queue.cursor[FRONT] = front + 1
-        elif has_opened:
+        elif has_opened:  # all buckets of the ring are empty: skip to this state
             queue.cursor[FRONT] = queue.opened_bucket[next_opened]
         else:
             return NONE_WAITS
@@ -121,16 +144,18 @@ def advance_buckets(queue: Any) -> int:
 
 @inlined
 def pop_from_bucket(queue: Any) -> Any:
-    """Remove a state from the front bucket, which holds one, and return it."""
+    """Remove a state from the front bucket, which holds one, and return it.
+
+    The states in the ring come first, then those beside it, in `queue.opened`.
+    """
     place = _place_in_ring(queue.cursor[FRONT], queue)
-    read = queue.cursor[READ]
-    if read < queue.used[place]:
-        queue.cursor[READ] = read + 1
-        return np.int64(queue.bucket[place, np.uint64(read)])
-    # It is one of the states beside the ring.
-    taken = queue.cursor[TAKEN]
-    queue.cursor[TAKEN] = taken + 1
-    return np.int64(queue.opened[taken])
+    popped_in_ring = queue.cursor[READ]
+    if popped_in_ring < queue.used[place]:
+        queue.cursor[READ] = popped_in_ring + 1
+        return np.int64(queue.bucket[place, np.uint64(popped_in_ring)])
+    popped_beside = queue.cursor[TAKEN]
+    queue.cursor[TAKEN] = popped_beside + 1
+    return np.int64(queue.opened[popped_beside])
 
 
 @inlined
@@ -157,7 +182,7 @@ class Heap(NamedTuple):
 
 
 def make_heap(entries: int) -> Heap:
-    """Return an empty heap with room for so many entries."""
+    """Return an empty heap with room for a number of entries."""
     return Heap(
         np.empty(entries, np.float32),
         np.empty(entries, np.int64),
@@ -167,19 +192,20 @@ def make_heap(entries: int) -> Heap:
 
 @inlined
 def push_to_heap(key: Any, state: Any, heap: Any) -> None:
-    """Add a state to a heap; its key is rounded to float32."""
-    rounded = np.float32(key)
-    # The state rises from the end of the heap past all parents of greater keys.
+    """Add a state to a `Heap`, which has room; its key is rounded to float32."""
+    rounded_key = np.float32(key)
+    # The state rises from the end of the heap, and each parent of a greater key moves
+    # down into the place that the state leaves.
     place = heap.size[0]
     heap.size[0] = place + 1
     while place > 0:
         parent = (place - 1) >> CHILD_BITS
-        if heap.keys[parent] <= rounded:
+        if heap.keys[parent] <= rounded_key:
             break
         heap.keys[place] = heap.keys[parent]
         heap.states[place] = heap.states[parent]
         place = parent
-    heap.keys[place] = rounded
+    heap.keys[place] = rounded_key
     heap.states[place] = state
 
 
@@ -197,11 +223,12 @@ def heap_is_past(heap: Any, cost: Any) -> bool:
 
 @inlined
 def pop_from_heap(heap: Any) -> Any:
-    """Remove the state of the least key from a heap that is not empty; return it."""
+    """Remove the state of the least key from a `Heap` that is not empty; return it."""
     size = heap.size[0] - 1
     heap.size[0] = size
-    first_state = heap.states[0]
-    # The last entry moves to the first place, and from there down past smaller keys.
+    removed_state = heap.states[0]
+    # The last entry sinks from the first place, and the child of the smallest key moves
+    # up into the place that it leaves, as long as that key is smaller than its own.
     key = heap.keys[size]
     state = heap.states[size]
     place = 0
@@ -220,4 +247,4 @@ def pop_from_heap(heap: Any) -> Any:
         place = smallest_place
     heap.keys[place] = key
     heap.states[place] = state
-    return first_state
+    return removed_state

@@ -67,13 +67,14 @@ def simplify(
 
 
 def straightened(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> Path:
-    """Return a path of few legal segments, as `simplify` does: (K, 2).
+    """Return a path of few legal segments, as `simplify` does: cells (K, 2).
 
-    The path (N, 2) has one cell or more.
+    The given path (N, 2) has one cell or more.
     """
     layers = grid.layers(move_rule)
     cells = np.array(path, np.int64)
-    # Without costs no path between two cells is cheaper than a segment.
+    # (N,): what the path costs from its start to each cell. Without costs of cells it
+    # is not needed, as then no path between two cells is cheaper than a segment.
     cost_to_cell = np.empty(0)
     if grid.has_costs:
         costs = _segment_costs(cells, layers, must_be_legal=False)
@@ -128,17 +129,18 @@ def _pulled(
         Whether string pulling begins at the end of the path. The result leads from the
         start to the end in both cases.
     """
-    cells = path.copy()  # the first `count` of them are kept
+    # The kernels change both arrays in place: the first `count` rows are the path.
+    cells = path.copy()  # (N, 2)
     costs = np.zeros(len(path))  # (N,): of the segment that ends in each cell
     if is_backward:
         cells = path[::-1].copy()
-        # Only differences count. Negative costs in reverse order rise along the path,
-        # by the same differences.
+        # Only differences between costs count. Negative costs in reverse order rise
+        # along the path by the same differences.
         cost_to_cell = -cost_to_cell[::-1]
     count = _keep_corners(cells, costs, cost_to_cell, is_backward, layers)
     if is_backward:
         cells[:count] = cells[:count][::-1]
-        # A segment ends now where it began: its cost stands at the other end.
+        # A segment now ends in the cell in which it began: so does its cost.
         costs[1:count] = costs[1:count][::-1]
     count, has_moved_corners = _move_corners(cells, costs, count, layers)
     cost = float(costs[:count].sum())
@@ -162,7 +164,10 @@ def _segment_costs(path: Cells, layers: Layers, must_be_legal: bool) -> Float64:
 
 @inlined
 def _length(width: int, height: int) -> float:
-    """Return the length of a segment over so many columns and rows: its least cost."""
+    """Return the length of a segment over `width` columns and `height` rows, in cells.
+
+    No such segment costs less.
+    """
     return math.sqrt(width * width + height * height)
 
 
@@ -185,28 +190,34 @@ def segment_cost(
 ) -> float:
     """Return the cost of the segment from cell (x, y) to cell (last_x, last_y).
 
-    If it must be legal, but is not, the cost is infinite.
+    It is the segment's length in cells, on a map with costs times the mean multiplier
+    of the cells that the segment crosses. It is infinite if the segment must be legal
+    but is not. Both cells lie on the map, and the segment joins their centres.
     """
     dx = last_x - x
     dy = last_y - y
-    step_x = (dx > 0) - (dx < 0)
+    step_x = (dx > 0) - (dx < 0)  # -1, 0 or 1
     step_y = (dy > 0) - (dy < 0)
     length = _length(abs(dx), abs(dy))
-    actions = actions_of_segment(step_x, step_y, abs(dx), abs(dy))
-    # Positions on the segment count from 0 at its first point to `end` at its last
-    # point, in units in which all crossings of edges of cells are whole numbers: a
-    # column is 2 rows long, and a row 2 columns. Each end lies in the middle of a cell.
-    columns = max(abs(dx), 1)
-    rows = max(abs(dy), 1)
-    end = 2 * columns * rows
-    # Where the segment enters the next column and the next row: never without a step.
-    next_column = rows if dx != 0 else end + 1
-    next_row = columns if dy != 0 else end + 1
+    actions = actions_of_segment(step_x, step_y, abs(dx), abs(dy))  # a bit set
+    # Positions on the segment are whole numbers, 0 at its first point and `end` at its
+    # last point. To cross a column takes the same distance each time, and to cross a
+    # row another one. The two ends lie in the middle of a cell, so they are half of
+    # these distances away from the first and from the last edge.
+    half_column = max(abs(dy), 1)
+    half_row = max(abs(dx), 1)
+    end = 2 * half_column * half_row
+    # Where the segment enters the next column and the next row. Along one column, or
+    # along one row, it enters no other: that stands beyond the end.
+    next_column = half_column if dx != 0 else end + 1
+    next_row = half_row if dy != 0 else end + 1
     position = 0  # where the segment enters cell (x, y)
     weighted_length = 0.0  # each cell's part of the segment times the cell's multiplier
+    one = np.float64(1)  # the type in which the multiplier is computed
     costs_differ = has_costs(layers)
     while position < end:
-        cell_end = min(next_column, next_row, end)  # where the segment leaves the cell
+        # Cell (x, y): the segment leaves it at `cell_end`, unless the segment ends.
+        cell_end = min(next_column, next_row, end)
         if must_be_legal:
             if layers.occupancy[np.uint64(y), np.uint64(x)]:
                 return np.inf
@@ -216,15 +227,15 @@ def segment_cost(
             ):
                 return np.inf
         if costs_differ:
-            multiplier = multiplier_at(x, y, np.float64(1), layers)
-            weighted_length += (cell_end - position) * multiplier
+            weighted_length += (cell_end - position) * multiplier_at(x, y, one, layers)
+        # On to the next cell, in another column, another row or both.
         position = cell_end
         if next_column == cell_end:
             x += step_x
-            next_column += 2 * rows
+            next_column += 2 * half_column
         if next_row == cell_end:
             y += step_y
-            next_row += 2 * columns
+            next_row += 2 * half_row
     if costs_differ:
         return length * (weighted_length / end)
     return length
@@ -240,11 +251,23 @@ def _may_not_leave(
     is_at_corner: bool,
     layers: Layers,
 ) -> bool:
-    """Return whether a segment may not go on from cell (x, y).
+    """Return whether a segment may not go on from cell (x, y) to the cell after it.
 
-    That is so if the cell forbids one of the segment's actions, which are bits; or if
-    the segment leaves the cell at a corner, and one of the two cells that it touches
-    there, in the directions of its steps, is occupied.
+    It may not if the cell forbids one of the segment's actions. It may not either if it
+    leaves the cell at a corner and touches an occupied cell there, unless corners may
+    be cut.
+
+    Parameters
+    ----------
+    x, y : int
+        A cell on the map.
+    step_x, step_y : int
+        The signs of the segment's extents, -1, 0 or 1.
+    actions : int
+        A bit set, see `actions_of_segment`.
+    is_at_corner : bool
+        Whether the segment leaves the cell at a corner.
+    layers : Layers
     """
     column = np.uint64(x)  # unsigned: so no index counts from the end
     row = np.uint64(y)
@@ -263,7 +286,8 @@ def _write_costs(
 ) -> None:
     """Write the cost of the segment that ends in each cell of a path (N, 2) to `costs`.
 
-    It is infinite if an end of the segment lies outside the map.
+    `costs` is (N,), and its first element is not written. A cost is infinite if an end
+    of the segment lies outside the map, or if the segment must be legal but is not.
     """
     for index in range(1, path.shape[0]):
         x = path[index - 1, 0]
@@ -282,15 +306,16 @@ def _turns_around_obstacle(
     """Return whether a path turns at a right angle around an occupied cell.
 
     Such a corner cannot be left out, as no straight line leads past the occupied cell
-    on that side. It is False on a map with costs, or where corners of obstacles may be
-    cut.
+    on the side of the corner. The result is False on a map with costs, or where corners of
+    obstacles may be cut.
 
     Parameters
     ----------
     path : (N, 2)
+        Cells; the path is straight from `first` to `corner` and from there to `last`.
     first, corner, last : int
-        Rows of the path: where the side before the corner begins, the corner, and
-        where the side after it ends.
+        Rows of the path.
+    layers : Layers
     """
     if has_costs(layers) or layers.cuts_corners:
         return False
@@ -314,11 +339,12 @@ def _turns_around_obstacle(
 
 @inlined
 def _end_of_equal_moves(path: CellArray, first: int) -> int:
-    """Return the last row of a path to which equal moves lead from a row.
+    """Return the last row of a path (N, 2) to which equal moves lead from row `first`.
 
     Equal moves, one after another, are one straight segment.
     """
     last = path.shape[0] - 1
+    # The first move, which the others must equal.
     dx = path[first + 1, 0] - path[first, 0]
     dy = path[first + 1, 1] - path[first, 1]
     end = first + 1
@@ -338,7 +364,7 @@ def _cost_between(
     """Return the cost of the segment between two cells, in the direction of driving.
 
     `first` and `last` are rows of the path (N, 2). A backward path leads from the goal
-    to the start.
+    to the start, against the direction of driving.
     """
     begin = last if is_backward else first
     end = first if is_backward else last
@@ -357,15 +383,16 @@ def _keep_corners(
 ) -> int:
     """Leave out all cells of a path that straight segments can replace.
 
-    From each cell that is kept, the next one is the farthest cell found to which a
-    segment is legal and costs no more than the moves.
+    After a cell that is kept, the next cell kept is the farthest one found to which a
+    segment is legal and costs no more than the moves between both cells.
 
     Parameters
     ----------
     path : (N, 2)
         The cells that are kept are moved to its front.
     costs : (N,)
-        The costs of the segments that end in these cells are written to its front.
+        The cost of the segment that ends in each cell that is kept is written to the
+        same row.
     cost_to_cell : (N,)
         What the path costs from its first cell to each cell, plus any constant; empty
         on a map without costs.
@@ -380,8 +407,9 @@ def _keep_corners(
     """
     last = path.shape[0] - 1
     first = 0  # the row of the last cell that was kept
-    number = 0  # the row to which it was moved
+    number = 0  # the row to which that cell was moved
     while first < last:
+        # The segment from row `first` to row `end`, at first along equal moves.
         end = _end_of_equal_moves(path, first)
         if cost_to_cell.size > 0:
             cost = cost_to_cell[end] - cost_to_cell[first]
@@ -389,8 +417,9 @@ def _keep_corners(
             width = abs(path[first + 1, 0] - path[first, 0])
             height = abs(path[first + 1, 1] - path[first, 1])
             cost = (end - first) * _length(width, height)
-        # By how many cells the segment can be longer is found by doubling a step, and
-        # then by halving it. No segment reaches the very next cell past a right angle.
+        # The end moves on by a step of rows, as long as the longer segment can replace
+        # the moves. The step is doubled up to the first failure, and halved from then
+        # on. No segment reaches the very next cell past a right angle.
         step = FIRST_STEP
         is_doubling = True
         shortest_step = 1
@@ -428,47 +457,50 @@ def _move_corners(
     Parameters
     ----------
     path : (N, 2)
-        Its first `count` cells are the path; they change in place.
+        Its first `count` rows are the corners of the path, with its two ends; they
+        change in place.
     costs : (N,)
-        The cost of the segment that ends in each cell; changes in place.
+        The cost of the segment that ends in each corner; changes in place.
     count : int
     layers : Layers
 
     Returns
     -------
     count : int
-        How many cells remain.
+        How many rows remain.
     has_moved_corners : bool
+        Whether a corner was moved or left out.
     """
     has_moved_corners = False
-    corner = 1
-    moved_by = NO_ACTION  # the action by which this corner has just moved
+    corner = 1  # the row of the corner that is tried
+    last_action = NO_ACTION  # by which this corner has just moved
     while corner < count - 1:
-        was_moved_by = moved_by
+        # The actions to try are those from `first_action` to before `end_action`.
         first_action = 0
         end_action = len(MOVES)
-        if was_moved_by != NO_ACTION:  # this action alone is tried once more
-            first_action = was_moved_by
-            end_action = was_moved_by + 1
+        if last_action != NO_ACTION:  # the same action alone is tried once more
+            first_action = last_action
+            end_action = last_action + 1
         elif _turns_around_obstacle(path, corner - 1, corner, corner + 1, layers):
             end_action = 0  # no action is tried
         elif _move_to_next(path, costs, corner, layers):
             end_action = 0
-        moved_by = _move(path, costs, corner, first_action, end_action, layers)
+        action = _move(path, costs, corner, first_action, end_action, layers)
         is_at_next = (
             path[corner, 0] == path[corner + 1, 0]
             and path[corner, 1] == path[corner + 1, 1]
         )
-        if is_at_next:
+        if is_at_next:  # one of two equal corners is left out
             count -= 1
             _leave_out(path, costs, corner + 1, count)
-            moved_by = NO_ACTION
-        has_moved_corners |= is_at_next or moved_by != NO_ACTION
-        has_come_to_rest = was_moved_by != NO_ACTION and moved_by == NO_ACTION
+            action = NO_ACTION
+        has_moved_corners |= is_at_next or action != NO_ACTION
+        has_come_to_rest = last_action != NO_ACTION and action == NO_ACTION
+        last_action = action
         if is_at_next or has_come_to_rest:
             # The corner before has a new neighbour, and may move now.
             corner = max(corner - 1, 1)
-        elif moved_by == NO_ACTION:
+        elif action == NO_ACTION:
             corner += 1
     return count, has_moved_corners
 
@@ -477,17 +509,20 @@ def _move_corners(
 def _move_to_next(path: CellArray, costs: Float64, corner: int, layers: Layers) -> bool:
     """Move a corner onto the next one if the path then costs no more.
 
-    Return whether it moved. The caller then leaves out one of the two equal corners:
-    the segment between them costs nothing.
+    Return whether it moved. Both corners then are the same cell, and the segment
+    between them costs nothing: the caller leaves out one of them.
 
     Parameters
     ----------
     path : (N, 2)
         Changes in place, in row `corner`.
     costs : (N,)
-        The cost of the segment that ends in each cell; changes in place.
+        The cost of the segment that ends in each row of the path; changes in place.
+    corner : int
+        A row of the path, neither the first nor the last.
+    layers : Layers
     """
-    # Rounded sums of the same cost are not greater.
+    # Of the segments before and after the corner, with a margin for rounding.
     highest_cost = (costs[corner] + costs[corner + 1]) * SAME_COST
     x = path[corner - 1, 0]
     y = path[corner - 1, 1]
@@ -519,15 +554,19 @@ def _move(
 ) -> int:
     """Move a corner by the action after which the path costs the least.
 
-    An action moves it by a cell, or by two past an obstacle of one cell. The actions
-    from `first_action` on, and before `end_action`, are tried.
+    An action moves the corner by a cell, or by two past an obstacle of one cell.
 
     Parameters
     ----------
     path : (N, 2)
         Changes in place, in row `corner`.
     costs : (N,)
-        The cost of the segment that ends in each cell; changes in place.
+        The cost of the segment that ends in each row of the path; changes in place.
+    corner : int
+        A row of the path, neither the first nor the last.
+    first_action, end_action : int
+        The actions from the first on, and before the end, are tried: 0 to 8.
+    layers : Layers
 
     Returns
     -------
@@ -540,7 +579,7 @@ def _move(
     corner_y = path[corner, 1]
     next_x = path[corner + 1, 0]
     next_y = path[corner + 1, 1]
-    # Of the two segments at the corner. A rounded sum of the same cost is not less.
+    # Of the two segments at the corner, with a margin for rounding.
     lowest_cost = (costs[corner] + costs[corner + 1]) / SAME_COST
     best_action = NO_ACTION
     for action in range(first_action, end_action):
@@ -574,7 +613,10 @@ def _move(
 
 @inlined
 def _leave_out(path: CellArray, costs: Float64, row: int, count: int) -> None:
-    """Leave out a row of a path (N, 2), of which `count` other rows remain."""
+    """Leave out a row of a path (N, 2) and of its costs (N,).
+
+    The rows after it move to the front by one. `count` rows remain.
+    """
     for index in range(row, count):
         path[index, 0] = path[index + 1, 0]
         path[index, 1] = path[index + 1, 1]

@@ -64,7 +64,8 @@ def is_full(queue: Any, space: Any) -> bool:
 def expand(state: int, distance: Any, mark: Any, queue: Any, space: Any) -> None:
     """Lower the cost of each state that reaches a goal more cheaply by way of `state`.
 
-    `state` was just closed. Each state whose cost falls is marked as open and queued.
+    `state` was just closed. Each state whose cost in `distance` falls is marked as open
+    and queued.
     """
     raise NotImplementedError
 
@@ -74,7 +75,8 @@ def spread(
 ) -> Progress:
     """Close states in the order of a queue, until the cost of a target is known.
 
-    It grows from the goals, so the cost of a state is that of a path to a goal.
+    The cost of a state is that of a path from the state to a goal: a wavefront grows
+    from the goals toward the target.
 
     Parameters
     ----------
@@ -86,16 +88,22 @@ def spread(
     queue : Buckets or Heap
         The open states. A state may be in it more than once.
     target : Target
+        A state, when its cost is known well enough, and how many states may be closed.
     space : CellSpace or Search
         The map, as `expand` needs it.
+
+    Returns
+    -------
+    Progress
+        How many states were closed, and why the wavefront stopped.
     """
     visits = 0
     while True:
         step = advance(queue)
         if step == NONE_WAITS:
             break
-        # It stops only between two keys: of the states of one key, all are closed or
-        # none. So a rollout may choose among all paths of the same cost.
+        # The wavefront stops only between two keys: of the states of one key, all are
+        # closed or none. So a rollout may choose among all paths of the same cost.
         if step == NEXT_KEY:
             if mark[target.state] != UNREACHED:
                 cost = distance[target.state]
@@ -106,7 +114,8 @@ def spread(
         if is_full(queue, space):
             return Progress(visits, QUEUE_FULL)
         state = pop(queue)
-        # It was queued more than once and is closed by now, or a repair took it back.
+        # A state that is not open was queued more than once and closed before, or its
+        # cost was taken back by a repair.
         if mark[state] != OPEN:
             continue
         mark[state] = CLOSED
