@@ -171,7 +171,7 @@ def remaining_cost(dx: int, dy: int, bound: Any) -> Any:
 def _expand_cell(
     cell_number: int, distance: Any, mark: Any, queue: Any, space: Any
 ) -> None:
-    """Lower the distance of each neighbour from which a path by way of a cell is cheaper.
+    """Lower the distance of each neighbour that is nearer to a goal by way of a cell.
 
     A distance is the cost of a path to a goal. A neighbour whose distance falls is
     marked as open and queued; its key is the distance plus a lower bound of the cost

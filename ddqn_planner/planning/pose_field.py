@@ -35,11 +35,11 @@ FINEST_SHIFT = 1  # of the smallest tiles that the look uses
 NO_STATE = -1
 # An aim at no start, before the first look, which is at tiles of 2**SHIFT cells a side.
 NOWHERE = Aim(
-    x=0,
-    y=0,
-    number=NO_STATE,
+    start_x=0,
+    start_y=0,
+    start_number=NO_STATE,
     weight=1.0,
-    remaining=np.empty((0, 0), np.float32),
+    corner_bound=np.empty((0, 0), np.float32),
     shift=SHIFT + 1,
 )
 ALL_STATES = 2**62  # no map has so many
@@ -50,7 +50,7 @@ GREEDY_EXPONENT = 1.5
 
 
 def _untouched(count: int, dtype: DTypeLike) -> NDArray[Any]:
-    """Return `count` zeros, in memory that is used only where it is touched."""
+    """Return zeros, (count,), in memory that is used only where it is touched."""
     # In pages of 4 KiB: NumPy would ask for larger ones, which waste more.
     size = count * np.dtype(dtype).itemsize
     flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | NO_RESERVE
@@ -91,22 +91,22 @@ class PoseField(Field[Search]):
         """A lower bound of the cost from that start."""
 
     def _goals_alone(self) -> Search:
-        """Return what is known before any growth."""
+        """Return what is known before any growth: the goals cost 0 and are open."""
         world = self.world
         tiles = world.nearness.size
-        states = tiles << pose_space.TILE_BITS
+        states = tiles << pose_space.TILE_BITS  # on the map
         search = Search(
-            distance=_untouched(states, np.float32),
-            mark=_untouched(states, np.uint8),
+            distance=_untouched(states, np.float32),  # 0 everywhere
+            mark=_untouched(states, np.uint8),  # UNREACHED everywhere
             touched=np.zeros(tiles, np.bool_),
             heap=make_heap(0),
             aim=NOWHERE,
             world=world,
         )
         x, y, heading = self.goals.T
-        numbers = pose_space.number_of_state(x, y, heading, world)
-        search.mark[numbers] = wavefront.OPEN
-        search.touched[numbers >> pose_space.TILE_BITS] = True
+        goal_numbers = pose_space.number_of_state(x, y, heading, world)
+        search.mark[goal_numbers] = wavefront.OPEN
+        search.touched[goal_numbers >> pose_space.TILE_BITS] = True
         return search
 
     @property
@@ -120,10 +120,11 @@ class PoseField(Field[Search]):
         Parameters
         ----------
         start : State
+            (x, y, heading)
         bound : float
-            How many times the least cost the cost may be at most, 1 or more.
+            By what factor the cost may exceed the least cost, 1 or more.
         limit : int
-            How many states may be visited now.
+            How many states may be visited in this call.
 
         Returns
         -------
@@ -139,7 +140,8 @@ class PoseField(Field[Search]):
                 if visits_left <= 0:
                     return None
                 if self._should_look_at_map():
-                    if self._proved_bound() == math.inf and not self._can_leave():
+                    has_no_path = self._proved_bound() == math.inf
+                    if has_no_path and not self._can_leave():
                         return math.inf
                     aim = self.known.aim
                     self._begin_round(self.with_look_at_map(aim, aim.shift - 1))
@@ -149,23 +151,35 @@ class PoseField(Field[Search]):
             return self._proved_bound()
 
     def _aim_at(self, start: State, bound: float) -> None:
-        """Begin the first round toward a start, unless the field aims at it already."""
+        """Begin the first round toward a start, unless the field aims at it already.
+
+        The start is (x, y, heading), and the bound the factor by which the cost from
+        the start may exceed the least cost.
+        """
         aim = self.known.aim
         number = int(pose_space.number_of_state(*start, self.world))
-        if number == aim.number:
+        if number == aim.start_number:
             return
         x, y, _ = start
-        # What was seen of the map holds for all headings of a cell.
-        if (x, y) != (aim.x, aim.y):
+        # Lower bounds from a look at the map hold for all headings of the start's cell.
+        if (x, y) != (aim.start_x, aim.start_y):
             aim = NOWHERE
         self.visits = 0
         self._begin_round(
-            aim._replace(x=x, y=y, number=number, weight=bound**GREEDY_EXPONENT)
+            aim._replace(
+                start_x=x,
+                start_y=y,
+                start_number=number,
+                weight=bound**GREEDY_EXPONENT,
+            )
         )
 
     def _begin_round(self, aim: Aim) -> None:
-        """Queue all states that are open or wait, in the order toward an aim."""
-        tiles = np.flatnonzero(self.known.touched)
+        """Queue all states that are open or wait, in the order of A* toward an aim.
+
+        The states that are known stay. A lower bound of the start's cost is computed.
+        """
+        tiles = np.flatnonzero(self.known.touched)  # that have a reached state
         heap = make_heap((len(tiles) << pose_space.TILE_BITS) + HEAP)
         search = self.known._replace(aim=aim, heap=heap)
         self._known = search
@@ -178,35 +192,44 @@ class PoseField(Field[Search]):
     def _should_look_at_map(self) -> bool:
         """Return whether to look at the map's tiles now, for a better lower bound.
 
-        The next look is at tiles of half the side of those before: it takes 4 times as
-        long, and shows that narrower gaps are closed. So 8 times as many states must
-        have been visited before, and once a path is known, only the first look pays.
+        Each look is at tiles of half the side of the look before: it takes 4 times as
+        long, and shows that narrower gaps are closed. It pays after 8 times as many
+        visits of states; once a path is known, only the first look pays.
         """
-        shift = self.known.aim.shift - 1
-        has_paid = self.visits >= UNGUIDED << 3 * (SHIFT - shift)
-        if shift == SHIFT:
-            return has_paid
+        shift = self.known.aim.shift - 1  # the next look is at tiles of 2**shift cells
+        is_first_look = shift == SHIFT
+        has_visited_enough = self.visits >= UNGUIDED << 3 * (SHIFT - shift)
+        if is_first_look:
+            return has_visited_enough
         has_no_path = self._proved_bound() == math.inf
-        return has_paid and shift >= FINEST_SHIFT and has_no_path
+        return has_visited_enough and shift >= FINEST_SHIFT and has_no_path
 
     def _visit(self, bound: float, most_visits: int) -> int:
-        """Close states in the order of the round, at most so many; return how many.
+        """Close states in the order of the round, `most_visits` at most.
 
-        If the round ends and the bound is not proved, begin the next round.
+        Return how many states were closed. `bound` is the factor by which the start's
+        cost may exceed the least cost. If the round ends and the bound is not proved,
+        the next round begins.
         """
         search = self.known
         aim = search.aim
-        # The rounds of weighted A* end when the start's cost is the least key, the last
-        # round as soon as the bound is proved.
-        share = 1.0 if aim.weight > 1 else 1 / bound
-        target = Target(aim.number, share, bound * self._lower_bound, most_visits)
+        # A round of weighted A* ends when the start's cost is the least key, the last
+        # round, of A* itself, as soon as the bound is proved.
+        is_weighted = aim.weight > 1
+        target = Target(
+            state=aim.start_number,
+            share=1.0 if is_weighted else 1 / bound,
+            cost_enough=bound * self._lower_bound,
+            most_visits=most_visits,
+        )
         progress: Progress = pose_space.spread_over_poses(
             search.distance, search.mark, search.heap, target, search
         )
         self.visits += progress.visits
         is_proved = self._proved_bound() <= bound * SAME
         if not is_proved and progress.visits < most_visits:
-            # The round is over; or the heap is full, and it begins again.
+            # Either the round is over, and A* itself follows; or the heap is full: then
+            # the same round begins again, with a larger heap.
             is_over = progress.reason == DONE
             self._begin_round(aim._replace(weight=1.0) if is_over else aim)
         return progress.visits
@@ -227,54 +250,58 @@ class PoseField(Field[Search]):
     def _can_leave(self) -> bool:
         """Return whether primitives lead from the start to `UNGUIDED` states."""
         search = self.known
-        mark = _untouched(
-            search.mark.size, np.uint8
-        )  # its own: of states from the start
+        start = search.aim.start_number
+        # Not the field's own marks: these are of states to which the start leads.
+        mark = _untouched(search.mark.size, np.uint8)
         queue = np.empty(UNGUIDED, np.int64)
-        count = pose_space.count_reachable(search.aim.number, mark, queue, self.world)
+        count = pose_space.count_reachable(start, mark, queue, self.world)
         return bool(count == queue.size)
 
     def with_look_at_map(self, aim: Aim, shift: int) -> Aim:
-        """Return an aim with a lower bound of the cost to it from each corner of tiles.
+        """Return an aim with lower bounds of the cost to its start, found on tiles.
 
-        A tile has a side of 2**shift cells. R rows of C tiles have (R + 1) x (C + 1)
-        corners; tile (y, x) lies above and right of corner (y, x).
+        A tile has a side of 2**shift cells. There are R rows of C tiles, and a bound
+        for each of their (R + 1) x (C + 1) corners. Tile (y, x) lies above and right of
+        corner (y, x).
         """
         world = self.world
         tile_side = 1 << shift  # cells
         rows = math.ceil(world.height / tile_side)
         columns = math.ceil(world.width / tile_side)
-        # (R, C): whether the body may pass a tile, UNSEEN as long as nobody asked.
+        # (R, C): whether the body may pass each tile, UNSEEN until a kernel asks.
         passability = np.full((rows, columns), UNSEEN, np.uint8)
-        if shift == SHIFT:  # tiles of this size are kept from look to look
+        if shift == SHIFT:  # the world keeps what is found out of tiles of this size
             passability = world.passability
-        remaining = np.empty((rows + 1, columns + 1), np.float32)  # cells
-        aim_with_look = aim._replace(remaining=remaining, shift=shift)
-        goal_x, goal_y = self.goals[:, :2].T >> shift  # tiles
-        is_goal = np.zeros(remaining.shape, np.bool_)
+        corner_bound = np.empty((rows + 1, columns + 1), np.float32)  # cells
+        aim_with_look = aim._replace(corner_bound=corner_bound, shift=shift)
+        goal_x, goal_y = self.goals[:, :2].T >> shift  # of the tile of each goal
+        is_goal = np.zeros(corner_bound.shape, np.bool_)
         is_goal[goal_y, goal_x] = True
         box = np.array([goal_x.min(), goal_y.min(), goal_x.max(), goal_y.max()])
-        # The 4 corners of the start's tile; and each opens its 8 neighbours once.
-        heap = make_heap(4 + 8 * remaining.size)
+        # Room for the 4 corners of the start's tile, and for 8 neighbours that each
+        # corner queues.
+        heap = make_heap(4 + 8 * corner_bound.size)
         search = self.known._replace(aim=aim_with_look, heap=heap)
-        pose_space.write_remaining(search, passability, is_goal, box)
+        pose_space.write_corner_bounds(search, passability, is_goal, box)
         return aim_with_look
 
     def rollout(self, start: State, bound: float) -> PosePath:
-        """Return the path from a start to a goal; there is one, see `reach`.
+        """Return the path from a start (x, y, heading) to a goal, and keep it.
 
-        It costs at most `bound` times the least.
+        The path costs at most `bound` times the least. There is a path: `reach` has
+        returned a finite bound.
         """
         body = self.world.body
         with self._lock:
             proved_bound = self.reach(start, bound, ALL_STATES)
             assert proved_bound is not None
             search = self.known
-            cost = search.distance[search.aim.number]
+            start_number = search.aim.start_number
+            cost = search.distance[start_number]
             most_primitives = int(cost / body.cost.min()) + 1
             most_poses = int(np.diff(body.first_pose).max())  # of a primitive
             rows = np.empty((4, 1 + most_primitives * most_poses))
-            count = pose_space.follow(search, search.aim.number, most_primitives, rows)
+            count = pose_space.follow(search, start_number, most_primitives, rows)
         x, y, yaw, costs = rows[:, :count]  # cells, radians on the map, cells
         grid = self.grid
         in_cells = np.column_stack([x, y])
@@ -303,38 +330,51 @@ class PoseField(Field[Search]):
         return True
 
     def _repaired(self, search: Search, changed: NDArray[np.int64]) -> Search:
-        """Return what was known before cells (N, 2) changed, repaired in place.
+        """Return a search from before cells changed, repaired for this field's map.
 
         Where too much would be lost, return the goals alone, with the look at the map
-        if that holds still.
+        if that still holds.
+
+        Parameters
+        ----------
+        search : Search
+            What an older field knew; its arrays change in place.
+        changed : (N, 2)
+            The cells x, y in which the map differs from that of the older field.
         """
-        cost = _cost_from_start(search)
-        tiles = np.flatnonzero(search.touched)
-        is_near = self._tiles_near(changed)
-        near_tiles = np.flatnonzero(is_near.ravel() & search.touched)
+        cost_from_start = _cost_from_start(search)
+        tiles = np.flatnonzero(search.touched)  # that have a reached state
+        near_tiles = np.flatnonzero(self._is_near(changed).ravel() & search.touched)
         most_opened = len(tiles) << pose_space.TILE_BITS  # states that a repair opens
         occupied = self.grid.uninflated
-        has_freed_cell = not occupied[changed[:, 1], changed[:, 0]].all()
-        # A path may have become cheaper where a cell is free: then the lower bounds are
-        # void. Otherwise what is open stays in order, and `_lower_bound` a lower bound.
-        if has_freed_cell:
+        has_free_cell = not occupied[changed[:, 1], changed[:, 0]].all()
+        # 1. The aim and the queue. A path through a changed cell that is free may be
+        # cheaper than before: lower bounds do not hold any more. Else they hold, and
+        # the states in the queue stay in order.
+        if has_free_cell:
             search = search._replace(aim=NOWHERE, heap=make_heap(most_opened))
         elif search.heap.size[0] + most_opened > search.heap.keys.size:
-            aim = search.aim._replace(number=NO_STATE)  # so that a new round begins
+            aim = search.aim._replace(start_number=NO_STATE)  # so a new round begins
             search = search._replace(aim=aim, heap=make_heap(most_opened))
+        # 2. Costs that are too low. All costs below the least unsupported one hold.
         unsupported_cost = pose_space.least_unsupported(search, near_tiles)
-        if cost < math.inf and unsupported_cost < KEPT_SHARE * cost:
-            aim = search.aim._replace(number=NO_STATE)
+        has_path = cost_from_start < math.inf
+        if has_path and unsupported_cost < KEPT_SHARE * cost_from_start:
+            aim = search.aim._replace(start_number=NO_STATE)
             return self._goals_alone()._replace(aim=aim)
         if unsupported_cost < math.inf:
             pose_space.take_back(search, tiles, unsupported_cost)
-        if has_freed_cell:  # states near the cells are visited again
+        # 3. Costs that may be too high: states near the changed cells are opened again.
+        if has_free_cell:
             mark = search.mark.reshape(self.world.nearness.size, -1)
             mark[near_tiles] = np.minimum(mark[near_tiles], wavefront.OPEN)
         return search
 
-    def _tiles_near(self, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return from which tiles (R, C) primitives may sweep some cells (N, 2)."""
+    def _is_near(self, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return from which tiles primitives may sweep some of the cells (N, 2).
+
+        The result is (R, C), by rows and columns of tiles of `TILE` cells a side.
+        """
         is_near = np.zeros(self.world.nearness.shape, np.bool_)
         reach = self.world.body.reach // TILE + 1  # tiles
         columns, rows = (cells // TILE).T.tolist()
@@ -347,7 +387,7 @@ class PoseField(Field[Search]):
 
 def _cost_from_start(search: Search) -> float:
     """Return the least cost found from the aim's start; infinite without a path."""
-    number = search.aim.number
+    number = search.aim.start_number
     if number < 0 or search.mark[number] == wavefront.UNREACHED:
         return math.inf
     return float(search.distance[number])

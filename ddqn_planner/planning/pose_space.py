@@ -40,15 +40,15 @@ NO_PRIMITIVE: Final = -1
 
 
 class Aim(NamedTuple):
-    """The start toward which a field grows, and a lower bound of the cost to it."""
+    """The start toward which a field grows, and lower bounds of the cost to it."""
 
-    x: int  # of the start's cell
-    y: int
-    number: int  # of the start's state; negative for none
+    start_x: int  # the start's cell
+    start_y: int
+    start_number: int  # of the start's state; negative for none
     weight: float  # of the lower bound, in the order in which states are visited
-    # (rows + 1, columns + 1): at least the cost from each corner of tiles to the start,
-    # in cells; empty before the map was looked at.
-    remaining: NDArray[np.float32]
+    # (rows + 1, columns + 1): a lower bound of the cost from each corner of tiles to
+    # the start, in cells; empty before the map was looked at.
+    corner_bound: NDArray[np.float32]
     shift: int  # of these tiles: each has 2**shift cells along a side
 
 
@@ -67,7 +67,11 @@ class Search(NamedTuple):
 
 @inlined
 def number_of_state(x: Any, y: Any, heading: Any, world: Any) -> Any:
-    """Return the number of a state: bits of the tile, the cell in it, the heading."""
+    """Return the number of the state at cell (x, y) with a heading, 0 to 15.
+
+    Its highest bits number the tile of 4 x 4 cells, row by row; then come 4 bits for
+    the cell in the tile, row by row, and 4 for the heading.
+    """
     tile_columns = world.nearness.shape[1]
     tile = (y >> SHIFT) * tile_columns + (x >> SHIFT)
     cell_in_tile = (y & (TILE - 1)) << SHIFT | (x & (TILE - 1))
@@ -105,37 +109,43 @@ def end_of(x: int, y: int, primitive: int, world: Any) -> Any:
 
 @inlined
 def remaining_cost(x: int, y: int, aim: Any) -> float:
-    """Return a lower bound of the cost from cell (x, y) to the start, in cells.
+    """Return a lower bound of the cost from cell (x, y) to the aim's start, in cells.
 
-    It is the distance between them; or, with `aim.remaining`, the greatest of that and
-    what the four corners of the cell's tile say.
+    It is the straight distance between the centres of both cells. If the aim has lower
+    bounds from the corners of tiles to the start, a greater one may count: that of a
+    corner of the cell's tile, minus the distance from the cell to this corner.
     """
-    bound = math.sqrt((x - aim.x) * (x - aim.x) + (y - aim.y) * (y - aim.y))
-    if aim.remaining.size == 0:
+    dx = x - aim.start_x
+    dy = y - aim.start_y
+    bound = math.sqrt(dx * dx + dy * dy)
+    if aim.corner_bound.size == 0:
         return bound
+    # Corner (row, column) is the lowest corner of the tile of these numbers.
     first_row = y >> aim.shift
     first_column = x >> aim.shift
     for row in range(first_row, first_row + 2):
         for column in range(first_column, first_column + 2):
-            from_corner = aim.remaining[row, column]
-            if from_corner > bound:
-                # No path from the cell is shorter than one from the corner by more than
-                # the distance to the corner.
-                dx = x + 0.5 - (column << aim.shift)
-                dy = y + 0.5 - (row << aim.shift)
-                bound = max(bound, from_corner - math.sqrt(dx * dx + dy * dy))
+            bound_of_corner = aim.corner_bound[row, column]
+            if bound_of_corner > bound:
+                # From the corner to the centre of the cell: cell 0 is from 0 to 1.
+                corner_dx = x + 0.5 - (column << aim.shift)
+                corner_dy = y + 0.5 - (row << aim.shift)
+                distance = math.sqrt(corner_dx * corner_dx + corner_dy * corner_dy)
+                bound = max(bound, bound_of_corner - distance)
     return bound
 
 
 @in_place
 def queue_open_states(search: Search, tiles: NDArray[np.int64]) -> float:
-    """Open and queue all states in some tiles (K,) that are open or wait.
+    """Open and queue all states that are open or wait, in the tiles (K,).
 
-    Return a lower bound of the cost that may still be found for the start of the aim.
+    The marks and the heap of the search change. Return a lower bound of the cost that
+    may still be found for the start of the aim, in cells.
     """
     aim = search.aim
     lower_bound = np.inf
     for tile in tiles:
+        # The numbers of the states in the tile.
         for number in range(tile << TILE_BITS, (tile + 1) << TILE_BITS):
             if OPEN <= search.mark[number] <= WAITING:
                 search.mark[number] = OPEN
@@ -149,17 +159,29 @@ def queue_open_states(search: Search, tiles: NDArray[np.int64]) -> float:
 
 @inlined
 def _expand_pose(number: int, distance: Any, mark: Any, heap: Any, search: Any) -> None:
-    """Lower the cost of each state that is nearer to a goal by way of a state.
+    """Lower the cost of each state from which a path by way of a state is cheaper.
 
-    Such a state is marked as open and queued. State `number` was just closed; its
-    predecessors are the states from which a primitive leads to it. `distance`, `mark`
-    and `heap` are those of the search.
+    Each state is judged from which a primitive leads to state `number`. Where its cost
+    falls, it is marked as open and queued.
+
+    Parameters
+    ----------
+    number : int
+        A state that was just closed, see `number_of_state`.
+    distance : (N,) float32
+        The cost from each state to a goal, in cells; changes in place.
+    mark : (N,) uint8
+        UNREACHED, OPEN, WAITING or CLOSED for each state; changes in place.
+    heap : Heap
+    search : Search
+        Has the same three, the map with the body, and the aim that orders the heap.
     """
     aim = search.aim
     world = search.world
     body = world.body
     x, y, heading = state_of(number, world)
     cost_from_state = distance[number]
+    # The primitives that end with this heading.
     for place in range(body.first_ending[heading], body.first_ending[heading + 1]):
         primitive = body.by_end[place]
         begin_x = x - body.offset[primitive, 0]
@@ -167,8 +189,8 @@ def _expand_pose(number: int, distance: Any, mark: Any, heap: Any, search: Any) 
         if not is_inside(begin_x, begin_y, world):
             continue
         previous = number_of_state(begin_x, begin_y, body.start[primitive], world)
-        # First judged by the least cost of the primitive: whether the body has room for
-        # it, and what it costs on the map, takes longer to tell.
+        # First judged by the least cost of the primitive: it takes longer to tell
+        # whether the body has room for it, and what it costs on the map.
         is_reached = mark[previous] != UNREACHED
         if is_reached and cost_from_state + body.cost[primitive] >= distance[previous]:
             continue
@@ -178,8 +200,8 @@ def _expand_pose(number: int, distance: Any, mark: Any, heap: Any, search: Any) 
         if cost == np.inf or (is_reached and cost >= distance[previous]):
             continue
         distance[previous] = cost
-        # While the lower bound is weighted, a round closes each state once: a closed
-        # state waits for the next round.
+        # With a weighted lower bound, a round closes each state once: a state that is
+        # closed, or waits already, waits for the next round.
         if mark[previous] >= WAITING and aim.weight > 1:
             mark[previous] = WAITING
             continue
@@ -215,8 +237,19 @@ def cheapest_primitive(
 ) -> tuple[Any, int]:
     """Return the least cost from a state to a goal, and the path's first primitive.
 
-    Only primitives count whose end costs less than `limit`. If no path costs at most
-    `greatest_cost`, that and NO_PRIMITIVE are returned.
+    Costs are in cells.
+
+    Parameters
+    ----------
+    number : int
+        The state, see `number_of_state`.
+    limit : float
+        Only primitives count that lead to a state of a lower cost.
+    greatest_cost : float32
+        Only paths count that cost no more. Without such a path, `greatest_cost` and
+        NO_PRIMITIVE are returned.
+    search : Search
+        Knows the costs from the states after the primitives.
     """
     world = search.world
     body = world.body
@@ -247,13 +280,14 @@ def follow(search: Search, start: int, limit: int, rows: NDArray[np.float64]) ->
     Parameters
     ----------
     search : Search
+        Knows the costs from the states on the way.
     start : int
         The number of a state that was reached.
     limit : int
         How many primitives are taken at most.
     rows : (4, N)
-        Where the poses are written: x and y in cells, yaw in radians, and the cost from
-        the start to the pose, in cells.
+        Where the poses are written, one in each column: x and y in cells, yaw in
+        radians, and the cost from the start to the pose, in cells.
     """
     world = search.world
     body = world.body
@@ -269,6 +303,7 @@ def follow(search: Search, start: int, limit: int, rows: NDArray[np.float64]) ->
         cost_from_state = search.distance[number]
         if cost_from_state == 0:
             break
+        # Each primitive leads to a state of a lower cost.
         _, primitive = cheapest_primitive(
             number, cost_from_state, np.float32(np.inf), search
         )
@@ -291,25 +326,25 @@ def follow(search: Search, start: int, limit: int, rows: NDArray[np.float64]) ->
 def count_reachable(
     start: int, mark: NDArray[np.uint8], queue: NDArray[np.int64], world: World
 ) -> int:
-    """Return to how many states primitives lead from a start, which counts too.
+    """Return to how many states primitives lead from a start, the start included.
 
     Parameters
     ----------
     start : int
         The number of a state.
     mark : (N,)
-        UNREACHED for each state; those that are counted become OPEN.
+        UNREACHED for each state; the states that are counted become OPEN.
     queue : (K,)
-        Memory for the states that are counted: no more than K are.
+        Memory for the states that are counted. After K states, counting stops.
     world : World
     """
     queue[0] = start
     mark[start] = OPEN
-    count = 1
-    read = 0
-    while read < count < queue.size:
-        x, y, heading = state_of(queue[read], world)
-        read += 1
+    count = 1  # states in the queue
+    expanded = 0  # states of the queue whose primitives were followed
+    while expanded < count < queue.size:
+        x, y, heading = state_of(queue[expanded], world)
+        expanded += 1
         for primitive in range(
             world.body.first_starting[heading], world.body.first_starting[heading + 1]
         ):
@@ -328,13 +363,14 @@ def count_reachable(
 
 @in_place
 def least_unsupported(search: Search, tiles: NDArray[np.int64]) -> Any:
-    """Return the least cost of a state in some tiles (K,) that no primitive supports.
+    """Return the least cost that no primitive supports, of the states in tiles (K,).
 
-    A primitive supports the cost of a state if a path that begins with the primitive
-    costs no more. The result is infinite if all costs are supported.
+    A primitive supports the cost of a state if a path to a goal that begins with the
+    primitive costs no more. The result is infinite if all costs are supported.
     """
     least_cost = np.float32(np.inf)
     for tile in tiles:
+        # The numbers of the states in the tile.
         for number in range(tile << TILE_BITS, (tile + 1) << TILE_BITS):
             if search.mark[number] == UNREACHED:
                 continue
@@ -348,16 +384,17 @@ def least_unsupported(search: Search, tiles: NDArray[np.int64]) -> Any:
 
 @in_place
 def take_back(search: Search, tiles: NDArray[np.int64], limit: Any) -> None:
-    """Take back the costs of all states in some tiles (K,) that cost `limit` or more.
+    """Take back the costs of all states in tiles (K,) that cost `limit` or more.
 
-    A state from which a primitive leads to a state that costs less than `limit`, which
-    is supported still, is then opened with the cost of that path, and queued.
+    Costs below the limit hold. So a state from which a primitive leads to a state of
+    such a cost is opened again, with the cost of the path by this primitive, and
+    queued. Costs, marks and heap of the search change in place.
     """
     distance = search.distance
     mark = search.mark
     world = search.world
-    # A state that costs more than a primitive beyond the limit cannot be reached from
-    # one below it: unless primitives cost more on this map.
+    # No primitive leads from a state of a greater cost to a state below the limit: such
+    # a state costs at most the limit and one primitive, unless cells have costs.
     greatest_cost = limit
     if has_costs(world.layers):
         greatest_cost = np.float32(np.inf)
@@ -393,12 +430,12 @@ LONGER: Final = math.sqrt(1 + (DIAGONAL / STRAIGHT - 1) ** 2)
 def may_pass(x: int, y: int, world: Any) -> bool:
     """Return whether the origin of the body may lie in cell (x, y).
 
-    That is so if the body has room to stand there with some heading, or for a primitive
-    that leads the origin through the cell.
+    It may if the body has room to stand there with some heading, or has room for a
+    primitive that leads the origin through the cell.
     """
     body = world.body
-    # A core is what primitives sweep in common around each cell that the origin passes:
-    # with an occupied cell in a core, the body has no room for any of them.
+    # The core of some primitives is what all of them sweep around each cell that the
+    # origin passes: with an occupied cell in the core, none of them leads through.
     if not has_room(x, y, body.common_core_mask, world):
         return False
     for heading in range(HEADINGS):
@@ -406,6 +443,7 @@ def may_pass(x: int, y: int, world: Any) -> bool:
             return True
         if not has_room(x, y, body.core_mask + heading, world):
             continue
+        # The primitives that start with this heading.
         first = body.first_starting[heading]
         for primitive in range(first, body.first_starting[heading + 1]):
             if _may_lead_through(x, y, primitive, world):
@@ -415,10 +453,13 @@ def may_pass(x: int, y: int, world: Any) -> bool:
 
 @inlined
 def _may_lead_through(x: int, y: int, primitive: int, world: Any) -> bool:
-    """Return whether the body has room to take a primitive through cell (x, y)."""
+    """Return whether the body has room for a primitive whose origin passes (x, y).
+
+    The primitive may begin in several cells: (x, y) may be any cell that it passes.
+    """
     body = world.body
+    # The rows of `passed_cells` of this primitive: cells from the one where it begins.
     for place in range(body.first_passed[primitive], body.first_passed[primitive + 1]):
-        # The primitive begins so that this is the cell that its origin passes.
         begin_x = x - body.passed_cells[place, 0]
         begin_y = y - body.passed_cells[place, 1]
         is_begin_inside = is_inside(begin_x, begin_y, world)
@@ -433,14 +474,23 @@ def is_passable(
 ) -> bool:
     """Return whether the origin of the body may pass any cell of a tile.
 
-    `row` and `column` are those of the tile, which has 2**shift cells along a side. The
-    answer is kept in `passability`, an array by rows and columns of tiles.
+    Parameters
+    ----------
+    row, column : int
+        Of the tile, counted in tiles.
+    shift : int
+        A tile has 2**shift cells along a side.
+    passability : (rows, columns) uint8
+        UNSEEN, PASSABLE or IMPASSABLE for each tile. An unseen tile is looked at, and
+        what is found is written.
+    world : World
+        The body on the map.
     """
     if passability[row, column] == UNSEEN:
+        # Impassable, as long as no cell was found that may be passed.
         passability[row, column] = IMPASSABLE
         for y in range(row << shift, min((row + 1) << shift, world.height)):
             for x in range(column << shift, min((column + 1) << shift, world.width)):
-                # As soon as a cell may be passed, no other cell needs a look.
                 has_no_cell = passability[row, column] == IMPASSABLE
                 if has_no_cell and may_pass(x, y, world):
                     passability[row, column] = PASSABLE
@@ -449,15 +499,19 @@ def is_passable(
 
 @inlined
 def steps(columns: int, rows: int) -> int:
-    """Return how many steps a path over tiles counts that nothing stops."""
+    """Return the steps of a shortest path over free tiles: 5 a side, 7 a diagonal.
+
+    The path leads over so many columns and rows of tiles, each 0 or more.
+    """
     return STRAIGHT * max(columns, rows) + (DIAGONAL - STRAIGHT) * min(columns, rows)
 
 
 @inlined
 def steps_to_box(x: int, y: int, box: NDArray[np.int64]) -> int:
-    """Return how many steps it is at least from corner (x, y) to a box of corners.
+    """Return a lower bound of the steps from corner (x, y) to a box of corners.
 
-    The box is the least x, the least y, the greatest x and the greatest y.
+    All are corners of tiles, counted in tiles. The box (4,) is the least x, the least
+    y, the greatest x and the greatest y.
     """
     columns = max(box[0] - x, x - box[2], 0)
     rows = max(box[1] - y, y - box[3], 0)
@@ -466,34 +520,39 @@ def steps_to_box(x: int, y: int, box: NDArray[np.int64]) -> int:
 
 @inlined
 def _push_start(search: Any, box: Any) -> None:
-    """Queue the four corners of the start's tile, which 0 steps lead to."""
+    """Queue the four corners of the tile of the aim's start, with 0 steps each.
+
+    The steps are written to `aim.corner_bound`. `box` (4,) holds all goals: the least
+    x, the least y, the greatest x and the greatest y of corners.
+    """
     aim = search.aim
-    row = aim.y >> aim.shift
-    column = aim.x >> aim.shift
+    row = aim.start_y >> aim.shift
+    column = aim.start_x >> aim.shift
     for y in range(row, row + 2):
         for x in range(column, column + 2):
-            aim.remaining[y, x] = 0
-            corner = y * aim.remaining.shape[1] + x
+            aim.corner_bound[y, x] = 0
+            corner = y * aim.corner_bound.shape[1] + x
             push_to_heap(steps_to_box(x, y, box), corner, search.heap)
 
 
 @in_place
-def write_remaining(
+def write_corner_bounds(
     search: Search,
     passability: NDArray[np.uint8],
     is_goal: NDArray[np.bool_],
     box: NDArray[np.int64],
 ) -> None:
-    """Write lower bounds of the cost to the start, by corners of tiles.
+    """Write a lower bound of the cost from each corner of tiles to the aim's start.
 
-    They are found by A* over the corners, from those of the start's tile to the nearest
-    goal, and somewhat further: tiles that are not on the way there are not looked at.
-    They are infinite where no path leads.
+    The bounds are found by A* over the corners, from those of the start's tile to the
+    goals: it visits all corners on a way to the nearest goal that is up to a fifth
+    longer than the shortest. A bound is infinite if A* has visited all corners that a
+    path from the start can reach, and this one is none of them.
 
     Parameters
     ----------
     search : Search
-        With an empty heap. The bounds are written to `search.aim.remaining`, (R + 1,
+        With an empty heap. The bounds are written to `search.aim.corner_bound`, (R + 1,
         C + 1), in cells.
     passability : (R, C) uint8
         UNSEEN, PASSABLE or IMPASSABLE for each tile; changes in place.
@@ -502,23 +561,23 @@ def write_remaining(
     box : (4,) int64
         The least x, the least y, the greatest x and the greatest y of these corners.
     """
-    heap = search.heap
-    step_count = search.aim.remaining  # steps from the start's tile, at first
+    heap = search.heap  # of corners; a key is steps plus those that are left at least
+    step_count = search.aim.corner_bound  # at first the steps from the start's tile
     corner_columns = step_count.shape[1]
     step_count[:] = np.inf
     _push_start(search, box)
     last_key = np.float32(0)
-    limit = np.inf
-    while heap.size[0] > 0 and heap.keys[0] <= limit:
+    greatest_key = np.inf  # no corner of a greater key is visited
+    while heap.size[0] > 0 and heap.keys[0] <= greatest_key:
         last_key = heap.keys[0]
         corner = pop_from_heap(heap)
         y = corner // corner_columns
         x = corner - y * corner_columns
-        # The corner was queued again, with fewer steps.
-        if last_key > step_count[y, x] + steps_to_box(x, y, box):
+        key = step_count[y, x] + steps_to_box(x, y, box)
+        if last_key > key:  # the corner was queued once more, with fewer steps
             continue
         if is_goal[y, x]:
-            limit = min(limit, FURTHER * step_count[y, x])
+            greatest_key = min(greatest_key, FURTHER * step_count[y, x])
         _step_over_tiles(x, y, search, passability, box)
     _turn_into_cost(search, last_key, box)
 
@@ -527,13 +586,25 @@ def write_remaining(
 def _step_over_tiles(
     x: int, y: int, search: Any, passability: Any, box: NDArray[np.int64]
 ) -> None:
-    """Step from corner (x, y) to the corners of the tiles around it, over each tile.
+    """Step from corner (x, y) over the passable tiles around it, to all their corners.
 
-    A corner that takes fewer steps then is queued.
+    A corner to which fewer steps lead than before gets these, and is queued.
+
+    Parameters
+    ----------
+    x, y : int
+        A corner of tiles. It has tile (y, x) above and right of it.
+    search : Search
+        Its aim's `corner_bound`, (rows + 1, columns + 1), holds the steps from the
+        start to each corner; changes in place.
+    passability : (rows, columns)
+        Of each tile, see `is_passable`; changes in place.
+    box : (4,)
+        See `steps_to_box`.
     """
     rows, columns = passability.shape
     shift = search.aim.shift
-    step_count = search.aim.remaining  # (rows + 1, columns + 1)
+    step_count = search.aim.corner_bound  # (rows + 1, columns + 1)
     steps_before = step_count[y, x]
     for row in range(max(y - 1, 0), min(y + 1, rows)):
         for column in range(max(x - 1, 0), min(x + 1, columns)):
@@ -551,23 +622,32 @@ def _step_over_tiles(
 
 @inlined
 def _turn_into_cost(search: Any, last_key: Any, box: Any) -> None:
-    """Turn the steps in `aim.remaining` into lower bounds of costs, in cells.
+    """Turn the steps in `aim.corner_bound` into lower bounds of costs, in cells.
 
-    `last_key` is the key of the last corner that A* has visited: its steps, plus those
-    that are left at least to the box around all goals.
+    Parameters
+    ----------
+    search : Search
+        Its aim's `corner_bound` holds the steps from the start's tile to each corner
+        of tiles, infinite where A* did not come; changes in place. Its heap holds the
+        corners that A* has queued and not visited.
+    last_key : float
+        The key of the last corner that A* has visited: its steps, plus a lower bound
+        of the steps from there to a box around all goals.
+    box : (4,)
+        See `steps_to_box`.
     """
     aim = search.aim
     was_stopped = search.heap.size[0] > 0
-    for y in range(aim.remaining.shape[0]):
-        for x in range(aim.remaining.shape[1]):
-            # A corner that was not visited has a key that is no less than the last.
+    for y in range(aim.corner_bound.shape[0]):
+        for x in range(aim.corner_bound.shape[1]):
+            # A corner that was not visited has at least the key of the last one.
             least_steps = np.inf
             if was_stopped:
                 least_steps = last_key - steps_to_box(x, y, box)
-            step_count = min(aim.remaining[y, x], least_steps)
-            # The shortest path in tiles, from a corner of the start's tile: the path of
-            # these steps is longer by the factor `LONGER` at most.
+            step_count = min(aim.corner_bound[y, x], least_steps)
+            # No path from a corner of the start's tile is shorter than this, in sides
+            # of tiles: a path of steps is longer by the factor `LONGER` at most.
             from_corner = step_count / (STRAIGHT * LONGER)
             # The start is no farther than a diagonal from that corner.
             from_start = from_corner - math.sqrt(2.0)
-            aim.remaining[y, x] = from_start * (1 << aim.shift)
+            aim.corner_bound[y, x] = from_start * (1 << aim.shift)

@@ -306,7 +306,7 @@ def _turns_around_obstacle(
     """Return whether a path turns at a right angle around an occupied cell.
 
     Such a corner cannot be left out, as no straight line leads past the occupied cell
-    on the side of the corner. The result is False on a map with costs, or where corners of
+    on the corner's side. The result is False on a map with costs, or where corners of
     obstacles may be cut.
 
     Parameters
