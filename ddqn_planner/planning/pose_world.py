@@ -118,19 +118,28 @@ class Masks(NamedTuple):
 
 
 def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
-    """Return primitives as kernels need them.
+    """Return P primitives as kernels need them: all in flat arrays, see `Body`.
 
-    `swept` (P, S, S) are the cells that the body sweeps on each primitive, around the
-    cell in which the primitive begins.
+    Parameters
+    ----------
+    motions : Motions
+        The primitives, sorted by the headings in which they start.
+    swept : (P, S, S)
+        The cells that the body sweeps on each primitive, by y and x, with the cell in
+        which the primitive begins in the middle.
     """
-    origin_cells = [_passed_cells(poses) for poses in motions.poses]
-    masks = _masks_of(motions, swept, origin_cells)
-    lowest = np.array([cells.min(axis=0) for cells, _, _ in origin_cells])
-    highest = np.array([cells.max(axis=0) for cells, _, _ in origin_cells])
+    # For each primitive, the cells that the origin passes.
+    passed = [_passed_cells(poses) for poses in motions.poses]
+    lowest = np.array([cells.min(axis=0) for cells, _, _ in passed])  # (P, 2)
+    highest = np.array([cells.max(axis=0) for cells, _, _ in passed])
+    passed_rows = [np.column_stack([cells, actions]) for cells, actions, _ in passed]
+    shares = np.concatenate([shares for _, _, shares in passed])
+
+    masks = _masks_of(motions, swept, passed)
     farthest_swept = np.abs(np.argwhere(masks.swept) - swept.shape[1] // 2).max()
     # An origin outside of the body may reach farther than what the body sweeps.
     reach = int(max(farthest_swept, (highest - lowest).max()))
-    side = 2 * reach + TILE + 1
+    side = 2 * reach + TILE + 1  # cells within reach of a tile
     # The rows of all masks, in the order of the masks' numbers.
     rows = [
         rows_of(swept),
@@ -139,16 +148,14 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
         rows_of(np.array([masks.core.all(axis=0)])),
         rows_of(np.ones((1, side, side), dtype=np.bool_)),
     ]
-    row_counts = np.concatenate([part.counts for part in rows])
-    primitives = len(motions.start)
-    passed_rows = [
-        np.column_stack([cells, actions]) for cells, actions, _ in origin_cells
-    ]
-    shares = np.concatenate([shares for _, _, shares in origin_cells])
+    row_counts = np.concatenate([part.counts for part in rows])  # (M,): of each mask
+
+    # All poses but the first of each primitive, and their shares of its cost.
     pose_rows = [
         np.column_stack([poses, np.linspace(0, 1, len(poses))])[1:]
         for poses in motions.poses
     ]
+    primitives = len(motions.start)
     headings = np.arange(HEADINGS + 1)
     by_end = np.argsort(motions.end, kind="stable")
     return Body(
@@ -179,13 +186,22 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
 
 
 def _masks_of(
-    motions: Motions, swept: NDArray[np.bool_], origin_cells: list[PassedCells]
+    motions: Motions, swept: NDArray[np.bool_], passed: list[PassedCells]
 ) -> Masks:
-    """Return what the primitives of each heading sweep in common.
+    """Return where the body stands, and what the primitives of a heading all sweep.
 
-    `swept` (P, S, S) are the cells that the body sweeps on each primitive.
+    Parameters
+    ----------
+    motions : Motions
+        P primitives.
+    swept : (P, S, S)
+        The cells that the body sweeps on each primitive, by y and x, with the cell in
+        which the primitive begins in the middle.
+    passed : list of PassedCells
+        For each primitive, the cells that the origin passes.
     """
     shape = swept.shape[1:]
+    # All cells are set at first. Each primitive takes away what it does not sweep.
     standing = np.ones((HEADINGS, *shape), dtype=np.bool_)
     core = np.ones((HEADINGS, *shape), dtype=np.bool_)
     swept_by_any = np.zeros(shape, dtype=np.bool_)
@@ -194,11 +210,9 @@ def _masks_of(
         end = motions.end[primitive]
         # (C, S, S): what the primitive sweeps, with each of the C cells that the origin
         # passes moved to the middle.
+        passed_cells = passed[primitive].cells.tolist()
         swept_around = np.array(
-            [
-                np.roll(mask, (-y, -x), axis=(0, 1))
-                for x, y in origin_cells[primitive].cells.tolist()
-            ]
+            [np.roll(mask, (-y, -x), axis=(0, 1)) for x, y in passed_cells]
         )
         # The body stands in cells that all primitives sweep which begin or end there.
         standing[start] &= swept_around[0]
@@ -209,18 +223,19 @@ def _masks_of(
 
 
 def rows_of(masks: NDArray[np.bool_]) -> Rows:
-    """Return the rows of 64 cells of masks (M, S, S) in which a cell is set.
+    """Return the words of masks (M, S, S) in which a cell is set.
 
-    Columns S to the next multiple of 64 are not set.
+    A word is 64 cells of a row of a mask, as bits. S is rounded up to whole words: the
+    columns beyond S are not set.
     """
     middle = masks.shape[-1] // 2
-    missing_columns = -masks.shape[-1] % 64
+    missing_columns = -masks.shape[-1] % 64  # up to the next multiple of 64
     whole_words = np.pad(masks, ((0, 0), (0, 0), (0, missing_columns)))
     # (M, S, words): bit b of word w is the cell in column 64 w + b.
     words = np.packbits(whole_words, axis=-1, bitorder="little").view("<u8")
-    mask, y, word = np.nonzero(words)  # (R,) each
-    begins = np.column_stack([y, 64 * word]) - middle
-    counts = np.bincount(mask, minlength=len(masks))
+    mask, y, word = np.nonzero(words)  # (R,) each: the indices of a word
+    begins = np.column_stack([y, 64 * word]) - middle  # (R, 2): y and x
+    counts = np.bincount(mask, minlength=len(masks))  # (M,)
     return Rows(begins, words[mask, y, word], counts)
 
 
@@ -229,32 +244,36 @@ def _passed_cells(poses: NDArray[np.float64]) -> PassedCells:
 
     The poses are x and y in cells, from the centre of the first cell, and yaw.
     """
+    # K points on the path of the origin, and the short steps between them.
     points = dense_poses(poses, FINE, 0.0)[:, :2]  # (K, 2)
-    middles = (points[1:] + points[:-1]) / 2  # (K - 1, 2): of the steps between points
-    steps = np.diff(points, axis=0)
+    middles = (points[1:] + points[:-1]) / 2  # (K - 1, 2): of the steps
+    steps = np.diff(points, axis=0)  # (K - 1, 2)
     lengths = np.hypot(steps[:, 0], steps[:, 1])  # (K - 1,)
     if not lengths.any():  # a turn on the spot: one step that stays in its cell
         middles = points[:1]
         lengths = np.ones(1)
+    # The steps whose middles lie in one cell, one after another, are a pass of it: C.
     cell_of_step = np.floor(middles + 0.5).astype(np.int64)  # (K - 1, 2)
     is_in_new_cell = (cell_of_step[1:] != cell_of_step[:-1]).any(axis=1)
-    begins = np.flatnonzero(np.append(True, is_in_new_cell))  # (C,): steps
-    cells = cell_of_step[begins]  # (C, 2)
-    shares = np.add.reduceat(lengths, begins) / lengths.sum()  # (C,)
+    first_steps = np.flatnonzero(np.append(True, is_in_new_cell))  # (C,)
+    cells = cell_of_step[first_steps]  # (C, 2)
+    length_in_cell = np.add.reduceat(lengths, first_steps)  # (C,)
+    shares = length_in_cell / lengths.sum()
+    # The move from each cell to the next one; the origin stays in the last cell.
     dx, dy = np.diff(cells, axis=0).T  # (C - 1,) each
-    actions = np.append(ACTION_OF_STEP[dy + 1, dx + 1], STAND)
+    actions = np.append(ACTION_OF_STEP[dy + 1, dx + 1], STAND)  # (C,)
     return PassedCells(cells, actions, shares)
 
 
 def body_costs(grid: GridMap) -> NDArray[np.int8] | None:
     """Return the costs of cells (H, W) for a body, or None for a map without costs.
 
-    A cell that is occupied only because a disc's body would touch an obstacle costs the
-    most.
+    The cost is 0 to 100, or -1 for an unknown cell. A cell that is occupied by
+    inflation alone, as a disc's body would touch an obstacle, costs 100.
     """
-    if grid.cost is None or grid.obstacles is None:
+    if grid.cost is None or grid.obstacles is None:  # no cell is inflated
         return grid.cost
-    # The cost of an occupied cell is 0 in `grid.cost`.
+    # An occupied cell has the cost 0 in `grid.cost`.
     costs: NDArray[np.int8] = grid.cost + np.int8(OCCUPIED) * grid.occupancy
     # Like all layers, it is read-only: else numba would compile the kernels again.
     costs.flags.writeable = False
@@ -269,18 +288,27 @@ def world_of(
 ) -> World:
     """Return a body on a map, as kernels use it.
 
-    With the `cells` (N, 2) in which an `older` world of the same body differs from the
-    map, what kernels have found out there is kept, except near these cells.
+    Parameters
+    ----------
+    grid : GridMap
+    body : Body
+    older : World, optional
+        The same body on an older map. What kernels have found out there is kept,
+        except near the cells that differ. It does not change.
+    cells : (N, 2), optional
+        The cells x, y in which the older map differs from the map. With None, nothing
+        is kept.
     """
     if older is None or cells is None:
         return _new_world(grid, body)
     if not len(cells):
         return older
+    # The rows from the first to the last of these cells are written anew.
     first_column, first_row = cells.min(axis=0).tolist()
     last_column, last_row = cells.max(axis=0).tolist()
     occupied_bits = older.occupied_bits.copy()
     _write_rows(occupied_bits, grid, first_row, last_row + 1)
-    # The tiles from which a body may reach the cells are unseen again.
+    # The tiles from which a body may reach one of the cells become unseen.
     near_rows = _tiles_near(first_row, last_row)
     near_columns = _tiles_near(first_column, last_column)
     nearness = older.nearness.copy()
@@ -296,17 +324,22 @@ def world_of(
 
 
 def _tiles_near(first: int, last: int) -> slice:
-    """Return the rows of tiles within `BORDER` of some rows of cells, or columns."""
+    """Return the rows of tiles that lie within `BORDER` cells of some rows of cells.
+
+    `first` and `last` are the first and the last of these rows of cells. Columns are
+    counted in the same way.
+    """
     return slice(max(first - BORDER, 0) // TILE, (last + 1 + BORDER) // TILE + 1)
 
 
 def _new_world(grid: GridMap, body: Body) -> World:
-    """Return a body on a map, of which no tile was seen."""
+    """Return a body on a map, of which kernels have seen no tile."""
+    # A bit for each cell, 64 in a word; all are set at first, so also in the border.
     # One word more than a row fills: kernels read a word and the word after it.
     words = math.ceil((grid.width + 2 * BORDER) / 64) + 1
     occupied_bits = np.full((grid.height + 2 * BORDER, words), FULL)
     _write_rows(occupied_bits, grid, 0, grid.height)
-    tiles = math.ceil(grid.height / TILE), math.ceil(grid.width / TILE)
+    tiles = math.ceil(grid.height / TILE), math.ceil(grid.width / TILE)  # rows, columns
     return World(
         body,
         occupied_bits,
@@ -321,7 +354,11 @@ def _new_world(grid: GridMap, body: Body) -> World:
 def _write_rows(
     occupied_bits: NDArray[np.uint64], grid: GridMap, begin: int, end: int
 ) -> None:
-    """Write rows `begin` to before `end` of a map to `World.occupied_bits`."""
+    """Write rows `begin` to before `end` of a map as bits, 1 where a cell is occupied.
+
+    `occupied_bits` (rows, words) has a border of `BORDER` cells around the map, see
+    `World`; it changes in place.
+    """
     columns = 64 * occupied_bits.shape[1]
     # The border on both sides of the map counts as occupied.
     is_occupied = np.ones((end - begin, columns), dtype=np.bool_)
@@ -339,18 +376,19 @@ def _layers_for_body(grid: GridMap) -> Layers:
 
 
 def differences(old: GridMap, new: GridMap) -> NDArray[np.int64] | None:
-    """Return the cells (N, 2) in which two maps differ for a body.
+    """Return the cells (N, 2), x and y, in which two maps differ for a body.
 
-    It is None where the maps are better not compared, see `changed_cells`.
+    None means that a comparison does not pay: the maps show different places, or differ
+    in too many cells, see `changed_cells`.
     """
     old_occupied = old.uninflated
     new_occupied = new.uninflated
 
     def differs(box: Box) -> NDArray[np.bool_]:
-        """Return which cells of a box differ."""
+        """Return which cells of a box, an index of rows and columns, differ."""
         has_changed_occupancy: NDArray[np.bool_]
         has_changed_occupancy = old_occupied[box] != new_occupied[box]
-        # Any layer of the map: costs of occupied cells do not count.
+        # In any layer of the map. Layers of occupied cells do not count.
         has_changed_layer = new.differs(old, box) & ~new_occupied[box]
         return has_changed_occupancy | has_changed_layer
 
@@ -359,17 +397,21 @@ def differences(old: GridMap, new: GridMap) -> NDArray[np.int64] | None:
 
 @inlined
 def touches(x: int, y: int, mask: int, world: Any) -> bool:
-    """Return whether an occupied cell lies in a mask around cell (x, y)."""
+    """Return whether an occupied cell lies in a mask around cell (x, y).
+
+    `mask` is the number of a mask, see `Body`: a set of cells, in rows of 64 bits.
+    """
     body = world.body
     for number in range(body.first_row[mask], body.first_row[mask + 1]):
-        # The 64 cells of the mask's row are bits of two words of the map's row.
+        # The first cell of the mask's row, on the map with its border.
         row = y + body.row_begin[number, 0] + BORDER
         column = np.uint64(x + body.row_begin[number, 1] + BORDER)
+        # From there on, 64 cells of the map lie in two words: the highest bits of one,
+        # and the lowest bits of the next. The latter take two shifts, as one shift by
+        # 64, which bit 0 would need, has no meaning.
         word = column // WORD
         bit = column & LAST_BIT
         occupied = world.occupied_bits[row, word] >> bit
-        # And the lowest bits of the next word, in two shifts: one by 64, which bit 0
-        # would need, has no meaning.
         occupied |= (world.occupied_bits[row, word + ONE] << ONE) << (LAST_BIT - bit)
         if occupied & body.row_bits[number]:
             return True
@@ -386,11 +428,13 @@ def is_inside(x: int, y: int, world: Any) -> bool:
 def is_far(x: int, y: int, world: Any) -> bool:
     """Return whether the body reaches no occupied cell from any cell of a tile.
 
-    The tile is that of cell (x, y). What was found is kept in `world.nearness`.
+    The tile is that of cell (x, y). The answer is kept in `world.nearness`, where
+    UNSEEN stands for a tile that was not asked for before.
     """
-    row = y >> SHIFT
+    row = y >> SHIFT  # of the tile
     column = x >> SHIFT
     if world.nearness[row, column] == UNSEEN:
+        # The cells within reach of the tile are a mask around its middle.
         middle_x = (column << SHIFT) + TILE // 2
         middle_y = (row << SHIFT) + TILE // 2
         if touches(middle_x, middle_y, world.body.reach_mask, world):
@@ -402,25 +446,30 @@ def is_far(x: int, y: int, world: Any) -> bool:
 
 @inlined
 def cost_of_primitive(x: int, y: int, primitive: int, world: Any) -> Any:
-    """Return the cost of a primitive from cell (x, y) on, for which the body has room.
+    """Return the cost of a primitive that begins in cell (x, y), float32, in cells.
 
-    It is infinite if the map forbids a move of the origin.
+    It is the least cost of the primitive times the mean multiplier of the cells that
+    the origin passes, or infinite if the map forbids a move of the origin. The body has
+    room for the primitive.
     """
     body = world.body
     layers = world.layers
     if not has_costs(layers) and layers.forbidden.size == 0:
         return body.cost[primitive]
+    one = np.float32(1)  # the type in which a multiplier is computed
     mean_multiplier = np.float32(0)  # along the path of the origin
+    # The rows of `passed_cells` of this primitive.
     for place in range(body.first_passed[primitive], body.first_passed[primitive + 1]):
         cell_x = x + body.passed_cells[place, 0]
         cell_y = y + body.passed_cells[place, 1]
-        if forbids(cell_x, cell_y, body.passed_cells[place, 2], layers):
+        action = body.passed_cells[place, 2]  # by which the origin leaves the cell
+        if forbids(cell_x, cell_y, action, layers):
             return np.float32(np.inf)
-        multiplier = multiplier_at(cell_x, cell_y, np.float32(1), layers)
+        multiplier = multiplier_at(cell_x, cell_y, one, layers)
         mean_multiplier += body.passed_shares[place] * multiplier
     # Shares are rounded, so the mean may be less than 1; but lower bounds rely on the
     # cost of the primitive as the least.
-    return body.cost[primitive] * max(mean_multiplier, np.float32(1))
+    return body.cost[primitive] * max(mean_multiplier, one)
 
 
 @inlined
@@ -429,6 +478,7 @@ def leaves_map(x: int, y: int, primitive: int, world: Any) -> bool:
 
     Where the body has room, only an origin outside of the body can leave the map.
     """
+    # (P, 2): the least and greatest x and y of the cells that the origin passes.
     lowest = world.body.lowest_passed
     highest = world.body.highest_passed
     if not is_inside(x + lowest[primitive, 0], y + lowest[primitive, 1], world):
@@ -440,10 +490,10 @@ def leaves_map(x: int, y: int, primitive: int, world: Any) -> bool:
 def has_room(x: int, y: int, mask: int, world: Any) -> bool:
     """Return whether no occupied cell lies in a mask around cell (x, y).
 
-    The masks of primitives have the primitives' numbers: of these, the origin must not
-    leave the map either.
+    `mask` is the number of a mask, see `Body`. Mask p has the cells that the body
+    sweeps on primitive p: then the origin must not leave the map on p either.
     """
-    if is_far(x, y, world):
+    if is_far(x, y, world):  # no mask around the cell touches an occupied cell
         return True
     if touches(x, y, mask, world):
         return False
@@ -455,9 +505,10 @@ def has_room(x: int, y: int, mask: int, world: Any) -> bool:
 def move_free_to_front(states: NDArray[np.int64], world: World) -> int:
     """Move the states at which the body has room to the front; return how many.
 
-    `states` (N, 3) are x, y and heading. Their order does not change.
+    `states` (N, 3), x, y and heading, change in place. The states that are moved keep
+    their order.
     """
-    count = 0
+    count = 0  # states with room
     for place in range(len(states)):
         x = states[place, 0]
         y = states[place, 1]
