@@ -48,7 +48,7 @@ def main(_: Sequence[str]) -> int:
     """Print the flips per 100 replans; cost beside that of the first threshold."""
     rows = []
     planner = Planner.load("any_map")
-    planner.fields.nbytes = 0  # each map comes once
+    planner.fields.max_bytes = 0  # each map comes once
     for kind, path in itertools.product(KINDS, ("cells", "straight")):
         first_cost = None
         for threshold in THRESHOLDS:

@@ -245,7 +245,7 @@ class Requests:
         if planner is None:
             reason = self.model.diagnostics.refused["model"]
             raise RequestError("NO_MODEL", f"no model is loaded: {reason}")
-        planner.fields.nbytes = self.settings.field_cache_bytes
+        planner.fields.max_bytes = self.settings.field_cache_bytes
         grid: GridMap = await ready
         return PlanInputs(header, grid, planner)
 

@@ -35,10 +35,10 @@ class QField(Field[Known]):
     goal : (x, y)
         A free cell.
     q : (8, H, W) float32
-        The network's value of each action in each cell; -inf where no way to the goal
+        The network's value of each action in each cell; -inf where no path to the goal
         is known.
     legal : (8, H, W) bool
-        The legal moves. The robot knows its map and takes no other.
+        Whether each action may leave each cell. A rollout takes no other.
     move_rule : MoveRule
         The rule by which they are legal.
     """
@@ -81,15 +81,19 @@ class QField(Field[Known]):
 
     @property
     def nbytes(self) -> int:
-        """Memory of its arrays, with those that were asked for, bytes."""
-        state = vars(self)  # to which other threads add
+        """Memory in bytes of its arrays, as far as they were computed."""
+        state = vars(self)  # to which other threads add what they compute
         arrays = [
             state[name] for name in ("q", "legal", "value", "policy") if name in state
         ]
         return sum(memory_of(array).nbytes for array in arrays)
 
     def unmasked(self) -> QField:
-        """Return the field without action masking: an illegal move traps a rollout."""
+        """Return the field without action masking: an illegal move traps a rollout.
+
+        Of each cell's actions, the one of the greatest Q alone counts as legal, if it
+        is legal.
+        """
         greedy_1HW = self.q.argmax(axis=0, keepdims=True)
         actions_A11 = np.arange(len(MOVES)).reshape(-1, 1, 1)
         legal = self.legal & (actions_A11 == greedy_1HW)
@@ -100,11 +104,11 @@ class QField(Field[Known]):
         return True
 
     def rollout(self, start: Cell, straight: bool = False) -> Plan:
-        """Take greedy steps from a free cell until the goal, and return the path.
+        """Return the plan of greedy steps from a free cell, (x, y), to the goal.
 
-        The plan is ROLLOUT_TRAPPED as soon as a cell is entered again: the steps would
-        repeat. A start that is no cell of the map is a ValueError. `straight` matters
-        to a `DistanceField` alone, see there.
+        It is ROLLOUT_TRAPPED if a step enters a cell again, as the steps would then
+        repeat, or if a cell has no legal step. A start that is no cell of the map is a
+        ValueError. `straight` is not used here, see `DistanceField.rollout`.
         """
         policy = self.policy  # (H, W): an action, or -1
         cell = cell_inside(start, policy.shape, "the start")
@@ -152,25 +156,30 @@ class DistanceField(QField):
         return DistanceField, (self.goals, self.grid, self.costs, self.move_rule)
 
     def _goals_alone(self) -> Known:
-        """Return what is known before any growth."""
-        cells = self.costs.patch_number.size
+        """Return what is known before any growth: the goals alone are open."""
+        cells = self.costs.patch_number.size  # of the padded map
         distance = np.zeros(cells)  # 0: not reached
-        mark = np.zeros(cells, np.uint8)
+        mark = np.zeros(cells, np.uint8)  # UNREACHED
         numbers = np.array([self._number(*goal) for goal in self.goals], np.int32)
         distance[numbers] = cell_space.AT_GOAL
         mark[numbers] = wavefront.OPEN
         return Known(distance, mark, opened=numbers)
 
     def _number(self, x: Any, y: Any) -> Any:
-        """Return the number of a cell on the padded map; of many cells for arrays."""
+        """Return the number of cell (x, y) on the padded map; of many cells for arrays.
+
+        The padded map has a border of one cell; its cells are numbered row by row.
+        """
         return (y + 1) * self.costs.width + x + 1
 
     def grow(self, start: Cell | None = None, limit: int = 2**62) -> bool:
         """Grow until a start's distance is known; without a start, over all of the map.
 
-        Visit about `limit` cells at most. Return whether that was enough.
+        About `limit` cells are visited at most. Return whether the distance is known
+        then, or known to be none.
         """
-        # No path reaches cell 0, of the border: toward it, all of the map is visited.
+        # No path reaches cell 0 of the padded map, in the border: with cell 0 as the
+        # start, all of the map is visited.
         number = 0 if start is None else self._number(*start)
         with self._lock:
             is_enough = _is_final(self.known, number)
@@ -186,21 +195,23 @@ class DistanceField(QField):
         return known is not None and _is_final(known, self._number(*start))
 
     def rollout(self, start: Cell, straight: bool = False) -> Plan:
-        """Grow toward a start and return the path of greedy steps from there to a goal.
+        """Return the plan of greedy steps from a start, (x, y), to a goal.
 
-        It is empty only if no path leads to a goal. Of steps that are as good as each
-        other, it takes those nearest to the line from the start: to the goal if
-        `straight`, else in no direction, so that the first action counts.
+        The field grows as far as the start. The plan is NO_PATH only if no path leads
+        to a goal. Of steps on paths of the same cost, a rollout takes those that stay
+        nearest to the straight line from the start to the goal if `straight`, else the
+        first one in the order of actions.
         """
         start = cell_inside(start, self.grid.occupancy.shape, "the start")
         number = self._number(*start)
+        # A line from the start to itself has no direction: all steps are equally near.
         toward_x, toward_y = self.goal if straight else start
         with self._lock:
             self.grow(start)
             known = self.known
             if known.mark[number] != wavefront.CLOSED:
                 return Plan(PlanStatus.NO_PATH, move_rule=self.move_rule)
-            # No move costs less than 1; sums are rounded.
+            # No move costs less than 1, but sums of costs are rounded.
             most_cells = 2 + int(1.01 * known.distance[number])
             path = np.empty((min(most_cells, known.distance.size), 2), np.int32)
             length = cell_space.roll_out(
@@ -227,11 +238,12 @@ class DistanceField(QField):
         if changed is None:
             return False
         cells_to_judge = self._numbers_around(changed)
-        # For one start, a repair of at most `limit` cells and the growth of this field
-        # take turns, each time with four times the limit: the quicker one wins. If that
-        # is the growth, the older field gets back what it knows.
+        # For one start, two attempts take turns, each time with four times the limit:
+        # to repair the older field, and to grow this one. The first to succeed is used.
+        # If that is the growth, the older field gets back what it knows. Without a
+        # start, only the repair is tried, once.
         most_repaired = max(REPAIRED, int(REPAIRED_SHARE * self.grid.occupancy.size))
-        limit = most_repaired if start is None else REPAIRED
+        limit = most_repaired if start is None else REPAIRED  # cells of a repair
         with older._lock:
             known = older._take_known()
             repaired = cell_space.take_back(known, self.costs, cells_to_judge, limit)
@@ -250,11 +262,12 @@ class DistanceField(QField):
     def _numbers_around(self, cells: NDArray[np.int64]) -> NDArray[np.int32]:
         """Return the numbers of some cells (N, 2) and of their neighbours, sorted.
 
-        Moves from the neighbours may have changed, too. Numbers in the first and the
-        last row of the padded map, where there are no moves, are left out.
+        They are (K,) numbers on the padded map, each of them once. Numbers in its first
+        and last row, where there are no moves, are left out.
         """
         width = self.costs.width
         steps = np.arange(-1, 2)
+        # What leads from a cell's number to those of the 9 cells around it.
         offsets = (steps[:, None] * width + steps).reshape(9, 1)
         x, y = cells.T
         numbers = (offsets + self._number(x, y)).astype(np.int32)  # (9, N)
@@ -264,14 +277,16 @@ class DistanceField(QField):
         return inside[is_new]
 
     def _layer(self, write: Callable[..., None], layer: NDArray[Any]) -> NDArray[Any]:
-        """Return a layer (..., H, W) of the whole field.
+        """Grow over all of the map and return a layer of the field, (..., H, W).
 
-        A kernel writes it to `layer` (..., C), the C cells of the padded map.
+        The kernel `write` computes it from the distances, and writes it to `layer`
+        (..., C), for the C cells of the padded map.
         """
         with self._lock:
             self.grow()
             write(self.known.distance, layer, step_costs(self.costs))
-        return layer.reshape(*layer.shape[:-1], -1, self.costs.width)[..., 1:-1, 1:-1]
+        padded_map = layer.reshape(*layer.shape[:-1], -1, self.costs.width)
+        return padded_map[..., 1:-1, 1:-1]
 
     @cached_property
     def q(self) -> NDArray[np.float32]:  # type: ignore[override]
@@ -314,9 +329,10 @@ class DistanceField(QField):
 
 
 def _is_final(known: Known, number: int) -> bool:
-    """Return whether the distance of a cell, by its number, is known for good.
+    """Return whether the distance of a cell will not change any more.
 
-    It is also if no path can be found any more.
+    `number` is the cell's on the padded map. A cell without a path counts, too, once
+    the field has grown over all of the map.
     """
     is_closed = known.mark[number] == wavefront.CLOSED
     is_whole = known.opened.size == 0
@@ -326,9 +342,10 @@ def _is_final(known: Known, number: int) -> bool:
 def network_field(
     network: QNetwork, grid: GridMap, goal: Cell, move_rule: MoveRule
 ) -> QField:
-    """Return the field of a network that gives no costs of moves.
+    """Return the field of a network that gives no proved costs of moves.
 
-    It may judge moves wrong, or see the whole map at once.
+    Either its predicted costs may be wrong, as for a propagation network, or it
+    computes Q from the whole map at once.
     """
     if isinstance(network, PropagationQNetwork):
         costs = network.believed_costs(grid, move_rule)

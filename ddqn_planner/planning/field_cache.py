@@ -101,26 +101,29 @@ class FieldCache(Generic[AnyField]):
 
     Parameters
     ----------
-    nbytes : int
+    max_bytes : int
         Memory that the fields may take together with their maps, in bytes. The last
         `ALWAYS_KEPT` fields are kept whatever their size.
     changed_cells : Comparison
     """
 
-    def __init__(self, nbytes: int, changed_cells: Comparison) -> None:
-        self.nbytes = nbytes
+    def __init__(self, max_bytes: int, changed_cells: Comparison) -> None:
+        self.max_bytes = max_bytes
         self.changed_cells = changed_cells
-        # Used last at the end. The list is replaced and never changed, so that a thread
-        # may read it without the lock.
+        # The field that was used last is at the end. The list is replaced and never
+        # changed, so that a thread may read it without the lock.
         self.kept: list[AnyField] = []
         self._lock = threading.Lock()
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how a copy is made, also in another process: without fields."""
-        return FieldCache, (self.nbytes, self.changed_cells)
+        return FieldCache, (self.max_bytes, self.changed_cells)
 
     def find(self, key: Hashable, grid: GridMap) -> AnyField | None:
-        """Return the field with a key on a map, or None; mark it as used last."""
+        """Return the kept field with a key on a map, or None.
+
+        The field moves to the end of the list: it was used last.
+        """
         for field in self.kept:
             if field.key == key and field.is_on(grid):
                 # The same cells may lie at another origin, in other arrays.
@@ -149,6 +152,12 @@ class FieldCache(Generic[AnyField]):
             Makes a field with this key on this map that knows its goals alone.
         start : cell or pose state, optional
             From where the field is needed; None for all of it.
+
+        Returns
+        -------
+        Field
+            It is kept from now on. A field that it was repaired from, and those that
+            were not used for longest, may be forgotten.
         """
         field = self.find(key, grid)
         if field is not None:
@@ -160,44 +169,50 @@ class FieldCache(Generic[AnyField]):
         with self._lock:
             others = [other for other in self.kept if other is not replaced]
             fields = [*others, field]
-            self.kept = fields[-self._most(fields) :]
+            self.kept = fields[-self._count_to_keep(fields) :]
         return field
 
     def _repaired_by(self, field: AnyField, start: Any) -> AnyField | None:
-        """Let a new field take over what an older one knows; return the older one."""
+        """Let a new field take over what an older field with the same key knows.
+
+        Return the older field if the cache should forget it, None if it should forget
+        none. `start` is where the new field is needed, None for all of it.
+        """
         older_fields = [older for older in self.kept[::-1] if older.key == field.key]
-        # A map that changes hardly returns to what it was. If the fields used last are
-        # on maps that cannot be compared, so are those before them: with new expected
-        # times, all are.
+        # Only those that were used last: the maps of the fields before them are hardly
+        # more like this map.
         for older in older_fields[:ALWAYS_KEPT]:
             changed = self.changed_cells(older.grid, field.grid)
             if field.take_over(older, changed, start):
                 return older
         return None
 
-    def _most(self, fields: list[AnyField]) -> int:
-        """Return how many fields, those at the end of a list, may be kept.
+    def _count_to_keep(self, fields: list[AnyField]) -> int:
+        """Return how many fields at the end of a list, those used last, may be kept.
 
-        They may hold `nbytes`, the limit of the cache, but `ALWAYS_KEPT` of them always
-        stay.
+        With their maps, they may take `max_bytes` of memory, and at most `MOST_KEPT`
+        are kept; but `ALWAYS_KEPT` of them are kept in any case.
         """
-        held_bytes = 0
-        counted_arrays = set[int]()
-        for count, field in enumerate(reversed(fields)):
-            held_bytes += OBJECTS + field.nbytes
+        used_bytes = 0  # by the fields up to this one
+        counted_ids = set[int]()  # of the arrays that count in it
+        for fields_before, field in enumerate(reversed(fields)):
+            used_bytes += OBJECTS + field.nbytes
             # Fields of one map share its arrays, which count once.
             for array_id, array_bytes in field.map_arrays:
-                if array_id not in counted_arrays:
-                    counted_arrays.add(array_id)
-                    held_bytes += array_bytes
-            is_too_much = held_bytes > self.nbytes or count >= MOST_KEPT
-            if is_too_much and count >= ALWAYS_KEPT:
-                return count
+                if array_id not in counted_ids:
+                    counted_ids.add(array_id)
+                    used_bytes += array_bytes
+            is_too_much = used_bytes > self.max_bytes or fields_before >= MOST_KEPT
+            if is_too_much and fields_before >= ALWAYS_KEPT:
+                return fields_before
         return len(fields)
 
 
 def _put_on(field: Field[Any], grid: GridMap) -> None:
-    """Set the map of a field, and the list of arrays that it then shares."""
+    """Set the map of a field, and list the arrays of the map and of its costs.
+
+    Other fields may share these arrays: the list has the id and the bytes of each.
+    """
     field.grid = grid
     maps = [grid]
     exploration = grid.exploration
@@ -205,7 +220,8 @@ def _put_on(field: Field[Any], grid: GridMap) -> None:
         maps += [exploration.bold, exploration.safe]
     values: list[Any] = [*(field.costs or ())]
     for map_ in maps:
-        values += vars(map_).copy().values()  # other threads add to it
+        # A copy, as other threads may add to the map what they compute of it.
+        values += vars(map_).copy().values()
     arrays = [memory_of(value) for value in values if isinstance(value, np.ndarray)]
     field.map_arrays = [(id(array), array.nbytes) for array in arrays]
 

@@ -503,7 +503,7 @@ def test_a_path_to_one_goal_is_kept_while_it_is_nearly_as_good_as_a_new_one(
         assert "kept: its cost is +" in above_kept[1][1]
         assert node.model_source.planner is not None
         assert (
-            node.model_source.planner.fields.nbytes == 0
+            node.model_source.planner.fields.max_bytes == 0
         )  # what the node was started with holds
 
         def fail(*_: Any) -> GridMap:

@@ -75,14 +75,14 @@ def paper_map() -> GridMap:
 def test_a_copy_of_a_planner_plans_as_the_original_before_and_after_a_plan(
     make_copy: Callable[[Any], Any], planner: Planner
 ) -> None:
-    planner.fields.nbytes = 12_345
+    planner.fields.max_bytes = 12_345
     grid, before = map_for(planner), make_copy(planner)
     ends = ((5, 5), (15, 5)) if grid.width == 20 else ()
     plan = planner.plan(grid, *ends) if ends else plan_of(planner, grid)
     after = make_copy(planner)
     for copied in (before, after):
         assert copied.metadata == planner.metadata
-        assert copied.fields.nbytes == 12_345
+        assert copied.fields.max_bytes == 12_345
         assert copied.cell_planner.network is copied.network
         assert (copied.plan(grid, *ends) if ends else plan_of(copied, grid)) == plan
     assert plan.path.size or planner.metadata.network == "paper"

@@ -597,7 +597,7 @@ KINDS = pytest.mark.parametrize("kind", ["maps", "times", "patches"])
 def test_what_is_kept_takes_no_more_memory_than_the_bound(kind: str, side: int) -> None:
     # Also what fields keep alive: their costs, and their maps with all layers.
     planner, corner = new_planner(), (side - 1, side - 1)
-    planner.fields.nbytes = 500_000
+    planner.fields.max_bytes = 500_000
     maps = new_maps(side, kind)
     for grid in islice(maps, 3):
         planner.plan(grid, (0, 0), corner)
@@ -615,9 +615,9 @@ def test_what_is_kept_takes_no_more_memory_than_the_bound(kind: str, side: int) 
     finally:
         tracemalloc.stop()
     assert 3 < number <= field_cache.MOST_KEPT
-    assert freed < 1.1 * planner.fields.nbytes
+    assert freed < 1.1 * planner.fields.max_bytes
     # And it is made use of.
-    assert number == field_cache.MOST_KEPT or freed > 0.5 * planner.fields.nbytes
+    assert number == field_cache.MOST_KEPT or freed > 0.5 * planner.fields.max_bytes
 
 
 @KINDS
@@ -656,7 +656,7 @@ def test_the_last_64_fields_are_kept_and_3_whatever_their_size() -> None:
         planner.q_field(grid, goal)
     assert [field.goal for field in planner.fields.kept] == goals[-64:]
     planner.q_field(grid, goals[-5])  # used last by now
-    planner.fields.nbytes = 0
+    planner.fields.max_bytes = 0
     planner.q_field(grid, last)
     assert [field.goal for field in planner.fields.kept] == [
         goals[-1],
@@ -682,7 +682,7 @@ def test_fields_toward_other_goals_or_by_other_rules_are_not_repaired() -> None:
 def test_arrays_that_fields_share_count_once() -> None:
     side = 50
     planner, grid = new_planner(), GridMap(np.zeros((side, side)))
-    planner.fields.nbytes = 16 * 9 * (side + 2) ** 2 + 16 * field_cache.OBJECTS
+    planner.fields.max_bytes = 16 * 9 * (side + 2) ** 2 + 16 * field_cache.OBJECTS
     for goal in grid.free_cells()[:30]:
         planner.q_field(grid, goal)
     # One map and one set of costs; by themselves they would count as much as 4 of the

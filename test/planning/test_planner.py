@@ -244,7 +244,7 @@ def test_the_memory_for_fields_is_bounded_and_those_used_last_are_kept() -> None
     arrays = field.q, field.legal, field.value, field.policy
     assert field.nbytes == sum(array.nbytes for array in arrays)
     # And what they share: the map.
-    planner.fields.nbytes = 4 * (field.nbytes + OBJECTS) + grid.occupancy.nbytes
+    planner.fields.max_bytes = 4 * (field.nbytes + OBJECTS) + grid.occupancy.nbytes
     for goal in goals:
         planner.q_field(grid, goal)
         planner.q_field(grid, first)
@@ -253,7 +253,7 @@ def test_the_memory_for_fields_is_bounded_and_those_used_last_are_kept() -> None
         goal for goal in grid.free_cells() if known_field(planner, grid, goal, rule)
     ]
     assert known == [first, *goals[-3:]]
-    planner.fields.nbytes = 1
+    planner.fields.max_bytes = 1
     last = GridMap(np.zeros((3, 3)), cost=np.ones((3, 3), np.int8))
     three = (0, 0), (2, 2), (1, 0)
     for goal in (*three, *three):  # in turn, whatever the size of their fields
