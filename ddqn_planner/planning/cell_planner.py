@@ -99,15 +99,16 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
     def move_costs(self, grid: GridMap, rule: MoveRule) -> MoveCosts | None:
         """Return the costs of a map's moves; None if the network gives none.
 
-        They are those of a kept field on the same map, or on the map of which this one
-        is a patched copy; else the network reads all of the map.
+        They are taken from a kept field on a map of the same cells; or from one on a
+        map of which this map is a patched copy, and read anew in the patches. Without
+        such a field, the network reads all of the map.
         """
         for field in reversed(self.fields.kept):
             if not isinstance(field, DistanceField) or field.move_rule is not rule:
                 continue
             if grid.same_cells(field.grid):
                 return field.costs
-            boxes = grid.patches_since(field.grid)
+            boxes = grid.patches_since(field.grid)  # where the maps differ, or None
             if boxes is not None:
                 costs = field.costs.on_changed_map(grid, boxes)
                 if costs is not None:
@@ -130,11 +131,12 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
     ) -> PausingGenerator[Plan]:
         """Return the plan on the bold map, or the plan on the safe map.
 
-        Both maps make cells quick that were seldom driven through, most the bold map.
-        The path on the bold map is taken if the cost that is expected of it is at most
-        (1 + `exploration.share`) times the least expected cost.
+        Both maps assume that cells which were seldom driven through are quicker than
+        expected, the bold map more so. The path on the bold map is taken if its
+        expected cost is at most (1 + `exploration.share`) times the least expected
+        cost. The cost of the plan is the expected one, in seconds.
         """
-        grid = request.grid  # has the expected times
+        grid = request.grid  # the map of expected times
         rule = request.move_rule
         bold_request = replace(request, grid=exploration.bold)
         plan = yield from self._find_on_map(bold_request, clock)
@@ -178,7 +180,10 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
         return replace(task.failed_rollout, goal=task.goals[0], field_ms=clock.field_ms)
 
     def _refusal(self, request: PlanRequest, free_goals: Goals) -> PlanStatus | None:
-        """Return why there is no path if start and goals alone tell, or None."""
+        """Return why there is no path if start and goals alone tell that, else None.
+
+        `free_goals` are the goals of the request that are free cells.
+        """
         grid = request.grid
         if not grid.contains(request.start):
             return PlanStatus.START_OUTSIDE_MAP
@@ -195,7 +200,8 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
     def _from_known_field(self, task: _Task) -> Plan | None:
         """Return the plan by a kept field that is known as far as the start.
 
-        None if there is no such field, or if it leads nowhere.
+        Return None if there is no such field, or if its greedy steps find no path: then
+        `task.failed_rollout` is set.
         """
         request = task.request
         if not request.grid.is_free(request.start):
@@ -208,21 +214,24 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
     def _from_grown_field(self, task: _Task) -> PausingGenerator[Plan | None]:
         """Return the plan by a field that is grown as far as the start.
 
-        None if the start or all goals are occupied, or if the field leads nowhere. Sets
-        the costs of the task. Without costs of moves, a field can have one goal alone:
-        of several, only the nearest one stays a goal of the task, and None is returned.
+        Return None where another attempt has to find the path: if the start or all
+        goals are occupied, if the greedy steps of the field find no path (then
+        `task.failed_rollout` is set), or if the network gives no costs of moves. With
+        costs, `task.costs` is set. Without them, fields have one goal: of several goals
+        only the nearest stays in `task.goals`.
         """
-        if task.failed_rollout is not None:  # a kept field leads nowhere
+        if task.failed_rollout is not None:  # by a kept field, which is as good
             return None
         yield  # a pause: a slow step follows
         request = task.request
         grid = request.grid
         task.costs = self.move_costs(grid, request.move_rule)
-        if task.costs is None:  # a network that gives no costs of moves
+        if task.costs is None:
             if len(task.goals) > 1:
                 task.goals = self._nearest_alone(request, task.goals)
             return None
-        if not task.goals or not grid.is_free(request.start):
+        is_start_free = grid.is_free(request.start)
+        if not is_start_free or not task.goals:  # the task has free goals alone
             return None
         field = self.field(
             grid, task.goals, request.move_rule, request.start, task.costs
@@ -233,16 +242,17 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
         return _roll_out(task, field)
 
     def _by_escape(self, task: _Task) -> PausingGenerator[Plan | None]:
-        """Return the plan from the first free cell to a goal that a path can reach.
+        """Return the plan by an escape path to the first free cell, and a rollout.
 
-        A look at the whole map finds both, and sets them in the task, or it finds why
-        there is no path. None if the rollout from that cell fails.
+        The escape path and the goals that a path can reach, found on the whole map, are
+        set in the task, and so is the field toward these goals. If there are none, the
+        plan says why. Return None if greedy steps from that cell find no path.
         """
         request = task.request
         if task.failed_rollout is not None and request.reach >= 1:
             yield  # a pause: a slow step follows
         outcome = way_and_ends(request, task.goals)
-        if isinstance(outcome, PlanStatus):
+        if isinstance(outcome, PlanStatus):  # there is no path
             return Plan(outcome, move_rule=request.move_rule)
         task.escape_path, task.goals = outcome
         task.field = self.field(
@@ -255,9 +265,10 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
         return _roll_out(task, task.field)
 
     def _by_search(self, task: _Task) -> PausingGenerator[Plan | None]:
-        """Return the plan by a search in the order of the Q field, if that is allowed.
+        """Return the plan by a search in the order of the task's Q field.
 
-        None if the request wants greedy steps alone.
+        Return None if the request wants greedy steps alone. The search leads from the
+        end of the escape path to the field's goal.
         """
         request = task.request
         if request.method is not PlanMethod.ASTAR_FALLBACK or task.field is None:
@@ -274,9 +285,9 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
         return _finished(task, np.array(cells), PlanMethod.ASTAR_FALLBACK)
 
     def _nearest_alone(self, request: PlanRequest, goals: Goals) -> Goals:
-        """Return the nearest of several goals alone, by a plan to each.
+        """Return the one of several goals to which a plan is cheapest, as a tuple of 1.
 
-        Without a path to any, return the first goal.
+        A path to each of them is planned. Without a path to any, return the first goal.
         """
         plans = []
         for goal in goals:
@@ -286,15 +297,16 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
                 plans.append(plan)
         if not plans:
             return goals[:1]
-        nearest = min(plans, key=lambda plan: plan.cost or plan.length)
-        return nearest.cells[-1:]
+        cheapest = min(plans, key=lambda plan: plan.cost or plan.length)
+        return cheapest.cells[-1:]
 
 
 def _roll_out(task: _Task, field: QField) -> Plan | None:
-    """Return the plan by greedy steps in a field, from the first free cell.
+    """Return the plan by greedy steps in a field.
 
-    Where the steps fail, but another attempt may find a path, set `failed_rollout` of
-    the task and return None.
+    The steps begin at the end of the task's escape path, or at the start without one.
+    If they find no path, but another attempt may find one, set `failed_rollout` of the
+    task and return None.
     """
     request = task.request
     task.clock.end_field()
@@ -314,13 +326,14 @@ def _roll_out(task: _Task, field: QField) -> Plan | None:
 def _finished(task: _Task, path: Path, method: PlanMethod) -> Plan:
     """Return the plan of a path (N, 2) from the first free cell to a goal.
 
-    If the request says so, the path is straightened; if the rest of the path under way
-    hardly costs more, that is taken instead. Then the escape path comes before it.
+    If the request says so, the path is made straight. If the rest of the path under way
+    hardly costs more, the rest takes its place. Last, the task's escape path is put
+    before it. `method` is how the path was found.
     """
     request = task.request
     grid = request.grid
     rule = request.move_rule
-    extra_cost = None
+    extra_cost = None  # the share by which the rest of a path under way costs more
     if request.simplified:
         path = straightened(path, grid, rule)
     if len(request.under_way):
@@ -328,8 +341,8 @@ def _finished(task: _Task, path: Path, method: PlanMethod) -> Plan:
     goal = (int(path[-1, 0]), int(path[-1, 1]))
     if len(task.escape_path) > 1:
         path = np.concatenate([task.escape_path[:-1], path], dtype=np.int32)
-        # The extra cost is that of a path under way. This path is one only if its
-        # escape path belongs to the path under way, too.
+        # The path is still the rest of the path under way only if the escape path
+        # belongs to that, too.
         under_way = np.asarray(request.under_way)
         if not np.array_equal(path, under_way[-len(path) :]):
             extra_cost = None

@@ -24,7 +24,7 @@ MARGIN: Final = 1e-6
 
 
 class ExactPath(NamedTuple):
-    """A path of straight pieces."""
+    """A path of straight pieces between points."""
 
     points: Float64  # (N, 2): metres in the map frame
     length: float  # in cells, see `path_length`
@@ -41,12 +41,12 @@ def exact_path(
     Parameters
     ----------
     legs : sequence of (N, 2)
-        Cells, each leg from the last cell of the one before it.
+        The cells of each leg, which begins with the last cell of the leg before it.
     grid : GridMap
     points : sequence of (x, y)
-        Metres in the map frame: the point in the first cell of the first leg, and the
-        point at the end of each leg. Where a point lies in another cell, as for a goal
-        that moved, the cell's centre takes its place.
+        Metres in the map frame, one more than legs: where the path begins, and where
+        each leg ends. A point that does not lie in the leg's first or last cell, as for
+        a goal that moved, is replaced by the centre of that cell.
 
     Returns
     -------
@@ -56,13 +56,14 @@ def exact_path(
         passes the centre of that point's cell.
     """
     begin = _point_in(grid, legs[0][0], points[0])
-    parts = [begin]
-    for path, point in zip(legs, points[1:], strict=True):
-        end = _point_in(grid, path[-1], point)
-        cells = _cells_between(path, grid, _in_cells(begin, grid), _in_cells(end, grid))
+    parts = [begin]  # of the path, (K, 2) or (2,) each, in metres
+    for leg, point in zip(legs, points[1:], strict=True):
+        end = _point_in(grid, leg[-1], point)
+        cells = _cells_between(leg, grid, _in_cells(begin, grid), _in_cells(end, grid))
         parts += [grid.centres(cells), end]
         begin = end
     path_points = np.vstack(parts)
+    # Without points that repeat the one before.
     is_new = np.append(True, np.diff(path_points, axis=0).any(axis=1))
     return ExactPath(path_points[is_new], _length(path_points, grid))
 
@@ -85,10 +86,12 @@ def dense(points: Float64, spacing: float) -> tuple[Float64, NDArray[np.int64]]:
         For each dense point except the last, the number of the straight piece that it
         begins or lies on.
     """
-    lengths = np.hypot(*np.diff(points, axis=0).T)  # (N - 1,)
-    # Into how many equal parts each piece is divided.
+    lengths = np.hypot(*np.diff(points, axis=0).T)  # (N - 1,): of the pieces
+    # (N - 1,): into how many equal parts each piece is divided.
     parts = np.ceil(lengths / spacing * (1 - MARGIN)).astype(np.int64)
-    position = positions(parts)  # (M,): in pieces from the start of the path
+    # (M,): where each dense point lies, in pieces from the start: 1.5 is in the middle
+    # of the second piece.
+    position = positions(parts)
     number = np.arange(len(points))
     dense_points = np.column_stack(
         [np.interp(position, number, axis) for axis in points.T]
@@ -110,10 +113,18 @@ def _in_cells(points: Float64, grid: GridMap) -> Float64:
 
 
 def _cells_between(path: Path, grid: GridMap, begin: Float64, end: Float64) -> Path:
-    """Return the cells of a leg (N, 2) through whose centres a path leads.
+    """Return the cells of a leg through whose centres a path from begin to end leads.
 
-    The points `begin` and `end`, in cells, lie in the first and in the last cell of the
-    leg. Between the centres of its cells, the leg is known to be clear.
+    The first and the last cell are left out where the path can lead straight past their
+    centres.
+
+    Parameters
+    ----------
+    path : (N, 2)
+        The cells of the leg. Straight lines between their centres are clear.
+    grid : GridMap
+    begin, end : (2,)
+        Points in the first and in the last cell, in cells from the centre of (0, 0).
     """
     if len(path) == 1:
         return path[:0]
@@ -122,7 +133,7 @@ def _cells_between(path: Path, grid: GridMap, begin: Float64, end: Float64) -> P
     is_at_first = _is_near(begin, first)
     is_at_last = _is_near(end, last)
     if len(path) == 2:
-        # Between two centres it is the plan's own segment.
+        # One line may replace both cells. Between their centres it is always clear.
         if (is_at_first and is_at_last) or _is_clear(begin, end, grid):
             return path[:0]
         if is_at_first or _is_clear(begin, last, grid):
@@ -140,8 +151,8 @@ def _is_near(point: Float64, cell: CellXY) -> bool:
 def _is_clear(begin: Float64 | CellXY, end: Float64 | CellXY, grid: GridMap) -> bool:
     """Return whether a straight piece touches only free cells, and leaves them legally.
 
-    The piece leads from `begin` to `end`, in cells. The cells in which these two lie
-    need not be free: a robot may leave an obstacle.
+    The piece leads from the point `begin` to `end`, in cells. The cells in which these
+    two points lie need not be free: a robot may leave an obstacle.
     """
     layers = grid.layers(MoveRule.ROBOT_SAFE)
     x, y = begin.tolist()
@@ -173,19 +184,20 @@ def _touches_none(
 ) -> bool:
     """Return whether a straight piece touches no cell that is in its way.
 
-    The piece leads from (x, y) to (last_x, last_y), in cells. It touches a cell that it
-    comes nearer to than `MARGIN`.
+    The piece leads from point (x, y) to (last_x, last_y), in cells: cell 0 reaches from
+    -0.5 to 0.5. The piece touches a cell if it comes nearer to the cell than `MARGIN`.
     """
     dx = last_x - x
     dy = last_y - y
-    step_x = (dx > MARGIN) - (dx < -MARGIN)
+    step_x = (dx > MARGIN) - (dx < -MARGIN)  # -1, 0 or 1
     step_y = (dy > MARGIN) - (dy < -MARGIN)
-    actions = actions_of_segment(step_x, step_y, abs(dx), abs(dy))
+    actions = actions_of_segment(step_x, step_y, abs(dx), abs(dy))  # a bit set
     left = min(x, last_x)
     right = max(x, last_x)
     slope = dy / dx if step_x != 0 else 0.0
     for column in range(_first_touched(left), _last_touched(right) + 1):
-        # The y of the piece where it enters and where it leaves this column.
+        # The y of the piece at the left and at the right edge of this column. A piece
+        # along the y axis lies in the column as a whole.
         begin_y = y
         end_y = last_y
         if step_x != 0:
@@ -209,9 +221,19 @@ def _is_in_the_way(
 ) -> bool:
     """Return whether a cell that a straight piece touches stops the piece.
 
-    An occupied cell does, except the first and the last one. So does a cell that
-    forbids one of the actions, bits of a number, except the last one, which the piece
-    does not leave. Outside the map nothing does.
+    An occupied cell stops it, except in the piece's first and last cell. A cell that
+    forbids one of the piece's actions stops it, except in the last cell, which the
+    piece does not leave. Outside the map nothing stops it.
+
+    Parameters
+    ----------
+    column, row : int
+        The cell, which may lie outside the map.
+    is_first, is_last : bool
+        Whether the piece begins, or ends, in the cell.
+    actions : int
+        A bit set: bit a is set for action a.
+    layers : Layers
     """
     height, width = layers.occupancy.shape
     is_inside = 0 <= column < width and 0 <= row < height

@@ -27,10 +27,10 @@ def invalid_poses(
     distance: float = math.inf,
     clearing_radius: float = 0.0,
 ) -> NDArray[np.int64]:
-    """Return the indices of the poses that are not free, from the robot on.
+    """Return the indices (K,) of the poses that are not free, from the robot on.
 
-    The first pose checked is the one nearest to the robot. Cells between two poses do
-    not count.
+    The first pose checked is the one nearest to the robot. Cells between two poses are
+    not checked.
 
     Parameters
     ----------
@@ -46,13 +46,14 @@ def invalid_poses(
     unknown : (H, W) bool, optional
         Cells that count as obstacles too.
     max_cost : int
-        Nav2's cost, 0 to 255, from which on a cell is not free. Obstacles never are.
+        Nav2's cost, 0 to 255, from which on a cell is not free. Obstacles never are
+        free.
     distance : float
-        Metres along the path that are looked at; 0 or less means all.
+        Metres along the path that are checked; 0 or less means all.
     clearing_radius : float
-        A disc that stands in a cell which is not free may leave it through cells that
-        are not free. If that cell is an obstacle, the disc may pass obstacles within so
-        many cells of it.
+        A robot without a body that stands in a cell which is not free may leave it
+        through inflated cells. If it stands on an obstacle, it may also pass obstacles
+        within this radius of its cell, in cells.
     """
     first, end = _part_to_check(poses, robot, distance)
     closed = _closed_cells(grid, body is not None, unknown, max_cost)
@@ -68,21 +69,29 @@ def invalid_poses(
         return np.array(invalid, np.int64)
     # As float64, since poses may lie too far away for whole numbers.
     cells = np.floor(grid.in_cells(poses[first:end, :2]))  # (M, 2)
-    is_invalid = _is_closed(cells, closed)
-    cell = None if robot is None else grid.world_to_cell(*robot)
-    if cell is not None and grid.contains(cell) and not grid.is_free(cell):
-        # The poses before the first free one are the way out of the robot's cell. No
-        # pose is, if none is free.
-        way_out = int(is_invalid.argmin())
-        obstacles = obstacles_in_the_way(grid, cell, clearing_radius)
-        is_invalid[:way_out] = _is_closed(cells[:way_out], obstacles)
+    is_invalid = _is_closed(cells, closed)  # (M,)
+    robot_cell = None if robot is None else grid.world_to_cell(*robot)
+    if robot_cell is None or not grid.contains(robot_cell) or grid.is_free(robot_cell):
+        return first + np.flatnonzero(is_invalid)
+    # The poses before the first free one are the way out of the robot's cell: there
+    # only obstacles count. If no pose is free, there is no way out.
+    way_out = int(is_invalid.argmin())  # poses
+    obstacles = obstacles_in_the_way(grid, robot_cell, clearing_radius)
+    is_invalid[:way_out] = _is_closed(cells[:way_out], obstacles)
     return first + np.flatnonzero(is_invalid)
 
 
 def _part_to_check(poses: Float64, robot: Any, distance: float) -> tuple[int, int]:
     """Return the numbers of the first pose to check and of the pose after the last.
 
-    See `invalid_poses` for the parameters.
+    Parameters
+    ----------
+    poses : (N, 3)
+        Metres and radians.
+    robot : (x, y), optional
+        In metres. The pose nearest to the robot is the first; without a robot, pose 0.
+    distance : float
+        Metres along the path that are checked; 0, less or NaN means all.
     """
     x, y, _ = poses.T
     first = 0
@@ -92,7 +101,7 @@ def _part_to_check(poses: Float64, robot: Any, distance: float) -> tuple[int, in
     if not distance > 0:  # also where it is no number
         return first, len(poses)
     steps = np.hypot(np.diff(x[first:]), np.diff(y[first:]))
-    distance_from_first = np.cumsum(steps)  # of each pose after the first
+    distance_from_first = np.cumsum(steps)  # along the path, of each pose after it
     poses_ahead = int(np.count_nonzero(distance_from_first <= distance))
     return first, first + 1 + poses_ahead
 
@@ -100,7 +109,11 @@ def _part_to_check(poses: Float64, robot: Any, distance: float) -> tuple[int, in
 def _closed_cells(
     grid: GridMap, has_body: bool, unknown: Occupancy | None, max_cost: int
 ) -> Occupancy:
-    """Return the cells that are not free, (H, W): see `invalid_poses`."""
+    """Return which cells are not free: (H, W) bool.
+
+    For a body only obstacles count, else all occupied cells. So do the `unknown` cells
+    (H, W), and free cells of Nav2's cost `max_cost` or more.
+    """
     closed = grid.uninflated if has_body else grid.occupancy
     if unknown is not None:
         closed = closed | unknown
@@ -115,11 +128,13 @@ def _closed_cells(
 def _is_closed(cells: Float64, closed: Occupancy) -> NDArray[np.bool_]:
     """Return which cells (N, 2) are closed or lie outside the map: (N,).
 
-    `closed` (H, W) says which cells of the map are closed.
+    The cells are x and y, whole numbers as float64. `closed` (H, W) tells which cells
+    of the map are closed.
     """
     height, width = closed.shape
     is_closed: NDArray[np.bool_]
-    is_closed = np.any((cells < 0) | (cells >= (width, height)), axis=1)
-    column, row = cells[~is_closed].astype(np.int64).T
-    is_closed[~is_closed] = closed[row, column]
+    is_closed = np.any((cells < 0) | (cells >= (width, height)), axis=1)  # if outside
+    is_inside = ~is_closed
+    column, row = cells[is_inside].astype(np.int64).T
+    is_closed[is_inside] = closed[row, column]
     return is_closed

@@ -30,7 +30,7 @@ NO_CELL = -1  # the number of a cell that does not exist
 
 
 class WayOut(NamedTuple):
-    """How a path leaves the start, and where it can end."""
+    """How a path leaves a start that may be occupied, and where the path can end."""
 
     cells: tuple[Cell, ...]  # from the start to a free cell; the start alone if free
     ends: Goals  # a path leads to each of them from the last of these cells
@@ -87,18 +87,32 @@ def search(
 def _search(
     start: Cell, is_end: Any, value: Any, layers: Layers
 ) -> tuple[NDArray[np.int8], int]:
-    """Search a path from a start to an end, where `is_end` (H, W), by A*.
+    """Search a path from a start to an end by A*.
 
-    The values (H, W) are minus the expected cost from each cell to an end. Return the
-    action by which each cell was entered, (H, W), and the end that was reached: the
-    number y * W + x of its cell, or NO_CELL if no path leads to an end.
+    Parameters
+    ----------
+    start : (x, y)
+    is_end : (H, W) bool
+        Where the path may end.
+    value : (H, W)
+        Minus the expected cost from each cell to an end.
+    layers : Layers
+
+    Returns
+    -------
+    entered_by : (H, W) int8
+        The action by which each visited cell was entered; -1 for all others, and for
+        the start.
+    end : int
+        The end that was reached: the number y * W + x of its cell. NO_CELL if no path
+        leads to an end.
     """
     height, width = is_end.shape
     entered_by = np.full(is_end.shape, -1, dtype=np.int8)
     visited = np.zeros(is_end.shape, dtype=np.bool_)
-    # A heap of moves. For each: its order (the cost of the path with the move plus the
-    # expected rest), the cost of the path, the number of the cell to which the move
-    # leads, and the action.
+    # A heap of moves, the least key first. For each move: the key (the cost of the path
+    # with this move plus the expected rest), the cost of the path, the number of the
+    # cell to which the move leads, and the action. No action leads to the start.
     start_x, start_y = start
     queue = [(0.0, 0.0, start_y * width + start_x, -1)]
     while len(queue) > 0:
@@ -121,11 +135,11 @@ def _search(
             if not is_legal(x, y, action, layers):
                 continue
             next_cost = cost + cost_of_move(x, y, action, layers)
-            order = next_cost - value[next_y, next_x]
-            if np.isnan(order):  # a value that is no number leads last
-                order = np.inf
+            key = next_cost - value[next_y, next_x]
+            if np.isnan(key):  # a cell whose value is no number is visited last
+                key = np.inf
             next_cell = next_y * width + next_x
-            heapq.heappush(queue, (order, next_cost, next_cell, action))
+            heapq.heappush(queue, (key, next_cost, next_cell, action))
     return entered_by, NO_CELL
 
 
@@ -135,9 +149,16 @@ def _search(
 def way_and_ends(request: PlanRequest, goals: Goals) -> WayOut | PlanStatus:
     """Return how a path leaves the start and where it can end.
 
-    It can end in each of the `goals`, the free ones of the request, to which a path
-    leads; or else, with a tolerance, in the free cell nearest to the goal to which one
-    leads. If no path leads to any, return the status that says why.
+    A path can end in each of the goals to which a path leads. If there is none, and the
+    request has a tolerance, it can end in one cell: of the free cells to which a path
+    leads, the one nearest to the goal. If there is none either, return the status that
+    says why.
+
+    Parameters
+    ----------
+    request : PlanRequest
+    goals : tuple of (x, y)
+        Those goals of the request that are free.
     """
     grid = request.grid
     if goals:
@@ -156,20 +177,21 @@ def way_and_ends(request: PlanRequest, goals: Goals) -> WayOut | PlanStatus:
 
 
 def _way_out_to(candidates: NDArray[np.int64], request: PlanRequest) -> WayOut:
-    """Return how a path leaves the start, and which candidates (N, 2) it can reach.
+    """Return how a path leaves the start, and which candidates it can reach.
 
-    The candidates are free cells. Without a way out, no cell is reached.
+    The candidates (N, 2) are free cells. If a start that is occupied has no way out,
+    none of them is reached.
     """
     grid = request.grid
     rule = request.move_rule
-    cells: tuple[Cell, ...] = (request.start,)
+    way_out: tuple[Cell, ...] = (request.start,)
     if not grid.is_free(request.start):
         leads_to_candidate = grid.reachable(candidates, rule, backward=True)  # (H, W)
-        cells = find_way_out(request, leads_to_candidate)
-    is_reached = grid.reachable(cells[-1:], rule)  # (H, W)
+        way_out = find_way_out(request, leads_to_candidate)
+    is_reached = grid.reachable(way_out[-1:], rule)  # (H, W)
     x, y = candidates.T
     ends = candidates[is_reached[y, x]].tolist()
-    return WayOut(cells, tuple((end_x, end_y) for end_x, end_y in ends))
+    return WayOut(way_out, tuple((end_x, end_y) for end_x, end_y in ends))
 
 
 def obstacles_in_the_way(
@@ -205,37 +227,39 @@ def find_way_out(request: PlanRequest, ends: NDArray[np.bool_]) -> tuple[Cell, .
     """
     grid = request.grid
     obstacles = obstacles_in_the_way(grid, request.start, request.start_clearing_radius)
-    # The way leads through occupied cells that are no obstacles, and ends in its first
-    # free cell.
+    # On the map of this search, the free cells are the occupied cells that are no
+    # obstacles, and the ends: so a way ends in the first cell that is free on the
+    # request's map.
     is_closed = ~ends & (obstacles | ~grid.occupancy)
-    leaving = GridMap(is_closed, forbidden=grid.forbidden)
+    search_grid = GridMap(is_closed, forbidden=grid.forbidden)
+    # Of several shortest ways, the one counts that ends nearest to the goal.
     goal_x, goal_y = request.goals[0]
     y, x = np.ogrid[: grid.height, : grid.width]
     goal_distance = np.hypot(x - goal_x, y - goal_y)  # (H, W)
-    # So little that it decides between shortest ways only.
     value = (-NEARER_TO_GOAL * goal_distance).astype(np.float32)
-    return search(request.start, ends, leaving, request.move_rule, value)
+    return search(request.start, ends, search_grid, request.move_rule, value)
 
 
 def _cells_within(
     mask: NDArray[np.bool_], centre: Cell, radius: float
 ) -> NDArray[np.int64]:
-    """Return the cells (N, 2) of a mask (H, W) near a centre, the nearest first.
+    """Return the cells (N, 2) that are set in a mask (H, W), within a radius of a cell.
 
-    The cells are those within a radius, in cells, of the centre.
+    The radius is in cells and may be infinite. The cell nearest to the centre, (x, y),
+    is the first one.
     """
     x, y = centre
-    # Columns and rows to each side of the centre; a radius may be infinite.
+    # A window of the mask that contains the circle: so many cells to each side.
     side = int(min(radius, max(mask.shape)))
     first_column = max(x - side, 0)
     first_row = max(y - side, 0)
     window = mask[first_row : y + side + 1, first_column : x + side + 1]
-    rows, columns = np.nonzero(window)
+    rows, columns = np.nonzero(window)  # (M,) each: the set cells of the window
     cells = np.column_stack([columns + first_column, rows + first_row])  # (M, 2)
     distance = np.hypot(cells[:, 0] - x, cells[:, 1] - y)  # (M,)
     order = np.argsort(distance, kind="stable")
-    count = np.count_nonzero(distance <= radius)
-    return cells[order[:count]]
+    count_within = np.count_nonzero(distance <= radius)
+    return cells[order[:count_within]]
 
 
 # The path under way
@@ -243,7 +267,7 @@ def _cells_within(
 
 def _clipped(cells: Path, grid: GridMap) -> Path:
     """Return cells (N, 2), moved to within a map's width and height around the map."""
-    # Along a segment to a cell 1e9 m away lie more cells than memory holds.
+    # A segment to a cell 1e9 m away would pass more cells than memory holds.
     size = np.array([grid.width, grid.height])
     clipped: Path = np.clip(cells, -size, 2 * size).astype(np.int32)
     return clipped
@@ -254,8 +278,8 @@ def rest_of_path(
 ) -> Path:
     """Return the path that leads from a robot's cell back to a path and along the rest.
 
-    It is empty if the robot is more than `REACH` cells away from the path, or the rest
-    of the path is not legal, or no legal way leads back to it.
+    It is empty if the robot is more than `REACH` cells away from the path, or if the
+    rest of the path is not legal, or if no legal way leads back to the path.
 
     Parameters
     ----------
@@ -280,8 +304,9 @@ def rest_of_path(
     next_corner = position.astype(np.int64) + 1  # (M,): the row of `cells` after each
     is_rest_legal = next_corner >= _legal_from(cells, grid, move_rule)  # (M,)
     distance = np.abs(passed_cells - robot).max(axis=1)  # (M,)
+    # Rows of `passed_cells` where the robot may come back to the path: the nearest to
+    # the robot first; of equally near ones, the last one of the path.
     candidates = np.flatnonzero((distance <= REACH) & is_rest_legal)
-    # The nearest to the robot first; of equally near cells, the last one of the path.
     order = np.lexsort((-candidates, distance[candidates]))
     for index in candidates[order].tolist():
         remaining_path = cells[next_corner[index] :]
@@ -296,17 +321,17 @@ def rest_of_path(
 
 
 def _ways_to(cell: Path, robot: Cell) -> Iterator[NDArray[np.int64]]:
-    """Yield three ways from a robot's cell to a cell (2,): cells (K, 2) of moves.
+    """Yield three ways from a robot's cell (x, y) to a cell (2,), as cells (K, 2).
 
-    The first one begins with diagonal moves. The others move along x first, or along y
-    first: past the corner of an obstacle that a diagonal move would touch.
+    The first way begins with diagonal moves. The second moves along x first, the third
+    along y first: they may pass the corner of an obstacle that a diagonal move touches.
     """
     vector = cell - robot
     dx, dy = np.abs(vector).tolist()
     # How many moves pass before the first one along x, and before the first along y.
     for moves_before_x, moves_before_y in ((0, 0), (0, dx), (dy, 0)):
         count = max(dx + moves_before_x, dy + moves_before_y)
-        moves = np.arange(count + 1)
+        moves = np.arange(count + 1)  # made up to each cell of the way
         columns = np.clip(moves - moves_before_x, 0, dx)
         rows = np.clip(moves - moves_before_y, 0, dy)
         yield robot + np.sign(vector) * np.column_stack([columns, rows])
@@ -315,45 +340,52 @@ def _ways_to(cell: Path, robot: Cell) -> Iterator[NDArray[np.int64]]:
 def keep_or_switch(request: PlanRequest, new_path: Path) -> tuple[Path, float | None]:
     """Return the path to follow: the rest of the path under way, or a new path.
 
-    It is the new path if the rest costs more by the request's threshold, or if it ends
-    neither where the new path does nor at a goal of the request.
+    The new path is taken if the rest costs more by the request's threshold, or if the
+    rest ends neither where the new path does nor at a goal of the request.
+
+    Parameters
+    ----------
+    request : PlanRequest
+        With the path under way, and whether paths are made straight.
+    new_path : (K, 2)
+        From the robot's cell.
 
     Returns
     -------
     path : (N, 2)
     extra_cost : float or None
-        By which share the rest costs more than the new path; None for a new path.
+        The share by which the rest costs more than the new path; None for a new path.
     """
     grid = request.grid
     rule = request.move_rule
     start_x, start_y = new_path[0].tolist()
-    old_path = rest_of_path(request.under_way, (start_x, start_y), grid, rule)
-    if not len(old_path):
+    rest = rest_of_path(request.under_way, (start_x, start_y), grid, rule)
+    if not len(rest):
         return new_path, None
     new_end_x, new_end_y = new_path[-1].tolist()
-    old_end_x, old_end_y = old_path[-1].tolist()
-    if (old_end_x, old_end_y) not in {(new_end_x, new_end_y), *request.goals}:
+    end_x, end_y = rest[-1].tolist()
+    if (end_x, end_y) not in {(new_end_x, new_end_y), *request.goals}:
         return new_path, None
-    path = straightened(old_path, grid, rule) if request.simplified else old_path
-    cost = cost_along(path, grid, rule)
+    straight_rest = straightened(rest, grid, rule) if request.simplified else rest
+    cost = cost_along(straight_rest, grid, rule)
     new_cost = cost_along(new_path, grid, rule)
     if not request.keeps(cost, new_cost):
         return new_path, None
-    # The rest is cheap enough only after it was straightened, through cells that have
-    # become free: that is a new path.
-    if not request.keeps(cost_along(old_path, grid, rule), new_cost):
-        return path, None
+    # Is the rest cheap enough only after it was made straight? Then it leads through
+    # cells that have become free: it counts as a new path.
+    if not request.keeps(cost_along(rest, grid, rule), new_cost):
+        return straight_rest, None
     if new_cost == 0:  # the robot is at the goal
-        return path, 0.0
-    return path, cost / new_cost - 1
+        return straight_rest, 0.0
+    return straight_rest, cost / new_cost - 1
 
 
 def _legal_from(cells: Path, grid: GridMap, move_rule: MoveRule | str) -> int:
     """Return the row of a path (N, 2) from which on all segments are legal.
 
-    It is N if the last cell is not free.
+    The result is N if the last cell is not free.
     """
-    # A segment of no length at the end: so the last cell has to be free, too.
+    # With a segment of no length at the end, which is legal if the last cell is free.
     path = np.concatenate([cells, cells[-1:]])
     is_legal = legal_segments(path, grid, move_rule)
     illegal = np.flatnonzero(~is_legal)

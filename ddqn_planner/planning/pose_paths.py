@@ -37,14 +37,19 @@ class PosePath(NamedTuple):
     least_cost: float  # a lower bound of the cost of any path between its ends
 
     def plan(self, first: int, grid: GridMap) -> PosePlan:
-        """Return the plan along the poses from number `first` on."""
+        """Return the plan along the rest of the path, from pose number `first` on.
+
+        Its cost is in seconds on a map `grid` of expected times, else in cells.
+        """
         poses = self.poses[first:]
         poses.flags.writeable = False
         cells = self.cells[first:]
         is_new_cell = np.append(True, (cells[1:] != cells[:-1]).any(axis=1))
-        cost = float(self.costs[-1] - self.costs[first])
-        least_cost = self.least_cost - float(self.costs[first])
-        bound = math.inf  # on the ratio of the cost to the least cost of any path
+        cost_before = float(self.costs[first])  # of the part that is left out
+        cost = float(self.costs[-1]) - cost_before
+        # If the rest could cost less, so could the whole path.
+        least_cost = self.least_cost - cost_before
+        bound = math.inf  # of the ratio of the cost to the least cost of any path
         if cost <= least_cost * SAME:
             bound = 1.0
         elif least_cost > 0:
@@ -70,15 +75,17 @@ class BodyPoints(NamedTuple):
 
 
 def points_of(corners: Float64, resolution: float) -> BodyPoints:
-    """Return points of a footprint whose corners (C, 2) are in metres.
+    """Return points on the outline of a footprint and inside, in cells.
 
-    The resolution is in metres per cell.
+    The corners of the footprint, (C, 2), are in metres, and the resolution in metres
+    per cell.
     """
     corners_in_cells = corners / resolution
     min_x, min_y = corners_in_cells.min(axis=0)
     max_x, max_y = corners_in_cells.max(axis=0)
     x = np.arange(min_x, max_x, FILL_SPACING)
     y = np.arange(min_y, max_y, FILL_SPACING)
+    # (L, 2): points of a square lattice over the footprint.
     lattice = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     return BodyPoints(
         outline=outline(corners_in_cells, OUTLINE_SPACING),
@@ -89,8 +96,8 @@ def points_of(corners: Float64, resolution: float) -> BodyPoints:
 def in_cells(poses: Float64, grid: GridMap) -> Float64:
     """Return poses (N, 3) with x and y in cells from the centre of cell (0, 0).
 
-    The given poses are in metres, in the map's frame; yaws become those from the map's
-    x axis.
+    The poses given are in metres and radians, in the map's frame. Each yaw becomes that
+    from the map's x axis.
     """
     poses = np.reshape(poses, (-1, 3))
     cells = grid.in_cells(poses[:, :2]) - 0.5
@@ -108,7 +115,9 @@ def nearest_pose(
     poses : (N, 3)
         In metres and radians.
     robot : (x, y, yaw)
+        In metres and radians, in the same frame.
     grid : GridMap
+        Tells the size of a cell.
     reach : (float, float)
         How many cells and how many radians the pose may be away from the robot's pose.
 
@@ -124,33 +133,38 @@ def nearest_pose(
     candidates = np.flatnonzero((distance <= max_distance) & (turn <= max_turn))
     if not len(candidates):
         return -1
-    max_cells, max_radians = REACH
-    # Such a distance counts as much as such a turn.
-    apartness = distance[candidates] / max_cells + turn[candidates] / max_radians
+    # A distance of `cells_per_unit` counts as much as a turn of `radians_per_unit`.
+    cells_per_unit, radians_per_unit = REACH
+    distance_units = distance[candidates] / cells_per_unit
+    apartness = distance_units + turn[candidates] / radians_per_unit
     return int(candidates[apartness.argmin()])
 
 
 def is_free(poses: Float64, grid: GridMap, body: BodyPoints) -> bool:
     """Return whether a body has room at all poses (N, 3), and no cell forbids the path.
 
-    The poses are in metres and radians, in the map's frame.
+    The poses are in metres and radians, in the map's frame. `body` has points of the
+    body's outline and inside, in cells.
     """
-    path = in_cells(poses, grid)
-    occupied = grid.uninflated.view(np.uint8)
+    path = in_cells(poses, grid)  # (N, 3): cells, cells, radians
+    occupied = grid.uninflated.view(np.uint8)  # (H, W)
     height, width = occupied.shape
-    cells = cells_of(path)
+    cells = cells_of(path)  # (N, 2): those of the origin, which may lie off the body
     if not ((cells >= 0) & (cells < (width, height))).all():
-        return False  # the origin, which may lie outside of the body, leaves the map
+        return False
     if touches(path, body.outline, occupied):
         return False
-    # An obstacle that is inside the body at a later pose came in through the outline.
+    # Only at the first pose: an obstacle that is inside the body at a later pose came
+    # in through the outline.
     if touches(path[:1], body.inside, occupied):
         return False
     if grid.forbidden is None:
         return True
+    # Whether each cell forbids the move of the origin to the next one. Two poses in one
+    # cell have the action 8, which no cell forbids: its bit is not in 8 bits.
     x, y = cells[:-1].T
     steps = np.clip(np.diff(cells, axis=0), -1, 1)  # (N - 1, 2)
-    actions = ACTION_OF_STEP[steps[:, 1] + 1, steps[:, 0] + 1]
+    actions = ACTION_OF_STEP[steps[:, 1] + 1, steps[:, 0] + 1]  # (N - 1,)
     is_forbidden = grid.forbidden[y, x] >> actions & 1
     return not is_forbidden.any()
 
@@ -163,11 +177,13 @@ def cells_of(path: Float64) -> NDArray[np.int32]:
 def cost_of_poses(poses: Float64, grid: GridMap) -> float:
     """Return the cost of a path along poses (N, 3), in cells.
 
-    It is nearly that of the primitives which make the path: each step between two poses
-    costs its length, more if it is not driven ahead, or its turn on the spot.
+    The poses are in metres and radians, in the map's frame. A step from a pose to the
+    next one costs its length, `BEHIND` times that if it is not driven ahead, or without
+    a length its turn on the spot. All this is times the multiplier of the step's cell.
+    The sum is nearly the cost of the primitives of which the path is made.
     """
     path = in_cells(poses, grid)
-    # Of each step, (N - 1,), as all arrays below.
+    # All arrays from here on are (N - 1,), a number for each step.
     dx, dy = np.diff(path[:, :2], axis=0).T
     length = np.hypot(dx, dy)
     yaw = path[:-1, 2]
@@ -177,8 +193,10 @@ def cost_of_poses(poses: Float64, grid: GridMap) -> float:
     is_ahead = length_ahead > AHEAD * length
     drive_cost = np.where(is_ahead, length, BEHIND * length)
     turn_cost = np.abs(turn) * TURN / grid.resolution
-    cost = np.where(length < ON_THE_SPOT, turn_cost, drive_cost)
-    x, y = cells_of(path[:-1]).T  # the cells in which the steps begin
+    is_on_the_spot = length < ON_THE_SPOT
+    cost = np.where(is_on_the_spot, turn_cost, drive_cost)
+    # The layers of the map count at the cell in which a step begins.
+    x, y = cells_of(path[:-1]).T
     cell_costs = body_costs(grid)
     if cell_costs is not None:
         cost *= multipliers_of(cell_costs[y, x])
@@ -189,12 +207,13 @@ def cost_of_poses(poses: Float64, grid: GridMap) -> float:
 
 @in_place
 def touches(path: Float64, points: Float64, occupied: NDArray[np.uint8]) -> bool:
-    """Return whether points of a body touch an occupied cell, or leave the map.
+    """Return whether points of a body lie in an occupied cell, or outside the map.
 
     Parameters
     ----------
     path : (N, 3)
-        Poses at which the body stands, see `in_cells`.
+        Poses at which the body stands: x and y in cells from the centre of cell (0, 0),
+        yaw in radians.
     points : (M, 2)
         From the origin of the body, ahead and to the left, in cells.
     occupied : (H, W)

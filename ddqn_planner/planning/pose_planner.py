@@ -98,8 +98,8 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
     ) -> PausingGenerator[PosePlan]:
         """Return the plan by a field that is grown as far as the start.
 
-        First to the goals themselves; without a path to these, and if the request has a
-        tolerance, to the states around its goal.
+        The plan leads to one of the goals themselves. If there is no path to these, and
+        the request has a tolerance, it leads to a state around the goal.
         """
         grid = request.grid
         self._check_resolution(grid)
@@ -135,9 +135,18 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         start: State,
         clock: Clock,
     ) -> PausingGenerator[PosePlan]:
-        """Return the plan from a start to the nearest of some states (N, 3).
+        """Return the plan of the cheapest path from a start to one of some states.
 
-        N may be 0: then the goal is occupied.
+        Parameters
+        ----------
+        request : PoseRequest
+        states : (N, 3)
+            The (x, y, heading) in which the path may end, all with room for the body.
+            Without any, the goal is occupied.
+        start : State
+            (x, y, heading)
+        clock : Clock
+            Is told when the field is known.
         """
         if not len(states):
             return PosePlan(PlanStatus.GOAL_OCCUPIED)
@@ -157,12 +166,17 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         return replace(plan, field_ms=clock.field_ms, rollout_ms=clock.rollout_ms)
 
     def _reason(self, request: PoseRequest, plan: PosePlan) -> PausingGenerator[str]:
-        """Return why there is no path, in words."""
+        """Return why there is no path, in words.
+
+        Besides the status of the plan, these say whether a path would lead through
+        unknown space, and what stops each of several goals.
+        """
         status: str = plan.status.value
         start_cell, *goal_cells = request.cells
         if not any(map(request.grid.contains, goal_cells)):
             outside = [unknown_space.OUTSIDE] * len(goal_cells)
             return unknown_space.reason_of_goals(outside, "")
+        # The same map with unknown cells free, and the body on it.
         free_grid = with_unknown_free(request.grid)
         free_world = world_of(free_grid, self.body)
         start = self._state_at(free_grid, request.start, free_world)
@@ -174,6 +188,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
             return f"the start {place}; {unknown_space.REMEDY}"
         if start is None and not has_several_goals:
             return status
+        # Why no path can end at each goal; empty words for a goal with room.
         places = [
             self._goal_in_words(request, goal, free_grid, free_world)
             for goal in request.goals
@@ -202,8 +217,15 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
     ) -> NDArray[np.int64]:
         """Return the states (N, 3) in which a path may end if unknown cells are free.
 
-        Of several goals, those count in which a path may end on the map as it is, if
-        there are any: their words in `places` are empty, see `_goal_in_words`.
+        Parameters
+        ----------
+        request : PoseRequest
+        places : sequence of str
+            Why no path can end at each goal; empty for a goal with room on the map as
+            it is. If there are such goals, they alone count.
+        start : State
+        free_grid, free_world : GridMap and World
+            The map with unknown cells free, and the body on it.
         """
         if any(request.tolerance):
             free_request = replace(request, grid=free_grid)
@@ -218,7 +240,8 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
     ) -> PausingGenerator[str]:
         """Return words that say that a path leads through unknown space, or may.
 
-        They are empty if no path does. In the field, unknown cells are free.
+        They are empty if no path does. `field` is that of a map whose unknown cells are
+        free; it grows toward the start (x, y, heading), for a limited time.
         """
         for _ in range(MOST_STEPS_OF_REASON):
             bound = field.reach(start, BOUND_OF_REASON, VISITS)
@@ -248,7 +271,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         return unknown_space.OCCUPIED
 
     def _place_in_words(self, request: PoseRequest, cell: Cell) -> str:
-        """Return how a cell lies in which the body touches unknown space."""
+        """Return in words how a cell lies, in which the body touches unknown space."""
         x, y = cell
         unknown = request.grid.unknown
         if unknown is not None and unknown[y, x]:
@@ -266,7 +289,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         grid: GridMap,
         reach: tuple[float, float] = paths.REACH,
     ) -> NDArray[np.float64]:
-        """Return the rest of a path, from the pose nearest to the robot on, (N, 3).
+        """Return the rest of a path, (N, 3): from the pose nearest to the robot on.
 
         It is empty if the robot is too far from the path, or if the body has no room
         along the rest.
@@ -291,29 +314,32 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
     def _keep_or_switch(self, request: PoseRequest, plan: PosePlan) -> PosePlan:
         """Return the plan along the rest of the path under way, or the new plan.
 
-        The rest is taken if it ends where the new plan does, or at a goal, and hardly
-        costs more; also if the new plan has no path.
+        The rest is taken if it ends where the new path does, or at a goal, and its cost
+        does not exceed that of the new path by more than the request's threshold. If
+        the new plan has no path, the rest is taken whatever it costs.
         """
         grid = request.grid
-        has_path = plan.poses.size > 0
-        reach = paths.REACH if has_path else BESIDE_PATH
-        rest = self.rest_of(request.under_way, request.start, grid, reach)
+        has_new_path = plan.poses.size > 0
+        reach = paths.REACH if has_new_path else BESIDE_PATH
+        rest = self.rest_of(request.under_way, request.start, grid, reach)  # (N, 3)
         if not len(rest):
             return plan
         ends = np.array([*plan.poses[-1:], *request.goals])
         is_other_end = paths.nearest_pose(ends, rest[-1], grid, SAME_END) < 0
         if is_other_end:
             return plan
-        rest_cost = paths.cost_of_poses(rest, grid)  # in cells, as all costs here
-        least_cost = 0.0  # without a new path nothing is proved
-        ratio = 1.0
-        if has_path:
+        # Costs are in cells here, and in seconds in a plan on a map of expected times.
+        rest_cost = paths.cost_of_poses(rest, grid)
+        least_cost = 0.0  # of any path: without a new path nothing is proved
+        ratio = 1.0  # of the cost of the rest to that of the new path
+        if has_new_path:
             new_cost = paths.cost_of_poses(plan.poses, grid)
             if not request.keeps(rest_cost, new_cost):
                 return plan
             if new_cost:
                 ratio = rest_cost / new_cost
-            # The costs of poses are nearly those of primitives: their ratio counts.
+            # Costs along poses differ a little from those of primitives, which plans
+            # have. So only the ratio of both costs along poses is used.
             cost_of_plan = (plan.cost or 0.0) / (grid.seconds_per_cell or 1.0)
             rest_cost = ratio * cost_of_plan
             least_cost = cost_of_plan / plan.bound
@@ -338,23 +364,34 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
             )
 
     def _state_at(self, grid: GridMap, pose: Pose, world: World) -> State | None:
-        """Return the state of a pose (metres and radians) on a map; None without room.
+        """Return the state (x, y, heading) of a pose on a map; None without room.
 
-        Of the two headings nearest to the yaw, it has the nearer one with room for the
-        body.
+        Its heading is the one nearest to the pose's yaw, or else the next nearest, with
+        room for the body.
+
+        Parameters
+        ----------
+        grid : GridMap
+        pose : (x, y, yaw)
+            Metres and radians in the map frame.
+        world : World
+            The body on the map.
         """
         x, y, yaw = pose
         turn = np.abs(turn_between(self.motions.angles, yaw - grid.origin[2]))  # (16,)
         nearest_headings = np.argsort(turn, kind="stable")[:2]
         column, row = grid.world_to_cell(x, y)
         states = np.array([(column, row, heading) for heading in nearest_headings])
-        count = move_free_to_front(states, world)
-        return tuple(states[0].tolist()) if count else None
+        count_with_room = move_free_to_front(states, world)
+        return tuple(states[0].tolist()) if count_with_room else None
 
     def _states_at(
         self, grid: GridMap, poses: Iterable[Pose], world: World
     ) -> NDArray[np.int64]:
-        """Return the states (N, 3) of those poses in which the body has room."""
+        """Return the states (N, 3) of those poses in which the body has room.
+
+        The poses are (x, y, yaw) in metres and radians; see `_state_at`.
+        """
         states = [self._state_at(grid, pose, world) for pose in poses]
         with_room = [state for state in states if state is not None]
         return np.array(with_room, dtype=np.int64).reshape(-1, 3)
@@ -364,47 +401,68 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
     ) -> NDArray[np.int64]:
         """Return the states (N, 3) within the goal's tolerance in which a path may end.
 
-        It is the start alone if that lies there. The body has room in all of them.
+        If the start lies within the tolerance, it is the only state. The body has room
+        in all states that are returned.
+
+        Parameters
+        ----------
+        request : PoseRequest
+            With one goal, and its tolerance in metres and radians.
+        start : State
+            (x, y, heading)
+        world : World
+            The body on the request's map.
         """
         grid = request.grid
         metres, radians = request.tolerance
         x, y, yaw = request.goals[0]
         goal_column, goal_row = grid.world_to_cell(x, y)
         radius = metres * ROUNDING / grid.resolution  # cells
-        turn = np.abs(turn_between(self.motions.angles, yaw - grid.origin[2]))
-        may_end = turn <= max(radians * ROUNDING, turn.min())  # (16,): by heading
+        # In which headings a path may end: within the tolerance, or the nearest one.
+        turn = np.abs(turn_between(self.motions.angles, yaw - grid.origin[2]))  # (16,)
+        may_end = turn <= max(radians * ROUNDING, turn.min())  # (16,)
         start_column, start_row, start_heading = start
         start_distance = math.hypot(start_column - goal_column, start_row - goal_row)
         if may_end[start_heading] and start_distance <= radius:
             return np.array([start])
+        # The cells of the map in a square around the goal, counted from the goal.
         columns = np.arange(grid.width) - goal_column
-        columns = columns[abs(columns) <= radius]  # (C,): relative to the goal
+        columns = columns[abs(columns) <= radius]  # (C,)
         rows = np.arange(grid.height) - goal_row
         rows = rows[abs(rows) <= radius]  # (R,)
-        distance = np.hypot(columns, rows[:, None])  # (R, C)
+        distance = np.hypot(columns, rows[:, None])  # (R, C): from the goal, in cells
+        # Paths end in a ring: beyond a distance for each heading, within the radius.
         least_distance = self._least_distance_of_ends(may_end, radius)  # (16,)
         is_end = (least_distance[:, None, None] < distance) & (distance <= radius)
-        heading, row, column = np.nonzero(is_end)
+        heading, row, column = np.nonzero(is_end)  # of (16, R, C)
         states = np.column_stack(
             [goal_column + columns[column], goal_row + rows[row], heading]
         )
-        return states[: move_free_to_front(states, world)]
+        count_with_room = move_free_to_front(states, world)
+        return states[:count_with_room]
 
     def _least_distance_of_ends(
         self, may_end: NDArray[np.bool_], radius: float
     ) -> NDArray[np.float64]:
         """Return beyond which distance from a goal paths end, by heading: (16,), cells.
 
-        A path ends as soon as it may. If all primitives that lead to a heading begin in
-        headings in which a path may end, then no path gets further inside the radius
-        (cells) than the longest of these primitives is. `may_end` (16,) tells in which
-        headings a path may end.
+        A path may end within a radius of the goal, in some headings, and ends as soon
+        as it may. If all primitives that lead to a heading begin in headings in which a
+        path may end, the last one began outside the radius: so no path gets further
+        inside than the longest of these primitives.
+
+        Parameters
+        ----------
+        may_end : (16,) bool
+            In which headings a path may end.
+        radius : float
+            Cells from the goal.
         """
         motions = self.motions
         # -1: at any distance, also 0. With the radius itself: nowhere.
         least_distance = np.where(may_end, -1.0, radius)
         for heading in np.flatnonzero(may_end):
-            leads_there = motions.end == heading
+            leads_there = motions.end == heading  # (P,): by primitive
             if may_end[motions.start[leads_there]].all():
                 longest = np.hypot(*motions.offset[leads_there].T).max()
                 least_distance[heading] = radius - longest
@@ -413,18 +471,20 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
     def _from_last_path(self, request: PoseRequest) -> PosePlan | None:
         """Return the rest of a path that was planned before, if the start lies on it.
 
-        The path led to the same goals on the same map, and the bound that is proved of
-        its rest is no greater than the bound of the request. Else return None.
+        The path led to the same goals with the same tolerance, on a map with the same
+        cells; and the bound that is proved of its rest is no greater than the bound of
+        the request. Return None if there is no such path.
         """
         for field in self.fields.kept:
-            path = field.path
+            path = field.path  # the last one that was made from the field
             goals, tolerance, _ = field.key
             is_for_goals = goals == request.goals and tolerance == request.tolerance
             if path is None or not is_for_goals:
                 continue
-            changed = self._differences(field.grid, request.grid)
+            changed = self._differences(field.grid, request.grid)  # (N, 2) or None
             if changed is None or len(changed):
                 continue
+            # The number of the pose at the start; -1 if no pose is near.
             first = paths.nearest_pose(path.poses, request.start, request.grid, ON_PATH)
             if first < 0:
                 continue
@@ -434,12 +494,12 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         return None
 
     def _world(self, grid: GridMap) -> World:
-        """Return the body on a map, made from the last world where that is quicker.
+        """Return the body on a map, as kernels use it, and keep it as the last one.
 
-        It becomes the last one.
+        It is made from the last one if the maps differ in few cells.
         """
         older_world = None
-        changed = None
+        changed = None  # the cells (N, 2) in which the last map differs
         if self._map is not None:
             older_grid, older_world = self._map
             changed = self._differences(older_grid, grid)
@@ -451,10 +511,11 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
 def _with_expected_cost(
     plan: PosePlan, expected: GridMap, planned: GridMap
 ) -> PosePlan:
-    """Return a plan with the cost that it has on the map of expected times.
+    """Return a plan with the cost in seconds that it has on the map of expected times.
 
-    Its cost was computed from primitives on the map on which it was `planned`. It is
-    multiplied by the ratio of both costs of its poses, which are nearly the same.
+    The plan's cost, which was computed from primitives on the map `planned`, is
+    multiplied by a ratio: of the costs along the plan's poses, on the map `expected` to
+    that on the map `planned`.
     """
     expected_cost = paths.cost_of_poses(plan.poses, expected)
     expected_seconds = expected_cost * (expected.seconds_per_cell or 1.0)
@@ -464,10 +525,10 @@ def _with_expected_cost(
 
 
 def _reason_of_places(places: Sequence[str], grid: GridMap, has_start: bool) -> str:
-    """Return why there is no path, if the places of the goals tell.
+    """Return why there is no path, if the places of the goals alone tell that.
 
-    It is empty if a search has to tell whether a path leads through unknown space, or
-    for one goal if there is nothing to add to the status.
+    The text is empty if a search has to tell whether a path leads through unknown
+    space, or if there is nothing to add to the status of a plan to one goal.
 
     Parameters
     ----------
