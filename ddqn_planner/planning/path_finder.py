@@ -75,10 +75,10 @@ class PathFinder(ABC, Generic[Request, AnyPlan]):
             clock.resume()
 
     def _answer(self, request: Request, clock: Clock) -> PausingGenerator[AnyPlan]:
-        """Return the plan of a request.
+        """Return the plan of a request, after pauses.
 
-        If it has no path, and unknown space or the goals tell more than the status, the
-        plan's reason says so.
+        If it has no path, its reason may say more than its status: whether unknown
+        space is in the way, or what stops each of several goals.
         """
         plan = yield from self._find(request, clock)
         has_several_goals = len(request.goals) > 1

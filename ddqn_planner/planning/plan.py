@@ -53,11 +53,11 @@ class PathRequest(Generic[Place]):
     grid : GridMap
     start : cell or pose
     goals : tuple of cells or poses
-        The goal that the cheapest path reaches counts.
+        Of several goals, the path leads to the one that the cheapest path reaches.
     under_way : (N, 2) cells or (N, 3) poses
         The path that the robot follows; empty for none.
     switch_threshold : float
-        The share by which the rest of that path may cost more than a new one.
+        The share by which the rest of that path may cost more than a new path.
     """
 
     grid: GridMap
@@ -67,7 +67,10 @@ class PathRequest(Generic[Place]):
     switch_threshold: float = field(default=0.0, kw_only=True)
 
     def keeps(self, cost: float, new_cost: float) -> bool:
-        """Return whether a path under way of some cost is kept, not a new path."""
+        """Return whether the rest of a path under way is kept, not the new path.
+
+        `cost` is that of the rest, and `new_cost` that of the new path.
+        """
         return cost <= (1 + self.switch_threshold) * new_cost * SAME_COST
 
 
@@ -92,7 +95,7 @@ class PlanRequest(PathRequest[Cell]):
         return self.start, *self.goals
 
     def after(self, leg: Plan, goal: Cell) -> PlanRequest:
-        """Return the request for the next leg."""
+        """Return the request for the next leg: from the end of a leg to a goal."""
         return replace(self, start=leg.cells[-1], goals=(goal,))
 
 
@@ -110,7 +113,7 @@ class PoseRequest(PathRequest[Pose]):
         return tuple(self.grid.world_to_cell(x, y) for x, y, _ in poses)
 
     def after(self, leg: PosePlan, goal: Pose) -> PoseRequest:
-        """Return the request for the next leg."""
+        """Return the request for the next leg: from the end of a leg to a goal."""
         x, y, yaw = leg.poses[-1].tolist()
         return replace(self, start=(x, y, yaw), goals=(goal,))
 
@@ -162,24 +165,29 @@ class Plan:
     reason: str = ""
 
     def __post_init__(self) -> None:
+        """Turn the fields into their types: a sequence of cells is a path, too.
+
+        The plan is frozen, so its fields are set by `object.__setattr__`.
+        """
         path = self.path
         if not isinstance(path, np.ndarray) or path.dtype != np.int32:
-            # A sequence of cells is a path, too.
             limits = (-(2**31), 2**31 - 1)
             path = numbers("the path", path, between=limits).astype(np.int32)
         if path.size and path.shape[1:] != (2,):
             raise ValueError(f"the path has shape {path.shape}; give (N, 2)")
         path = path.reshape(-1, 2)
         path.flags.writeable = False
-        object.__setattr__(self, "path", path)  # as the plan is frozen
-        for name, kind in (
-            ("status", PlanStatus),
-            ("method", PlanMethod),
-            ("move_rule", MoveRule),
-        ):
+        object.__setattr__(self, "path", path)
+        # A name stands for the member of a `Choice`: "greedy" for PlanMethod.GREEDY.
+        choices: dict[str, type[Choice]] = {
+            "status": PlanStatus,
+            "method": PlanMethod,
+            "move_rule": MoveRule,
+        }
+        for name, choice in choices.items():
             value = getattr(self, name)
-            if type(value) is not kind:
-                object.__setattr__(self, name, kind(value))
+            if type(value) is not choice:
+                object.__setattr__(self, name, choice(value))
         if not self.reason:
             object.__setattr__(self, "reason", self.status.value)
 
@@ -197,6 +205,7 @@ class Plan:
         return hash(self._identity())
 
     def _identity(self) -> tuple[object, ...]:
+        """Return all that equal plans have in common: not the times, not the reason."""
         return (
             self.status,
             self.path.tobytes(),
@@ -209,7 +218,7 @@ class Plan:
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
-        """The path as pairs of Python ints, made when asked for."""
+        """The path as pairs of Python ints, made at the first use."""
         return tuple(zip(*self.path.T.tolist(), strict=True))
 
     @property
@@ -260,8 +269,10 @@ def joined(plans: Sequence[Plan]) -> Plan:
     # All legs are on one map: all of them have a cost, or none.
     costs = [plan.cost for plan in plans if plan.cost is not None]
     was_searched = PlanMethod.ASTAR_FALLBACK in {plan.method for plan in plans}
+    # The last leg's plan, to which the other legs are added.
+    base = _with_poses_of(plans) if isinstance(last, PosePlan) else last
     return replace(
-        _with_poses_of(plans) if isinstance(last, PosePlan) else last,
+        base,
         path=_end_to_end([plan.path for plan in plans]),
         method=PlanMethod.ASTAR_FALLBACK if was_searched else PlanMethod.GREEDY,
         cost=sum(costs) if costs else None,

@@ -101,7 +101,7 @@ class Planner:
         return self.cell_planner.field(grid, (goal,), rule)
 
     def _rule(self, move_rule: MoveRule | str | None) -> MoveRule:
-        """Return a move rule; for None that of the model."""
+        """Return the move rule that is named; for None that of the model."""
         return self.metadata.move_rule if move_rule is None else MoveRule(move_rule)
 
     def plan(
@@ -251,18 +251,20 @@ class Planner:
         grid : GridMap
             With cells of the size that the robot learned.
         start : (x, y, yaw)
-            Metres and radians in the map frame. The path begins in the middle of its
-            cell, with one of 16 headings: the nearest one, or else the next, where the
-            body has room. Where at most half a cell and 11.25 degrees part it from the
-            path planned last, the plan is the rest of that path.
+            Metres and radians in the map frame. The path begins in the middle of the
+            start's cell, with one of 16 headings: the nearest one, or else the next,
+            where the body has room. A planner keeps its last paths to each goal: if the
+            start lies within half a cell and 11.25 degrees of such a path, the plan is
+            the rest of that path.
         goal : (x, y, yaw), or several
             Likewise; of several, the one that the cheapest path reaches.
         tolerance : (float, float)
-            Metres and radians by which a goal without room or without a way may move.
+            Metres and radians by which a goal may move if the body has no room there,
+            or if no path leads to it.
         bound : float
-            How many times the least cost a path may have at most, 1 or more: with 1 it
-            is the least, and takes longer. `PosePlan.bound` tells what is proved of the
-            path.
+            The factor by which the cost of a path may exceed the least cost, 1 or more.
+            With 1 a path of the least cost is found, which takes longer.
+            `PosePlan.bound` tells what is proved of the path.
 
         Returns
         -------
@@ -316,12 +318,15 @@ class Planner:
         simplified: bool,
         start_clearing_radius: float,
     ) -> Plan:
-        """Check the arguments and return the plan; the goals are checked already."""
+        """Check the arguments and return the plan to the nearest of one or more goals.
+
+        The arguments are those of `plan`; the goals, (x, y) each, are checked already.
+        """
         rule = self._rule(move_rule)
         check_grid(grid)
         if self.pose_planner is not None:
             raise ValueError(f"{HAS_BODY}; use plan_poses, or a planner_node")
-        at_least_zero = 0, math.inf, "0 cells or more"
+        at_least_zero = 0, math.inf, "0 cells or more"  # the range, and its words
         request = PlanRequest(
             grid,
             as_cell(start, "the start"),
@@ -338,7 +343,7 @@ class Planner:
 
 
 def _tolerance_of_poses(tolerance: Any) -> tuple[float, float]:
-    """Return a tolerance in metres and radians, checked."""
+    """Return a tolerance (metres, radians), each 0 or more; a ValueError for others."""
     two_numbers = "two numbers (metres, radians), each 0 or more"
     remedy = f"give {two_numbers}"
     wrong = ValueError(f"the tolerance is {tolerance!r}; {remedy}")
@@ -354,12 +359,16 @@ def _tolerance_of_poses(tolerance: Any) -> tuple[float, float]:
 
 
 def _poses_of_goals(goal: Any) -> tuple[Pose, ...]:
-    """Return the poses of one goal (x, y, yaw), or of a sequence of goals, checked."""
+    """Return the poses of one goal (x, y, yaw), or of a sequence of goals.
+
+    A ValueError if a goal is no pose, or if there is none.
+    """
     values = listed(goal, "the goal", "give a pose (x, y, yaw), or several")
     if not values:
         raise ValueError("there is no goal; give at least one pose (x, y, yaw)")
-    has_several = any(isinstance(value, (Sequence, np.ndarray)) for value in values)
-    poses = values if has_several else [values]
+    # The values are poses if one of them is a sequence, else the numbers of one pose.
+    are_poses = any(isinstance(value, (Sequence, np.ndarray)) for value in values)
+    poses = values if are_poses else [values]
     return tuple(as_pose("the goal", pose) for pose in poses)
 
 

@@ -51,8 +51,8 @@ def has_more_to_say(grid: GridMap, plan: Plan, has_several_goals: bool) -> bool:
 def reason_of(request: PlanRequest, plan: Plan) -> str:
     """Return why a plan has no path, in words.
 
-    These are the words of its status; if unknown space may be the reason, that and what
-    to do; and for several goals, what stops each of them.
+    These are the words of the plan's status. If unknown space may be the reason, they
+    say that and what to do. For several goals, they say what stops each of them.
     """
     grid = request.grid
     status: str = plan.status.value
@@ -61,11 +61,13 @@ def reason_of(request: PlanRequest, plan: Plan) -> str:
         return f"the start {place}; {REMEDY}" if place else status
     if len(request.goals) > 1:
         places = [goal_in_words(grid, goal) for goal in request.goals]
-        free = tuple(goal for goal in request.goals if grid.is_free(goal))
-        is_through = bool(free) and _leads_through_unknown_space(
-            replace(request, goals=free)
-        )
-        return reason_of_goals(places, THROUGH_UNKNOWN_SPACE if is_through else "")
+        free_goals = tuple(goal for goal in request.goals if grid.is_free(goal))
+        through = ""
+        if free_goals:
+            request_of_free = replace(request, goals=free_goals)
+            if _leads_through_unknown_space(request_of_free):
+                through = THROUGH_UNKNOWN_SPACE
+        return reason_of_goals(places, through)
     if plan.status is PlanStatus.GOAL_OCCUPIED:
         place = place_in_words(grid, request.goals[0])
         if place:
@@ -81,12 +83,12 @@ def _leads_through_unknown_space(request: PlanRequest) -> bool:
     """Return whether there is a path for a request if all unknown cells are free."""
     if request.grid.unknown is None:
         return False
-    for possible in _grids_without_unknown(request.grid):
-        goals = tuple(
-            sorted({goal for goal in request.goals if possible.is_free(goal)})
-        )
-        outcome = way_and_ends(replace(request, grid=possible), goals)
-        if isinstance(outcome, PlanStatus):
+    # A path must exist on each of these maps: the last one is decisive, and the first
+    # one often shows sooner that there is none.
+    for grid in _grids_without_unknown(request.grid):
+        free_goals = {goal for goal in request.goals if grid.is_free(goal)}
+        outcome = way_and_ends(replace(request, grid=grid), tuple(sorted(free_goals)))
+        if isinstance(outcome, PlanStatus):  # the status says why there is no path
             return False
     return True
 
@@ -103,7 +105,7 @@ def goal_in_words(grid: GridMap, cell: Cell) -> str:
 def place_in_words(grid: GridMap, cell: Cell) -> str:
     """Return in words why unknown space closes a cell.
 
-    It is empty for a cell that is free, or that is occupied for another reason.
+    The words are empty for a cell that is free, or is occupied for another reason.
     """
     if grid.unknown is None or not grid.contains(cell) or grid.is_free(cell):
         return ""
@@ -112,13 +114,14 @@ def place_in_words(grid: GridMap, cell: Cell) -> str:
         return IN_UNKNOWN_SPACE
     if grid.obstacles is None or grid.is_obstacle(cell) or grid.body_radius == 0:
         return ""
-    # The body is near enough to something. If it is an obstacle, that is the reason.
+    # The cell is inflated: an obstacle or an unknown cell is within the body's radius.
+    # If any of these is an obstacle, unknown space is not the reason.
     radius = grid.body_radius * (1 - ROUNDING) / grid.resolution  # cells
     box_of_cell = Box(slice(y, y + 1), slice(x, x + 1))
     box = wider(box_of_cell, int(radius) + 1, grid.occupancy.shape)
     is_obstacle = grid.obstacles[box] & ~grid.unknown[box]
-    rows, columns = is_obstacle.nonzero()  # of obstacles, from the box's first cell
-    dy = rows + box.rows.start - y
+    rows, columns = is_obstacle.nonzero()  # (M,) each, from the box's first cell
+    dy = rows + box.rows.start - y  # from the cell to each obstacle
     dx = columns + box.columns.start - x
     if (np.hypot(dx, dy) < radius).any():
         return ""
@@ -126,21 +129,26 @@ def place_in_words(grid: GridMap, cell: Cell) -> str:
 
 
 def reason_of_goals(places: Sequence[str], through: str) -> str:
-    """Return why no path leads to any of several goals, by their numbers.
+    """Return why no path leads to any of several goals, by their numbers from 1 on.
 
     Parameters
     ----------
     places : sequence of str
-        Why no path can end at each goal; empty for a goal to which no path leads.
+        Why no path can end at each goal, such as "is occupied"; empty for a goal that
+        is free, to which no path leads.
     through : str
         The words for a path through unknown space; empty if there is no such path.
     """
-    named = _goals_to_name(places)
-    reasons = [f"goal {index + 1} {places[index]}" for index in named if places[index]]
-    cut_off = [str(index + 1) for index in named if not places[index]]
-    if cut_off:
-        goals = "goals" if len(cut_off) > 1 else "goal"
-        reasons.append(f"no path leads to {goals} {', '.join(cut_off)}")
+    reasons = []
+    numbers_cut_off = []  # of the goals that are free
+    for index in _goals_to_name(places):
+        if places[index]:
+            reasons.append(f"goal {index + 1} {places[index]}")
+        else:
+            numbers_cut_off.append(str(index + 1))
+    if numbers_cut_off:
+        goals = "goals" if len(numbers_cut_off) > 1 else "goal"
+        reasons.append(f"no path leads to {goals} {', '.join(numbers_cut_off)}")
     if len(places) > MOST_NAMED:
         reasons.append("...")
     if through:
@@ -151,9 +159,10 @@ def reason_of_goals(places: Sequence[str], through: str) -> str:
 
 
 def _goals_to_name(places: Sequence[str]) -> list[int]:
-    """Return the indices of the goals that are named, `MOST_NAMED` at most, in order.
+    """Return the indices of the `MOST_NAMED` goals, or fewer, that a reason names.
 
-    The goals whose places are in unknown space come first, as the remedy is for them.
+    `places` says why no path can end at each goal. Of too many goals, those for which
+    unknown space is the reason are preferred, as there is a remedy for them.
     """
     indices = range(len(places))
     unknown_first = sorted(
@@ -163,13 +172,13 @@ def _goals_to_name(places: Sequence[str]) -> list[int]:
 
 
 def _grids_without_unknown(grid: GridMap) -> Iterator[GridMap]:
-    """Yield maps whose unknown cells are free.
+    """Yield one or two maps like `grid` whose unknown cells are free.
 
-    On the first map, only obstacles are occupied. On the last map, cells are, too, that
-    are too near to obstacles for the body.
+    Only for a robot with a radius there are two. On the first map only obstacles are
+    occupied: it is quick to make, and often shows that there is no path. On the last
+    map the cells are occupied, too, that are too near to obstacles for the body.
     """
     if grid.body_radius > 0 and grid.obstacles is not None and grid.unknown is not None:
-        # The first map is quick to make, and often shows that there is no path.
         obstacles = grid.obstacles & ~grid.unknown
         yield grid.with_layers(
             occupancy=obstacles, obstacles=obstacles, cost=None, unknown=None
