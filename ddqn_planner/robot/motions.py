@@ -137,14 +137,17 @@ def make_motions(
 
 
 def _cell_size(name: str, metres: Any) -> float:
-    """Return a number of metres per cell; `name` is what an error calls it."""
+    """Return metres per cell; a ValueError, which calls them `name`, out of the range."""
     smallest, largest = CELL_SIZES
     remedy = f"metres per cell, {smallest:g} to {largest:g}"
     return as_number(name, metres, smallest, largest, remedy)
 
 
 def _radius_in_cells(motion: Motion, turning_radius: float, cell_size: float) -> float:
-    """Return a turning radius in metres as cells; a ValueError if it is not allowed."""
+    """Return a turning radius, given in metres, in cells.
+
+    A ValueError if it is too small for a car, or too large. `cell_size` is in metres.
+    """
     metres = as_number(
         "the turning radius", turning_radius, 0, math.inf, "metres, 0 or more"
     )
@@ -169,7 +172,8 @@ def _straight(
 ) -> list[Primitive]:
     """Return a short and a long straight step in one direction, with a fixed heading.
 
-    A step ahead comes with the same step behind. Diagonal steps are short only.
+    Each step ahead comes with the same step behind. Of diagonal steps there is only the
+    short one.
 
     Parameters
     ----------
@@ -182,8 +186,9 @@ def _straight(
     cell_size : float
         Metres per cell.
     """
-    step = DIRECTIONS[(heading + relative_heading) % HEADINGS]  # (2,) cells
-    counts = [1]
+    # (2,): cells from a centre to the next one in this direction.
+    step = DIRECTIONS[(heading + relative_heading) % HEADINGS]
+    counts = [1]  # how many times the step is taken
     if relative_heading not in DIAGONALLY:
         stride = round(STRIDE / cell_size / math.hypot(*step))
         counts.append(max(stride, 2))
@@ -199,9 +204,9 @@ def _straight(
 
 
 def _driven_ahead(start: int, end: int, poses: Poses) -> Primitive:
-    """Return the primitive along poses: its cost is its length in cells.
+    """Return the primitive along poses (N, 3); its cost is its length in cells.
 
-    `start` and `end` are the headings of the first and the last pose.
+    `start` and `end` are the headings, 0 to 15, of the first and the last pose.
     """
     steps = np.diff(poses[:, :2], axis=0)
     length = float(np.hypot(steps[:, 0], steps[:, 1]).sum())
@@ -209,7 +214,7 @@ def _driven_ahead(start: int, end: int, poses: Poses) -> Primitive:
 
 
 def _driven_behind(primitive: Primitive) -> Primitive:
-    """Return a primitive's reverse, moved so that it begins in the origin."""
+    """Return the primitive that drives back along another, from the origin on."""
     last_x, last_y, _ = primitive.poses[-1]
     return Primitive(
         start=primitive.end,
@@ -224,10 +229,11 @@ def _turn_on_the_spot(
 ) -> Primitive:
     """Return the primitive that turns from one heading to another in the origin.
 
-    `angles` has the yaw of each heading; `cell_size` is in metres.
+    `start` and `end` are headings, 0 to 15; `angles` (16,) has the yaw of each heading
+    in radians; `cell_size` is in metres.
     """
     turn = float(turn_between(angles[start], angles[end]))
-    count = math.ceil(abs(turn) / ANGLE) + 1
+    count = math.ceil(abs(turn) / ANGLE) + 1  # poses
     yaw = angles[start] + turn * np.linspace(0, 1, count)
     poses = np.column_stack([np.zeros((count, 2)), yaw])
     return Primitive(start, end, poses, cost=abs(turn) * TURN / cell_size)
@@ -236,58 +242,74 @@ def _turn_on_the_spot(
 def _line(start: NDArray[Any], end: NDArray[Any], yaw: float) -> Poses:
     """Return poses on a line from one point (2,) to another, in cells, with a yaw.
 
-    Two poses are at most `SPACING` apart; a line of length 0 has one pose.
+    Neighbours are at most `SPACING` apart; a line of length 0 has one pose.
     """
     length = math.hypot(*np.subtract(end, start))
-    count = math.ceil(length / SPACING - 1e-9) + 1  # 1e-9: despite rounding
+    # A length that is greater than n spacings by rounding alone has n parts.
+    count = math.ceil(length / SPACING - 1e-9) + 1  # poses
     points = np.linspace(start, end, count)
     return np.column_stack([points, np.full(count, yaw)])
 
 
 def _bend(start: int, end: int, angles: Float64, radius: float) -> Poses:
-    """Return the shortest path to a neighbouring heading that ends in a cell's centre.
+    """Return the shortest bend to a neighbouring heading that ends in a cell's centre.
 
-    It is a line, an arc and a line, and the shorter line has the length 0. The two
-    lines would meet in a corner; the arc leaves the first line as far before the corner
-    as it joins the last line after it. This distance, a tangent of the arc's circle, is
-    radius * tan(turn / 2).
+    Two straight sides meet in a corner: from the origin ahead, and from the corner to
+    the end in the last heading. The bend cuts the corner by an arc, which begins as far
+    before the corner as it ends after it. This distance is radius * tan(turn / 2).
 
     Parameters
     ----------
     start, end : int
-        The first and the last heading.
+        The first and the last heading, 0 to 15.
     angles : (16,) float64
         The yaw of each heading, radians.
     radius : float
-        The least radius of the arc, in cells. It is at least 1 cell here.
+        The least radius of the arc, in cells; one below 1 cell counts as 1.
+
+    Returns
+    -------
+    (N, 3) float64
+        Poses from the origin on: cells, cells, radians.
     """
     turn = float(turn_between(angles[start], angles[end]))
-    tangent_per_radius = math.tan(abs(turn) / 2)
     yaws = angles[[start, end]]
-    directions = np.array([np.cos(yaws), np.sin(yaws)])  # (2, 2), in columns
-    min_tangent = max(radius, 1.0) * tangent_per_radius
-    bend_end = _nearest_end(directions, min_tangent)
-
-    # The arc takes all of the shorter side of the corner, and as much of the longer.
-    tangent = min(bend_end.before_corner, bend_end.after_corner)
-    arc_start = (bend_end.before_corner - tangent) * directions[:, 0]
-    arc_radius = tangent / tangent_per_radius
+    directions = np.array([np.cos(yaws), np.sin(yaws)])  # (2, 2): a column for each
+    cut_per_radius = math.tan(abs(turn) / 2)
+    min_cut = max(radius, 1.0) * cut_per_radius
+    corner = _nearest_end(directions, min_cut)  # its two sides, and the end
+    # The arc replaces all of the shorter side, and the same length of the longer side.
+    cut = min(corner.length_before, corner.length_after)
+    arc_start = (corner.length_before - cut) * directions[:, 0]
+    arc_radius = cut / cut_per_radius
     arc = _arc(arc_start, float(angles[start]), turn, arc_radius)
+    # What remains of the two sides. One of these lines is a single pose of the arc.
     first_line = _line(np.zeros(2), arc[0, :2], arc[0, 2])
-    last_line = _line(arc[-1, :2], bend_end.cell, arc[-1, 2])
+    last_line = _line(arc[-1, :2], corner.end_cell, arc[-1, 2])
     return np.concatenate([first_line[:-1], arc, last_line[1:]])
 
 
 def _arc(start: Float64, start_yaw: float, turn: float, radius: float) -> Poses:
-    """Return poses on an arc from a point (2,) and a yaw on, which turns by an angle.
+    """Return poses (N, 3) on an arc: cells, cells, radians.
 
-    The radius is in cells, angles are in radians; a turn above 0 leads to the left.
+    Parameters
+    ----------
+    start : (2,)
+        The first point, in cells.
+    start_yaw : float
+        The yaw there, radians.
+    turn : float
+        The angle by which the arc turns, radians; above 0 to the left.
+    radius : float
+        In cells.
     """
+    # As many parts as both the greatest angle and the greatest length of a part need.
     parts_by_angle = math.ceil(abs(turn) / ANGLE)
     parts_by_length = math.ceil(abs(turn) * radius / SPACING)
     count = max(parts_by_angle, parts_by_length) + 1
     yaw = start_yaw + turn * np.linspace(0, 1, count)  # (N,)
-    side = math.copysign(1, turn)  # 1: the centre lies to the left
+    # The circle's centre lies at a right angle to the yaw, to the left if `side` is 1.
+    side = math.copysign(1, turn)
     to_centre = np.array([-math.sin(start_yaw), math.cos(start_yaw)]) * side
     centre = start + radius * to_centre
     from_centre = np.column_stack([np.sin(yaw), -np.cos(yaw)]) * side  # (N, 2)
@@ -295,42 +317,43 @@ def _arc(start: Float64, start_yaw: float, turn: float, radius: float) -> Poses:
     return np.column_stack([points, yaw])
 
 
-class _BendEnd(NamedTuple):
-    """Where a bend ends, and the lengths of lines that meet in a corner, in cells."""
+class _Corner(NamedTuple):
+    """Two sides that meet in a corner: from the origin to it, and on to a cell."""
 
-    before_corner: float  # along the first heading
-    after_corner: float  # along the last heading
-    cell: NDArray[np.int64]  # (2,), from the cell where the bend begins
+    length_before: float  # of the side along the first heading, in cells
+    length_after: float  # of the side along the last heading, in cells
+    end_cell: NDArray[np.int64]  # (2,), from the cell where the bend begins
 
 
-def _nearest_end(directions: Float64, min_length: float) -> _BendEnd:
-    """Return the end for which the lines before and after the corner are shortest.
+def _nearest_end(directions: Float64, min_length: float) -> _Corner:
+    """Return the corner whose two sides end in a cell's centre and are shortest.
 
     Parameters
     ----------
     directions : (2, 2) float64
         The unit vectors of the first and the last heading, in columns.
     min_length : float
-        The least length of each line, in cells.
+        The least length of each side, in cells.
     """
+    # All cells in a square around the origin, which contains the nearest end.
     max_distance = math.ceil(4 * min_length) + 6
     coordinates = range(-max_distance, max_distance + 1)
     cells = np.array(list(product(coordinates, repeat=2)))  # (N, 2)
-    # The lengths of the two lines that lead to each cell: directions @ lengths.
+    # The lengths of the two sides that lead to each cell: directions @ lengths = cells.
     lengths = np.linalg.solve(directions, cells.T)  # (2, N)
-    is_possible = (lengths >= min_length - 1e-9).all(axis=0)
+    is_possible = (lengths >= min_length - 1e-9).all(axis=0)  # (N,)
     total_length = np.where(is_possible, lengths.sum(axis=0), np.inf)
     nearest = total_length.argmin()
-    before_corner, after_corner = lengths[:, nearest].tolist()
-    return _BendEnd(before_corner, after_corner, cells[nearest])
+    length_before, length_after = lengths[:, nearest].tolist()
+    return _Corner(length_before, length_after, cells[nearest])
 
 
 def _motions(
     cell_size: float, angles: Float64, primitives: Sequence[Primitive]
 ) -> Motions:
-    """Return primitives as arrays, sorted by their first and last headings.
+    """Return primitives as arrays, sorted by their first and then their last headings.
 
-    `cell_size` is in metres; `angles` has the yaw of each heading, radians.
+    `cell_size` is in metres; `angles` (16,) has the yaw of each heading, radians.
     """
     in_order = sorted(
         primitives, key=lambda primitive: (primitive.start, primitive.end)
@@ -348,18 +371,19 @@ def _motions(
 
 
 def dense_poses(poses: Poses, spacing: float, lever: float) -> Poses:
-    """Return poses (N, 3) with more poses between them, so that a body moves in steps.
+    """Return poses (N, 3), and more poses between them: (M, 3).
 
-    From one pose to the next, each point of the body moves by at most `spacing` if it
-    lies at most `lever` from the robot's origin. Lengths have the unit of the poses.
+    From one pose to the next, no point of the body moves by more than `spacing`: points
+    lie at most `lever` from the robot's origin. Both have the unit of the poses' x, y.
     """
     parts = [poses[:1]]
     for pose, next_pose in pairwise(poses):
         change = next_pose - pose
         dx, dy, turn = change.tolist()
         movement = math.hypot(dx, dy) + lever * abs(turn)
-        steps = max(math.ceil(movement / spacing - 1e-9), 1)  # 1e-9: despite rounding
-        shares = np.linspace(0, 1, steps + 1)[1:]  # without the pose itself
+        # A movement that is greater than n spacings by rounding alone takes n steps.
+        steps = max(math.ceil(movement / spacing - 1e-9), 1)
+        shares = np.linspace(0, 1, steps + 1)[1:]  # of the change, without 0
         parts.append(pose + shares[:, None] * change)
     return np.concatenate(parts)
 
@@ -436,7 +460,11 @@ def _check_number_of_headings(metadata: object) -> None:
 
 
 def _check_headings(headings: NDArray[np.int64], verb: str) -> None:
-    """Raise a ValueError if no primitive starts, or ends, with some heading."""
+    """Raise a ValueError unless each heading, 0 to 15, is among those of primitives.
+
+    `headings` (P,) are those with which P primitives start or end, as `verb` says:
+    "starts" or "ends".
+    """
     missing = sorted(set(range(HEADINGS)) - set(headings.tolist()))
     if missing:
         remedy = f"give primitives that start and end with each of the {HEADINGS}"
@@ -444,7 +472,10 @@ def _check_headings(headings: NDArray[np.int64], verb: str) -> None:
 
 
 def _angles(values: Any) -> Float64:
-    """Return the yaws of a lattice's headings, (16,)."""
+    """Return the yaws of a lattice's headings, (16,) radians; a ValueError for others.
+
+    `values` are those in the lattice's JSON.
+    """
     name = "heading_angles"
     angles = numbers(name, values)
     if angles.shape != (HEADINGS,):
@@ -457,7 +488,7 @@ def _angles(values: Any) -> Float64:
 def _primitive(
     name: str, primitive: object, cell_size: float, angles: Float64
 ) -> Primitive:
-    """Return a primitive of a lattice's JSON.
+    """Return a primitive of a lattice's JSON; a ValueError says what is wrong with it.
 
     Parameters
     ----------
@@ -480,14 +511,15 @@ def _primitive(
         f"metres, 0 to {MAX_DISTANCE:g}",
     )
     metric_poses = _poses(f"the poses of {name}", _field(primitive, "poses", name))
-    poses = metric_poses / (cell_size, cell_size, 1)
+    poses = metric_poses / (cell_size, cell_size, 1)  # cells, cells, radians
     poses = _from_heading_to_heading(poses, angles[start], angles[end])
     _check_end(name, poses)
     metres = length
-    if length == 0:  # a turn on the spot
+    if length == 0:  # a turn on the spot, which costs as much as these metres
         turn = float(np.abs(np.diff(poses[:, 2])).sum())
         metres = turn * TURN
     cost = metres / cell_size
+    # From the start to the end of the poses, metres.
     distance = float(np.hypot(poses[-1, 0], poses[-1, 1])) * cell_size
     if length < MIN_LENGTH_SHARE * distance or cost < MIN_COST:
         raise ValueError(
@@ -504,20 +536,25 @@ def _heading(field: str, name: str, primitive: object) -> int:
 
 
 def _from_heading_to_heading(poses: Poses, start_yaw: float, end_yaw: float) -> Poses:
-    """Return poses with these yaws at both ends, and no jumps by whole turns.
+    """Return a primitive's poses from the origin on, with exact yaws at both ends.
 
-    The last yaw of `poses` itself is changed.
+    The yaws, in radians, have no jumps by whole turns. `poses` (N, 3), x and y in
+    cells, may lack the pose in the origin; its last yaw is changed in place.
     """
     poses[-1, 2] = end_yaw
     start_pose = np.array([0, 0, start_yaw])
-    if np.abs(poses[0] - start_pose).max() > SAME_POSE:  # only old files begin with it
+    # Old files of Nav2 begin with the start pose, newer ones with the pose after it.
+    if np.abs(poses[0] - start_pose).max() > SAME_POSE:
         poses = np.vstack([start_pose, poses])
     poses[:, 2] = np.unwrap(poses[:, 2])
     return poses
 
 
 def _check_end(name: str, poses: Poses) -> None:
-    """Raise a ValueError if a primitive does not end in the centre of a cell."""
+    """Raise a ValueError if a primitive does not end in the centre of a cell.
+
+    `name` is what the error calls it; its poses (N, 3) are in cells and radians.
+    """
     end = poses[-1, :2]
     off_centre = np.abs(end - np.rint(end)).max()
     if off_centre > MAX_OFF_CENTRE:
@@ -528,7 +565,10 @@ def _check_end(name: str, poses: Poses) -> None:
 
 
 def _poses(name: str, values: Any) -> Float64:
-    """Return the poses of a lattice's primitive, (N, 3): metres, metres and radians."""
+    """Return the poses of a lattice's primitive, (N, 3): metres, metres and radians.
+
+    `values` are those in the lattice's JSON, and `name` is what errors call them.
+    """
     poses = numbers(name, values)
     if poses.ndim != 2 or poses.shape[1] != 3 or not 0 < len(poses) <= MAX_POSES:
         raise ValueError(
