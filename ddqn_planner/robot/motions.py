@@ -137,7 +137,7 @@ def make_motions(
 
 
 def _cell_size(name: str, metres: Any) -> float:
-    """Return metres per cell; a ValueError, which calls them `name`, out of the range."""
+    """Return metres per cell, checked; an error calls them `name`."""
     smallest, largest = CELL_SIZES
     remedy = f"metres per cell, {smallest:g} to {largest:g}"
     return as_number(name, metres, smallest, largest, remedy)
