@@ -102,17 +102,18 @@ def _short(footprint: Any) -> str:
 
 
 def _parsed(text: str) -> Any:
-    """Return the number or the nested lists of a text; commas may be left out.
+    """Return the number or the nested lists of numbers that a text stands for.
 
-    A ValueError says what is wrong with another text.
+    Commas may be left out, and brackets may be round. A ValueError says what is wrong
+    with any other text.
     """
     text = text.strip(" \t\r\n'\"")
     if NUMBER.fullmatch(text):
         return float(text)
-    # The lists whose brackets are open, the innermost at the end. The first list stands
-    # for the text itself.
+    # The lists whose brackets are open, the innermost at the end. The first list holds
+    # what stands outside of all brackets: in the end, the list of points alone.
     lists: list[list[Any]] = [[]]
-    position = 0
+    position = 0  # up to where the text was read
     while position < len(text):
         token = _token_at(text, position)
         opens, closes, _, number = token.groups()
@@ -136,7 +137,10 @@ def _parsed(text: str) -> Any:
 
 
 def _token_at(text: str, position: int) -> re.Match[str]:
-    """Return a match of `TOKEN` at a position of a text: a bracket, comma or number."""
+    """Return a match of `TOKEN` at a position of a text: a bracket, comma or number.
+
+    A ValueError shows the text there if it is neither.
+    """
     token = TOKEN.match(text, position)
     if token is None:
         beginning = text[position : position + 20]
@@ -150,19 +154,25 @@ def _is_scalar(value: Any) -> bool:
 
 
 def _around_circle(value: Any) -> Corners:
-    """Return the corners of a polygon around the circle of a radius, in metres."""
-    if isinstance(value, np.ndarray):
+    """Return the corners (K, 2) of a polygon around the circle of a radius, in metres.
+
+    The circle touches the middle of each side. A ValueError if `value` is no radius.
+    """
+    if isinstance(value, np.ndarray):  # of no axes: the number in it
         value = value[()]
     remedy = f"0.001 to {MAX_DISTANCE:g} metres"
     radius = as_number("the radius", value, 1e-3, MAX_DISTANCE, remedy)
-    angle = 2 * math.pi * (np.arange(CIRCLE_CORNERS) + 0.5) / CIRCLE_CORNERS
+    angle = 2 * math.pi * (np.arange(CIRCLE_CORNERS) + 0.5) / CIRCLE_CORNERS  # (K,)
     directions = np.column_stack([np.cos(angle), np.sin(angle)])
     distance = radius / math.cos(math.pi / CIRCLE_CORNERS)
     return directions * distance
 
 
 def _points(value: Any) -> Corners:
-    """Return points as an array (K, 2), without those that repeat the point before."""
+    """Return points as an array (K, 2), without those that repeat the point before.
+
+    A ValueError if `value` is no sequence of points (x, y), metres within a range.
+    """
     points = numbers("the points", value)
     if points.ndim != 2 or points.shape[1] != 2:
         raise ValueError(
@@ -181,12 +191,14 @@ def _points(value: Any) -> Corners:
 
 
 def _without_repeats(points: Corners) -> Corners:
-    """Return a polygon's corners without those that repeat the corner before."""
+    """Return a polygon's corners without those that repeat the corner before: (K, 2).
+
+    The corner before the first one is the last.
+    """
     corners: list[NDArray[np.float64]] = []
     for point in points:
         if not corners or math.dist(point, corners[-1]) > SAME_CORNER:
             corners.append(point)
-    # The first corner comes after the last one.
     while len(corners) > 1 and math.dist(corners[0], corners[-1]) <= SAME_CORNER:
         corners.pop()
     return np.array(corners, dtype=np.float64).reshape(-1, 2)
@@ -208,38 +220,43 @@ def _sides_cross(corners: Corners) -> bool:
 
     Sides that only meet in a corner, touch, or lie on one line do not cross.
     """
-    starts = corners
+    starts = corners  # of the K sides
     ends = np.roll(corners, -1, axis=0)
-    # (K, K): whether the ends of a side (row) lie to the left and to the right of the
-    # line through another side (column).
+    # (K, K): whether the line through a side (column) parts another side (row): one end
+    # of that lies to the left of the line, and one to the right.
     is_parted = _side_of(starts, starts, ends) * _side_of(ends, starts, ends) < 0
+    # Sides cross if each of them is parted by the line through the other.
     return bool((is_parted & is_parted.T).any())
 
 
 def _side_of(points: Points, starts: Points, ends: Points) -> NDArray[np.float64]:
     """Return on which side of each of K lines each of N points lies: (N, K).
 
-    A line leads from a start (K, 2) to an end. The value is 1 for a point to the left,
-    -1 to the right, and 0 for one on the line.
+    The points are (N, 2). A line leads from a start to an end, (K, 2) each. The result
+    is 1 for a point to the left, -1 for one to the right, and 0 for one on the line.
     """
     lines = ends - starts  # (K, 2)
     to_points = points[:, None] - starts  # (N, K, 2)
-    product = _cross(lines, to_points)  # the distance times the length of the line
-    tolerance = 1e-9 * np.hypot(lines[:, 0], lines[:, 1])
+    # (N, K): the distance of a point from a line, times the length of the line.
+    product = _cross(lines, to_points)
+    tolerance = 1e-9 * np.hypot(lines[:, 0], lines[:, 1])  # (K,)
     return np.where(np.abs(product) <= tolerance, 0, np.sign(product))
 
 
 def _padded(corners: Corners, padding: float) -> Corners:
-    """Return a polygon whose sides lie `padding` metres further out.
+    """Return a polygon whose sides lie `padding` metres further out: (L, 2).
 
-    A sharp corner is cut: it becomes two corners.
+    A sharp corner is cut, and becomes two corners: so L may be greater than the number
+    of `corners` (K, 2).
     """
     next_corners = np.roll(corners, -1, axis=0)
     sides = next_corners - corners
+    # (K, 2): unit vectors along the side after each corner, and the side before it.
     directions = sides / np.hypot(sides[:, 0], sides[:, 1])[:, None]
-    directions_before = np.roll(directions, 1, axis=0)  # of the side before each corner
+    directions_before = np.roll(directions, 1, axis=0)
+    # The area is positive if the corners are in counter-clockwise order.
     double_area = float(_cross(corners, next_corners).sum())
-    orientation = math.copysign(1, double_area)  # 1: counter-clockwise
+    orientation = math.copysign(1, double_area)
     padded: list[NDArray[np.float64]] = []
     for corner, direction_in, direction_out in zip(
         corners, directions_before, directions, strict=True
@@ -259,7 +276,7 @@ def _corner_offsets(
     Parameters
     ----------
     direction_in, direction_out : (2,) float64
-        The directions of the sides before and after the corner.
+        Unit vectors along the sides before and after the corner.
     orientation : float
         1 if the polygon is counter-clockwise, -1 if it is clockwise.
 
@@ -269,16 +286,16 @@ def _corner_offsets(
         One offset, or two where the corner is cut.
     """
     total = direction_in + direction_out
-    # The cosine of half the angle by which the outline turns.
+    # The cosine of half the angle by which the outline turns in the corner.
     cosine = math.hypot(total[0], total[1]) / 2
     is_concave = _cross(direction_in, direction_out) * orientation < 0
     if cosine > MIN_COSINE or is_concave:
-        # The moved sides meet at a distance of 1 / cosine from the corner, and the
-        # length of `outward` is 2 * cosine.
+        # One offset, to where the moved sides meet: at a distance of 1 / cosine from
+        # the corner, in the direction of `outward`, whose length is 2 * cosine.
         outward = _turned_outward(total, orientation)
         return [outward / (2 * max(cosine, SMALLEST_COSINE) ** 2)]
-    # The middle of the cut is as far beyond the corner as the sides move, 1. The cut is
-    # perpendicular to the way there.
+    # Two offsets, to the ends of the cut. The middle of the cut is as far from the
+    # corner as the sides move, 1, and the cut lies at a right angle to that direction.
     difference = direction_in - direction_out
     middle_of_cut = difference / math.hypot(difference[0], difference[1])
     along_cut = -_turned_outward(middle_of_cut, orientation)
@@ -289,33 +306,42 @@ def _corner_offsets(
 def _turned_outward(
     vector: NDArray[np.float64], orientation: float
 ) -> NDArray[np.float64]:
-    """Return a vector (2,) along the outline, turned by 90 degrees to its outside."""
+    """Return a vector (2,) along the outline, turned by 90 degrees to its outside.
+
+    The orientation is 1 for a counter-clockwise outline, -1 for a clockwise one.
+    """
     x, y = vector
     return np.array([orientation * y, -orientation * x])
 
 
 def _is_padded(padded: Corners, corners: Corners, padding: float) -> bool:
-    """Return whether the outline of a padded polygon keeps the padding everywhere.
+    """Return whether a padded polygon is `padding` metres away from the unpadded one.
 
-    `corners` are those of the polygon without padding.
+    The padded polygon must lie around the other one, and may not cross itself. `padded`
+    (L, 2) and `corners` (K, 2) are the corners of both.
     """
     if _sides_cross(padded):
         return False
     if inside(padded, corners).any() or not inside(corners, padded).all():
         return False
+    # The least distance is from a corner of one polygon to a side of the other.
     gap = min(_distances(padded, corners).min(), _distances(corners, padded).min())
     return bool(gap > padding * (1 - 1e-6))
 
 
 def _distances(points: Points, corners: Corners) -> NDArray[np.float64]:
-    """Return how far points (N, 2) are from each side of a polygon, (N, K)."""
+    """Return how far points (N, 2) are from each side of a polygon, (N, K).
+
+    The polygon has K corners, (K, 2). Distances have the unit of the points.
+    """
     sides = np.roll(corners, -1, axis=0) - corners  # (K, 2)
     to_points = points[:, None] - corners  # (N, K, 2)
-    # The nearest point of a side lies at a share of it: 0 is its begin and 1 its end.
-    dot_products = (to_points * sides).sum(axis=2)
-    squared_lengths = (sides * sides).sum(axis=1)
-    shares = (dot_products / squared_lengths).clip(0, 1)
-    from_nearest = to_points - shares[..., None] * sides
+    # The point of a side that is nearest to a point lies at a share of the side: 0 is
+    # its begin and 1 its end.
+    dot_products = (to_points * sides).sum(axis=2)  # (N, K)
+    squared_lengths = (sides * sides).sum(axis=1)  # (K,)
+    shares = (dot_products / squared_lengths).clip(0, 1)  # (N, K)
+    from_nearest = to_points - shares[..., None] * sides  # (N, K, 2)
     distances: NDArray[np.float64] = np.hypot(
         from_nearest[..., 0], from_nearest[..., 1]
     )
@@ -323,16 +349,21 @@ def _distances(points: Points, corners: Corners) -> NDArray[np.float64]:
 
 
 def inside(points: Points, corners: Corners) -> NDArray[np.bool_]:
-    """Return which points (N, 2) lie in a polygon: its outline leads around them."""
-    # The winding number: sides that cross the ray from a point to the right upward,
-    # minus those that cross it downward.
+    """Return which points (N, 2) lie in a polygon, with corners (K, 2): (N,) bool.
+
+    The outline leads around such a point at least once, in one direction.
+    """
+    # For each point, a ray leads to the right. The winding number counts the sides that
+    # cross the ray upward, minus those that cross it downward.
     winding_number = np.zeros(len(points), dtype=np.int64)
     x, y = points.T
     ends = np.roll(corners, -1, axis=0)
     for (start_x, start_y), (end_x, end_y) in zip(corners, ends, strict=True):
-        if start_y == end_y:
+        if start_y == end_y:  # a side along the rays crosses none
             continue
-        crosses_line = (start_y > y) != (end_y > y)  # the horizontal line of the ray
+        # (N,) each: whether the side crosses the horizontal line through each point,
+        # and where; to the right of the point it crosses the ray.
+        crosses_line = (start_y > y) != (end_y > y)
         share_of_side = (y - start_y) / (end_y - start_y)
         x_of_crossing = start_x + share_of_side * (end_x - start_x)
         crosses_ray = crosses_line & (x < x_of_crossing)
@@ -345,7 +376,10 @@ def inside(points: Points, corners: Corners) -> NDArray[np.bool_]:
 
 
 def outline(corners: Corners, spacing: float) -> Points:
-    """Return points along the sides of a polygon, (M, 2), at most a spacing apart."""
+    """Return points along the sides of a polygon, (M, 2), at most `spacing` apart.
+
+    The corners (K, 2) and the spacing have the same unit.
+    """
     parts = []
     for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         count = math.ceil(math.dist(start, end) / spacing)
@@ -354,7 +388,11 @@ def outline(corners: Corners, spacing: float) -> Points:
 
 
 def placed(corners: Corners, poses: Poses) -> NDArray[np.float64]:
-    """Return the corners (K, 2) of a body at poses (N, 3), in metres: (N, K, 2)."""
+    """Return where the corners of a body are at each of some poses: (N, K, 2), metres.
+
+    The corners (K, 2) are ahead and to the left of the robot's origin. The poses (N, 3)
+    are in metres and radians.
+    """
     x, y, yaw = poses.T[..., None]  # (N, 1) each
     ahead, left = corners.T  # (K,) each: in the robot's own frame
     cos = np.cos(yaw)
@@ -379,24 +417,25 @@ def swept_cells(corners: Corners, motions: Motions) -> NDArray[np.bool_]:
     ValueError
         If a primitive sweeps cells that are too far away.
     """
-    body = corners / motions.resolution  # in cells
+    body = corners / motions.resolution  # (K, 2), in cells
     radius = float(np.hypot(body[:, 0], body[:, 1]).max())
-    reach = _reach(radius, motions)
-    edge = outline(body, MARGIN)
+    reach = _reach(radius, motions)  # cells to each side of the start
+    edge = outline(body, MARGIN)  # (M, 2): points in cells
     side = 2 * reach + 1
     swept = np.zeros((len(motions.poses), side, side), dtype=np.bool_)
     for mask, poses in zip(swept, motions.poses, strict=True):
-        # Between two poses the body reaches no cell that its outline does not touch. So
-        # the outline needs many poses, and the inside needs few.
+        # A cell that the body comes to cover between two poses is touched by its
+        # outline. So the outline needs many poses, and the inside needs few.
         _mark_touched(mask, edge, dense_poses(poses, MARGIN, radius))
         _mark_covered(mask, body, poses)
     return swept
 
 
 def _reach(radius: float, motions: Motions) -> int:
-    """Return to how many cells on each side a body may sweep on its motions.
+    """Return how many cells a body may sweep to each side of its start.
 
-    The body's radius is in cells. A ValueError if it sweeps too many.
+    The body's radius, its greatest distance from the robot's origin, is in cells. A
+    ValueError if the cells are too many.
     """
     poses = np.concatenate(motions.poses)
     distances = np.hypot(poses[:, 0], poses[:, 1])
@@ -418,16 +457,19 @@ def _mark_touched(mask: NDArray[np.bool_], edge: Points, poses: Poses) -> None:
     edge : (M, 2) float64
         Points of the outline in the robot's own frame, in cells.
     poses : (N, 3) float64
+        x and y in cells from the middle of the mask, yaw in radians.
     """
-    # A point is near the cells that contain the corners of a square around it.
+    # The cells near a point are those that contain a corner of a square around it.
     square = MARGIN * np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)])
-    reach = len(mask) // 2
+    middle = len(mask) // 2
     for x, y, yaw in poses:
-        turned = edge @ _rotation(yaw).T
-        points = turned + np.array([x, y])  # (M, 2)
+        turned_edge = edge @ _rotation(yaw).T
+        points = turned_edge + np.array([x, y])  # (M, 2)
         corners = points[:, None] + square  # (M, 4, 2)
-        cells = np.rint(corners).astype(np.int64) + reach
-        mask[cells[..., 1], cells[..., 0]] = True
+        cells = np.rint(corners).astype(np.int64) + middle
+        column = cells[..., 0]
+        row = cells[..., 1]
+        mask[row, column] = True
 
 
 def _mark_covered(mask: NDArray[np.bool_], body: Points, poses: Poses) -> None:
@@ -440,14 +482,16 @@ def _mark_covered(mask: NDArray[np.bool_], body: Points, poses: Poses) -> None:
     body : (K, 2) float64
         The corners in the robot's own frame, in cells.
     poses : (N, 3) float64
+        x and y in cells from the middle of the mask, yaw in radians.
     """
-    reach = len(mask) // 2
-    coordinates = np.arange(-reach, reach + 1.0)
+    middle = len(mask) // 2
+    coordinates = np.arange(-middle, middle + 1.0)
+    # (S * S, 2): the centres of all cells of the mask, from its middle.
     centres = np.stack(np.meshgrid(coordinates, coordinates), axis=-1).reshape(-1, 2)
     for x, y, yaw in poses:
         from_robot = centres - np.array([x, y])
-        turned_back = from_robot @ _rotation(yaw)
-        mask |= inside(turned_back, body).reshape(mask.shape)
+        in_robot_frame = from_robot @ _rotation(yaw)  # turned back
+        mask |= inside(in_robot_frame, body).reshape(mask.shape)
 
 
 def _rotation(yaw: float) -> NDArray[np.float64]:

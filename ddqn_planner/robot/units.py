@@ -27,10 +27,10 @@ class Units(NamedTuple):
 def units_of(motions: Motions) -> Units:
     """Return the units of primitives: quarter turns of each other share a unit.
 
-    The poses of a unit are those of its first primitive, turned back so that its first
-    heading lies in the first quarter.
+    The poses of a unit are those of its first primitive, turned back by quarter turns
+    until its first heading lies in the first quarter, 0 to 3.
     """
-    turns = motions.start // HEADINGS_PER_QUARTER
+    turns = motions.start // HEADINGS_PER_QUARTER  # (P,): quarter turns, 0 to 3
     unit_of_primitive: list[int] = []
     poses_of_units: list[Poses] = []
     for quarter_turns, poses in zip(turns.tolist(), motions.poses, strict=True):
@@ -48,12 +48,14 @@ def _turned_back(poses: Poses, quarter_turns: int) -> Poses:
     """Return poses (N, 3) turned clockwise around the origin by some quarter turns."""
     x, y, yaw = poses.T
     for _ in range(quarter_turns):
-        x, y = y, -x
+        turned_x = y
+        y = -x
+        x = turned_x
     return np.column_stack([x, y, yaw - quarter_turns * math.pi / 2])
 
 
 def _first_same(poses_of_units: list[Poses], poses: Poses) -> int | None:
-    """Return the index of the first unit with the same poses, or None."""
+    """Return the index of the first unit whose poses are the same, or None."""
     for unit, unit_poses in enumerate(poses_of_units):
         if _are_same(poses, unit_poses):
             return unit
