@@ -223,7 +223,7 @@ def lower_bounds(
         np.array([goal]), grid, world_of(grid, PosePlanner(planner.network).body)
     )
     x, y, _ = start
-    aim = field.with_look_at_map(NOWHERE._replace(x=x, y=y), shift)
+    aim = field.with_look_at_map(NOWHERE._replace(start_x=x, start_y=y), shift)
     cells = np.ndindex(grid.occupancy.shape)
     bounds = [remaining_cost(column, row, aim) for row, column in cells]
     return np.array(bounds).reshape(grid.occupancy.shape)

@@ -250,7 +250,7 @@ def test_what_the_map_tells_is_left_at_least(motion: str, seed: int) -> None:
     x, y, heading = (int(random.integers(n)) for n in (44, 30, 16))
     world = world_of(grid, planner(motion).body)
     field = pose_field.PoseField(np.array([(43, 29, 0)]), grid, world)
-    aim = pose_field.NOWHERE._replace(x=x, y=y)
+    aim = pose_field.NOWHERE._replace(start_x=x, start_y=y)
     best = least_costs(grid, *robot(motion), (x, y, heading))
     for shift in (2, 1):  # tiles of 4 cells, and of 2
         aim = field.with_look_at_map(aim, shift)
