@@ -60,7 +60,8 @@ class MoveCosts(NamedTuple):
     def of_table(cls, table_PA: Array) -> MoveCosts:
         """Return the costs of a table of P patches and 8 actions, for no map yet.
 
-        The table gets one more row, for a patch that no move leaves.
+        `table_PA` has the cost of each action in each patch, infinite where the move is
+        not possible. It gets one more row, for a patch that no move leaves.
         """
         highest = float(table_PA.max(where=np.isfinite(table_PA), initial=1))
         # Even actions are straight, odd actions diagonal. Two straight moves replace a
@@ -84,7 +85,8 @@ class MoveCosts(NamedTuple):
     def on_changed_map(self, grid: GridMap, boxes: Sequence[Box]) -> MoveCosts | None:
         """Return the costs on a map that differs in boxes from the map of these costs.
 
-        None means that the whole map must be read.
+        A box is an index of rows and columns. The result is None where the whole map
+        must be read.
         """
         if grid.forbidden is not None:  # the patch numbers depend on all cells
             return None
@@ -94,7 +96,10 @@ class MoveCosts(NamedTuple):
         return costs
 
     def _with_box_of(self, grid: GridMap, box: Box) -> MoveCosts:
-        """Return the costs after the cells of a box became those of a map `grid`."""
+        """Return the costs after the cells of a box changed to those of a map `grid`.
+
+        Only a part of the map is read: the box and what lies around it.
+        """
         shape = grid.occupancy.shape
         cells = wider(box, 1, shape)  # whose patches contain a cell of the box
         region = wider(box, 2, shape)  # all cells of these patches
@@ -103,14 +108,18 @@ class MoveCosts(NamedTuple):
             layer = getattr(grid, name)
             if layer is not None:
                 layers[name] = layer[region].copy()  # in C order, as numba expects
-        part = self.on_map(grid.with_layers(**layers))
+        part = self.on_map(grid.with_layers(**layers))  # the costs of the region alone
+        # Where `cells` lie in the padded region, and in the padded map.
         cells_of_part = relative_to(region, cells, border=1)
         cells_of_map = relative_to(ORIGIN, cells, border=1)
 
         def with_part(
             array: NDArray[Number], array_of_part: NDArray[Number]
         ) -> NDArray[Number]:
-            """Return a copy of a map's array (C,) with the cells of the part."""
+            """Return a copy of the map's array (C,) with the part's values in `cells`.
+
+            An array that the map does not have is empty.
+            """
             if array_of_part.size == 0:
                 return array
             new_cells = array_of_part.reshape(-1, part.width)[cells_of_part]
@@ -159,8 +168,11 @@ class MoveCosts(NamedTuple):
         return costs
 
     def _with_multiplier(self, multiplier: Array) -> MoveCosts:
-        """Return the costs times the multipliers of a map's cells, (H, W)."""
-        # The highest cost of these costs may contain multipliers of another map.
+        """Return the costs with the multipliers (H, W) of a map's cells, 1 or more.
+
+        A move costs what the table says times the mean multiplier of its two cells.
+        """
+        # Not from `self.highest`, which may contain multipliers of another map.
         highest_of_table = self.table.max(where=np.isfinite(self.table), initial=1)
         return self._replace(
             multiplier=_with_border(multiplier, 1).ravel(),
@@ -172,8 +184,9 @@ class MoveCosts(NamedTuple):
         """Return the costs, infinite for the actions that cells forbid.
 
         The table gets a copy of all its rows for each set of forbidden actions that
-        occurs on the map. A cell's patch number, a row of the table, then leads to the
-        copy for its set. Shapes: C cells, S sets, P rows of the table, A = 8 actions.
+        occurs on the map. Each cell's patch number, a row of the table, then leads to
+        the copy for the cell's set. Shapes: C cells of the padded map, S sets, P rows
+        of the table, A = 8 actions.
 
         Parameters
         ----------
@@ -182,21 +195,22 @@ class MoveCosts(NamedTuple):
             over the forbidden actions a.
         """
         bit_set_C = _with_border(forbidden, 0).ravel()
-        occurs = np.zeros(2**ACTIONS, np.bool_)  # for each bit set
+        occurs = np.zeros(2**ACTIONS, np.bool_)  # (256,): by bit set
         _mark_occurring(bit_set_C, occurs)
-        bit_sets_S = np.flatnonzero(occurs)
-        is_forbidden_SA = (bit_sets_S[:, None] & 2 ** np.arange(ACTIONS)) != 0
+        bit_set_S = np.flatnonzero(occurs)
+        is_forbidden_SA = (bit_set_S[:, None] & 2 ** np.arange(ACTIONS)) != 0
+        # The copy of the table for each set: with infinite costs for its actions.
         table_PA = self.table.reshape(-1, ACTIONS)
         infinite = np.float32(np.inf)
-        tables_SPA = np.where(is_forbidden_SA[:, None], infinite, table_PA)
-
-        rows = len(bit_sets_S) * len(table_PA)
+        table_SPA = np.where(is_forbidden_SA[:, None], infinite, table_PA)
+        # The rows of copy s begin at s * P. The old patch number counts from there.
+        rows = len(bit_set_S) * len(table_PA)
         dtype = np.uint16 if rows <= 2**16 else np.int32
-        first_row = np.zeros(2**ACTIONS, dtype)  # of the copy for each bit set
-        first_row[bit_sets_S] = np.arange(0, rows, len(table_PA))
-        patch_number = first_row.take(bit_set_C)
-        patch_number += self.patch_number.astype(dtype, copy=False)
-        return self._replace(patch_number=patch_number, table=tables_SPA.ravel())
+        first_row = np.zeros(2**ACTIONS, dtype)  # (256,): of the copy, by bit set
+        first_row[bit_set_S] = np.arange(0, rows, len(table_PA))
+        patch_number_C = first_row.take(bit_set_C)
+        patch_number_C += self.patch_number.astype(dtype, copy=False)
+        return self._replace(patch_number=patch_number_C, table=table_SPA.ravel())
 
 
 @in_place
@@ -207,7 +221,7 @@ def _mark_occurring(bit_set_C: NDArray[np.uint8], occurs: NDArray[np.bool_]) -> 
 
 
 def _with_border(inside: NDArray[Number], value: int) -> NDArray[Number]:
-    """Return an array with one more cell of a value on each side."""
+    """Return an array (H, W) with a border of one cell of a value: (H + 2, W + 2)."""
     # `np.pad` takes 50 µs longer.
     array = np.full((inside.shape[0] + 2, inside.shape[1] + 2), value, inside.dtype)
     array[1:-1, 1:-1] = inside
@@ -253,8 +267,10 @@ def _read_cells(
 ) -> Any:
     """Write patch numbers and cost codes of a map's cells; return the least cost.
 
-    A patch number has bit 3 y + x where cell (x, y) of the 3x3 patch around the cell is
-    occupied. A cost code is the cost plus 1, 0 where unknown and 101 where occupied.
+    A cell's patch number has a bit for each cell of the 3x3 patch around it, set where
+    that is occupied: bit 3 y + x, with y and x from 0 to 2. A cost code is the cell's
+    cost plus 1; 0 for an unknown and 101 for an occupied cell. The least cost is at
+    most 100.
 
     Parameters
     ----------
@@ -268,6 +284,7 @@ def _read_cells(
         Without costs, `cost` and `cost_code` are not used, and 100 is returned.
     """
     least_cost = np.uint8(OCCUPIED)
+    # x and y count cells of the arrays with a border.
     for y in range(1, patch_number.shape[0] - 1):
         below = occupied[y - 1]
         row = occupied[y]
@@ -281,8 +298,8 @@ def _read_cells(
             bits += 64 * above[x - 1] + 128 * above[x] + 256 * above[x + 1]
             patch_number[y, x] = bits
             if has_costs:
-                # In uint8, so that the loop handles many cells at once. An unknown cell
-                # has the cost 255, which overflows to the code 0.
+                # The cost 100 where the cell is occupied. In uint8, so that the loop
+                # handles many cells at once: the 255 of an unknown cell plus 1 is 0.
                 cost_of_cell = np.uint8(cost_row[x - 1] + row[x] * np.uint8(OCCUPIED))
                 code_row[x] = cost_of_cell + np.uint8(1)
                 least_cost = min(least_cost, cost_of_cell)
@@ -292,10 +309,11 @@ def _read_cells(
 def patches(
     occupancy: NDArray[np.bool_], cost: NDArray[np.int8] | None
 ) -> NDArray[np.int8]:
-    """Return the 3x3 patch of each cell, (C, 9) int8.
+    """Return the 3x3 patch around each cell of a map: (C, 9) int8, C = H * W.
 
     Each of the 9 cells has its cost, -1 to 99, or 0 without costs; occupied cells and
-    cells outside the map have 100. The order is row by row, so 4 is the cell itself.
+    cells outside the map have 100. They come row by row, so number 4 is the cell in the
+    middle. `occupancy` and `cost` are (H, W).
     """
     if cost is None:
         cost = np.zeros(occupancy.shape, np.int8)
@@ -309,24 +327,33 @@ def patches(
 def unique_patches(
     occupancy: NDArray[np.bool_], cost: NDArray[np.int8]
 ) -> tuple[NDArray[Any], NDArray[np.int8]]:
-    """Return the patch number of each cell, (C,), and the patches by number, (P, 9).
+    """Return the different patches of a map with costs, numbered.
 
-    The cells C are those of the padded map; those outside the map have the number P.
+    `occupancy` and `cost` are (H, W).
+
+    Returns
+    -------
+    patch_number : (C,) int32
+        Of each cell of the padded map; P for cells outside the map.
+    patches : (P, 9) int8
+        The patch of each number, see `patches`.
     """
     patch_N9 = patches(occupancy, cost)  # N = cells of the map
-    # One number for each patch: its cost codes are digits to the base 128.
+    # One integer tells a patch: the cost codes of its cells are digits to the base 128.
     digits_N9 = patch_N9 - UNKNOWN
     code_N = digits_N9 @ 128 ** np.arange(9)
-    _, first_cell, number_N = np.unique(code_N, return_index=True, return_inverse=True)
+    # P different codes: a cell where each occurs, and the number of each cell's code.
+    _, cell_P, number_N = np.unique(code_N, return_index=True, return_inverse=True)
     number_HW = number_N.reshape(occupancy.shape).astype(np.int32)
-    padded = np.pad(number_HW, 1, constant_values=len(first_cell))
-    return padded.ravel(), patch_N9[first_cell]
+    padded = np.pad(number_HW, 1, constant_values=len(cell_P))
+    return padded.ravel(), patch_N9[cell_P]
 
 
 def every_patch() -> NDArray[np.int8]:
     """Return all patches without costs in the order of patch numbers: (512, 9) int8.
 
-    Bit c of the number is set where cell c of the patch is occupied, see `CellsRead`.
+    Bit c of the number is set where cell c of the patch, 0 to 8, is occupied. Occupied
+    cells have the value 100, free cells 0.
     """
     number_P1 = np.arange(2**9)[:, None]
     is_occupied_P9 = (number_P1 & 2 ** np.arange(9)) != 0
@@ -338,9 +365,9 @@ def legal_in_patches(
     patch_P9: NDArray[np.int8], move_rule: MoveRule
 ) -> NDArray[np.bool_]:
     """Return which actions are legal in the centre of each patch: (P, 8) bool."""
-    # On a map of 3 columns the patches lie one above the other: a move out of a centre
-    # stays in its patch.
-    occupancy = (patch_P9 == OCCUPIED).reshape(-1, 3)
+    # A map of 3 columns, in which the patches lie one above the other: a move out of
+    # the centre of a patch stays in the patch.
+    occupancy = (patch_P9 == OCCUPIED).reshape(-1, 3)  # (3 P, 3)
     legal = legal_moves(occupancy, move_rule)  # (8, 3 P, 3)
     legal_PA: NDArray[np.bool_] = legal[:, 1::3, 1].T
     return legal_PA

@@ -48,7 +48,15 @@ class ModelFileError(ValueError):
 
 
 class QNetwork:
-    """A trained Q-network, of `sizes` and `tensors`: what it says of a map's moves."""
+    """A trained Q-network: what its tensors say of a map's moves.
+
+    Parameters
+    ----------
+    sizes : mapping of str to int
+        A size for each of `size_names`, such as the filters.
+    tensors : mapping of str to array
+        The weights and biases, by name; their shapes follow from the sizes.
+    """
 
     name: ClassVar[str]  # in model files and hyper-parameters
     size_names: ClassVar[tuple[str, ...]]
@@ -82,21 +90,25 @@ class QNetwork:
         return None
 
     def move_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts | None:
-        """Return the costs of a map's moves; None unless proved that they are right.
+        """Return the costs of a map's moves, or None.
 
-        Then exactly the legal moves are possible.
+        None means that it is not proved of the network that exactly the legal moves are
+        possible.
         """
         return None
 
     def q_values(self, grid: GridMap, goal: Cell, move_rule: MoveRule) -> Array:
         """Return Q(s, a) of every cell toward one goal: (8, H, W).
 
-        Networks whose Q follows from costs of moves do not have it.
+        Networks whose Q follows from costs of moves do not have this method.
         """
         raise NotImplementedError
 
     def _layer(self, name: str, input_BI: Array) -> Array:
-        """Return the O outputs of a fully connected layer for B inputs: (B, O)."""
+        """Return the O outputs of a fully connected layer for B rows of inputs: (B, O).
+
+        The layer's tensors are `name`.weight, (O, I), and `name`.bias.
+        """
         with np.errstate(
             over="ignore", invalid="ignore"
         ):  # a broken model may overflow
@@ -108,7 +120,11 @@ class QNetwork:
 def observation_background(
     occupancy: NDArray[np.bool_], goal: Cell
 ) -> NDArray[np.float32]:
-    """Return the value of each cell in the observation without the robot: (H * W,)."""
+    """Return the value of each cell in the observation without the robot: (H * W,).
+
+    The observation is what the paper's network sees. `occupancy` is (H, W), `goal`
+    (x, y).
+    """
     background = np.where(occupancy, OBSTACLE, FREE).astype(np.float32)
     background[goal[1], goal[0]] = GOAL
     return background.ravel()
@@ -134,9 +150,9 @@ class PaperQNetwork(QNetwork):
         of every second row.
         """
         filters = sizes["filters"]
-        units = sizes["hidden_units"]
+        units = sizes["hidden_units"]  # 0 for no hidden layer
         windows = ((sizes["height"] + 1) // 2) * ((sizes["width"] + 1) // 2)
-        features = filters * windows
+        features = filters * windows  # outputs of the convolution
         layers: dict[str, tuple[int, ...]] = {"convolution": (filters, 1, 3, 3)}
         if units:
             layers["hidden"] = (units, features)
@@ -154,30 +170,32 @@ class PaperQNetwork(QNetwork):
         """
         # In double precision: differences of large sums stay exact enough, and do not
         # overflow.
-        weights = {
+        tensors = {
             name: self.tensors[name].astype(np.float64)
             for name in self.shapes(self.sizes)
         }
-        has_hidden_layer = self.sizes["hidden_units"] > 0
-        layer = "hidden" if has_hidden_layer else "fully_connected"
-        output_CU = _outputs_by_robot_cell(grid, goal, weights, layer)
-        if has_hidden_layer:
+        # Shapes: C = cells where the robot may be, and one that stands for all outside
+        # the map; U = hidden units, A = 8 actions.
+        if self.sizes["hidden_units"] > 0:
+            output_CU = _outputs_by_robot_cell(grid, goal, tensors, "hidden")
             hidden_CU = np.maximum(output_CU, 0)
-            last_UA = weights["fully_connected.weight"].T
-            output_CU = hidden_CU @ last_UA + weights["fully_connected.bias"]
-        q_CA = output_CU[:-1]  # without the cell that stands for all outside the map
+            last_UA = tensors["fully_connected.weight"].T
+            output_CA = hidden_CU @ last_UA + tensors["fully_connected.bias"]
+        else:
+            output_CA = _outputs_by_robot_cell(grid, goal, tensors, "fully_connected")
+        q_CA = output_CA[:-1]  # without the cell that stands for all outside the map
         with np.errstate(over="ignore"):
             q_AC: Array = q_CA.T.astype(np.float32)
         return q_AC.reshape(-1, *grid.occupancy.shape)
 
 
 def _outputs_by_robot_cell(
-    grid: GridMap, goal: Cell, weights: Mapping[str, NDArray[np.float64]], layer: str
+    grid: GridMap, goal: Cell, tensors: Mapping[str, NDArray[np.float64]], layer: str
 ) -> NDArray[np.float64]:
-    """Return the outputs of the layer after the convolution by robot's cell: (C, U).
+    """Return what a layer after the convolution gives for a robot in each cell: (C, U).
 
-    The layer is linear, so its output is that for the observation without a robot, plus
-    the changes in the few windows of the convolution that contain the robot.
+    The layer is linear. So its output is that for the observation without a robot, plus
+    a change for each window of the convolution that contains the robot's cell.
 
     Shapes: C = cells, and at the end one that stands for all outside the map, L =
     windows of 9 cells, F = filters, U = outputs of the layer.
@@ -186,41 +204,44 @@ def _outputs_by_robot_cell(
     ----------
     grid : GridMap
     goal : (x, y)
-    weights : mapping of str to float64 array
+    tensors : mapping of str to float64 array
         The network's tensors, by their names.
     layer : str
         The name of the layer.
     """
-    kernel_9F = weights["convolution.weight"].reshape(-1, 9).T
-    bias_F = weights["convolution.bias"]
-    cell_L9 = window_cells(grid.occupancy.shape)
+    kernel_9F = tensors["convolution.weight"].reshape(-1, 9).T
+    bias_F = tensors["convolution.bias"]
+    cell_L9 = window_cells(grid.occupancy.shape)  # the cells of each window
     # The layer's weights have the shape (U, F * L) in the file.
-    weight_UFL = weights[f"{layer}.weight"].reshape(-1, len(bias_F), len(cell_L9))
+    weight_UFL = tensors[f"{layer}.weight"].reshape(-1, len(bias_F), len(cell_L9))
     weight_LFU = weight_UFL.T.copy()
 
-    # Without the robot. Cells outside the map have the value 0.
+    # 1. Without the robot. Cells outside the map have the value 0.
     background_C = np.append(observation_background(grid.occupancy, goal), 0.0)
     value_L9 = background_C[cell_L9]
     sum_LF = value_L9 @ kernel_9F + bias_F
     feature_LF = np.maximum(sum_LF, 0)
-    output_U = weights[f"{layer}.bias"] + np.tensordot(feature_LF, weight_LFU, 2)
+    output_U = tensors[f"{layer}.bias"] + np.tensordot(feature_LF, weight_LFU, 2)
 
-    # With a robot in each of the 9 cells of each window.
+    # 2. With the robot in one of the 9 cells of a window, which then has another value.
     increase_L9F = (ROBOT - value_L9)[..., None] * kernel_9F
     feature_L9F = np.maximum(sum_LF[:, None] + increase_L9F, 0)
     change_L9U = (feature_L9F - feature_LF[:, None]) @ weight_LFU
+
+    # 3. Each cell of the map gets the changes of all windows in which it lies. No cell
+    # of the map has the same number in two windows: so no index of it occurs twice.
     output_CU = np.tile(output_U, (len(background_C), 1))
-    for place in range(9):
-        # No cell of the map lies at the same place of two windows.
-        output_CU[cell_L9[:, place]] += change_L9U[:, place]
+    for number in range(9):  # of a cell in its window
+        output_CU[cell_L9[:, number]] += change_L9U[:, number]
     return output_CU
 
 
 def window_cells(shape: tuple[int, int]) -> NDArray[np.int64]:
-    """Return the numbers y * W + x of the cells of each window, (L, 9).
+    """Return the numbers y * W + x of the 9 cells of each window: (L, 9).
 
-    A window of the convolution is a square of 3x3 cells around every second cell of
-    every second row. The number H * W stands for all cells outside the map.
+    The windows of the convolution are squares of 3x3 cells around every second cell of
+    every second row of a map of shape (H, W). The number H * W stands for all cells
+    outside the map.
     """
     cells = shape[0] * shape[1]
     padded = np.pad(np.arange(cells).reshape(shape), 1, constant_values=cells)
@@ -247,13 +268,14 @@ class PropagationQNetwork(QNetwork):
     )
 
     def __init__(self, sizes: Mapping[str, int], tensors: Mapping[str, Array]) -> None:
+        """Keep the tensors, and set tiny weights of cost multipliers to 0."""
         super().__init__(sizes, tensors)
         for name, tensor in tensors.items():
             if name.startswith("prices"):
                 self.tensors[name] = np.where(np.abs(tensor) < NOISE, 0, tensor)
-        # These hold for all maps, so they are computed once: by the rules, and by the
-        # arguments of `_proved_costs`. A cache of a bound method would keep the network
-        # in a cycle.
+        # What is proved holds for all maps, so it is computed once: certificates by the
+        # rules, costs by the arguments of `_proved_costs`. A cache of a bound method
+        # would keep the network in a cycle of references.
         self._certificates: dict[tuple[MoveRule, ...], Certificate] = {}
         self._proved: dict[tuple[MoveRule, bool, bool], MoveCosts | None] = {}
 
@@ -272,10 +294,12 @@ class PropagationQNetwork(QNetwork):
 
     @classmethod
     def features(cls, patch_B9: NDArray[np.int8], move_rule: MoveRule) -> Array:
-        """Return the I inputs of the network for B patches, see `patches`: (B, I).
+        """Return the I inputs of the network for B patches: (B, I).
 
-        Without costs I = 9: whether each cell is occupied. With costs I = 28: then each
-        cell's cost, 0 to 0.99, whether it is unknown, and whether corners are cut.
+        `patch_B9` has the cells of each patch: costs -1 (unknown) to 99, or 100 for
+        occupied. A network without costs has 9 inputs, whether each cell is occupied.
+        One with costs has 28: the same 9, each cell's cost from 0 to 0.99, whether each
+        cell is unknown, and whether corners may be cut.
         """
         occupied_B9 = patch_B9 == OCCUPIED
         if not cls.uses_costs:
@@ -293,10 +317,11 @@ class PropagationQNetwork(QNetwork):
 
         `feature_BI` has the inputs for B patches; see `features`.
         """
-        hidden_BF = np.maximum(self._layer("convolution", feature_BI), 0)
-        hidden_BF = np.maximum(self._layer("hidden", hidden_BF), 0)
+        filtered_BF = np.maximum(self._layer("convolution", feature_BI), 0)
+        hidden_BF = np.maximum(self._layer("hidden", filtered_BF), 0)
+        logit_BA = self._layer("moves", hidden_BF)
         # The sigmoid function, without overflow.
-        p_BA: Array = 0.5 + 0.5 * np.tanh(0.5 * self._layer("moves", hidden_BF))
+        p_BA: Array = 0.5 + 0.5 * np.tanh(0.5 * logit_BA)
         return p_BA
 
     def tries(self, feature_BI: Array) -> Array:
@@ -312,7 +337,10 @@ class PropagationQNetwork(QNetwork):
         return tries_BA
 
     def multiplier(self, feature_BI: Array) -> Array:
-        """Return the cost multiplier of each move in B patches, 1 or more: (B, 8)."""
+        """Return the cost multiplier of each move in B patches, 1 or more: (B, 8).
+
+        `feature_BI` has the inputs for B patches; see `features`.
+        """
         if not self.uses_costs:
             return np.ones((len(feature_BI), len(MOVES)), dtype=np.float32)
         multiplier_BA: Array = 1 + np.maximum(self._layer("prices", feature_BI), 0)
@@ -329,13 +357,14 @@ class PropagationQNetwork(QNetwork):
         return self._certificates[rules]
 
     def move_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts | None:
-        """Return the costs of a map's moves, or None if other than legal are possible.
+        """Return the costs of a map's moves, or None.
 
-        Where the map has expected times, its slowness replaces its costs.
+        None means that the network takes an illegal move for possible, or a legal move
+        for impossible. On a map of expected times, its slowness replaces its costs.
         """
         has_times = grid.slowness is not None
         with_costs = self.uses_costs and grid.cost is not None and not has_times
-        key = move_rule, with_costs, has_times
+        key = move_rule, with_costs, has_times  # what costs for any map depend on
         if key not in self._proved:
             self._proved[key] = self._proved_costs(move_rule, with_costs, has_times)
         costs = self._proved[key]
@@ -352,6 +381,7 @@ class PropagationQNetwork(QNetwork):
         with_costs, has_times : bool
             Whether the costs, or the expected times, of a map's cells count.
         """
+        # P = 512 patches without costs, A = 8 actions
         patch_P9 = every_patch()
         legal_PA = legal_in_patches(patch_P9, move_rule)
         if with_costs:
@@ -364,10 +394,13 @@ class PropagationQNetwork(QNetwork):
     def _sums_of_prices(
         self, move_rule: MoveRule, legal_PA: NDArray[np.bool_]
     ) -> MoveCosts | None:
-        """Return costs as sums over a move's two cells, or None if they are none.
+        """Return costs for any map, whose multipliers are sums over a move's two cells.
+
+        Return None if the network's multipliers are no such sums, or its moves are not
+        proved.
 
         Shapes: 9 = the cells of a patch, A = 8 actions, L = the codes of a cell's cost
-        (0 unknown, 1 to 100 for costs 0 to 99, 101 occupied).
+        (0 unknown, 1 to 100 for costs 0 to 99, 101 occupied), P = 512 patches.
 
         Parameters
         ----------
@@ -377,46 +410,49 @@ class PropagationQNetwork(QNetwork):
         """
         if not self.certificate(move_rule).proved:
             return None
+        # A multiplier is 1 plus the terms of the 9 cells around a move.
         term_9AL = self._price_terms(move_rule)
         action_A = np.arange(len(MOVES))
-        # (A,): the cell of the patch of 3 x 3 to which each move leads.
-        target_A = CENTRE + MOVES @ [1, 3]
+        target_A = CENTRE + MOVES @ [1, 3]  # the cell to which each move leads, 0 to 8
         # The terms of the cell before a move, and of the cell after it.
         term_2AL = np.stack([term_9AL[CENTRE], term_9AL[target_A, action_A]])
-        # No move leads to an occupied cell: its term has no meaning.
+        # No move leads to an occupied cell, so any term will do for it.
         term_2AL[..., OCCUPIED_CODE] = term_2AL[..., OCCUPIED_CODE - 1]
+        # The terms of all other cells should be 0.
         other_9AL = term_9AL.copy()
         other_9AL[CENTRE] = 0
         other_9AL[target_A, action_A] = 0
-        highest_A = 1 + term_2AL.max(axis=2).sum(axis=0)
-        highest = float(highest_A.max())
-        if other_9AL.any() or term_2AL.min() < 0 or highest > MAX_MULTIPLIER:
-            return None  # the cost of a move does not follow from its two cells
+        highest_multiplier_A = 1 + term_2AL.max(axis=2).sum(axis=0)
+        highest_multiplier = float(highest_multiplier_A.max())
+        is_right = not other_9AL.any() and term_2AL.min() >= 0
+        if not is_right or highest_multiplier > MAX_MULTIPLIER:
+            return None
         lengths_PA = np.where(legal_PA, LENGTHS, np.inf).astype(np.float32)
         costs = MoveCosts.of_table(lengths_PA)
         half = np.float32(0.5)  # of the 1 to which both terms are added
         return costs._replace(
             terms=term_2AL.ravel() + half,
-            highest=costs.highest * highest,
+            highest=costs.highest * highest_multiplier,
             least_by_cost_code=_least_multipliers(term_2AL),
         )
 
     def _price_terms(self, move_rule: MoveRule) -> Array:
-        """Return what a cell of the patch adds to a cost multiplier: (9, 8, L).
+        """Return what each cell of the patch adds to a cost multiplier: (9, 8, L).
 
         The indices are the cell, the action and the code of the cell's cost: 0 unknown,
         1 to 100 for costs 0 to 99, 101 occupied. The layer is linear, so a multiplier
         is 1 plus the sum of these terms over the cells.
         """
         weight_AI = self.tensors["prices.weight"]
-        cells_weight_AI = weight_AI[:, :27]  # without the weight of the move rule
-        occupied_9A, cost_9A, unknown_9A = cells_weight_AI.T.reshape(3, 9, -1)
-        share_of_costs = np.arange(OCCUPIED) / 100  # of the costs 0 to 99
+        # The weights of the inputs for the 9 cells, without that of the move rule.
+        weight_of_cells_AI = weight_AI[:, :27]
+        occupied_9A, cost_9A, unknown_9A = weight_of_cells_AI.T.reshape(3, 9, -1)
+        share_of_costs = np.arange(OCCUPIED) / 100  # the inputs for costs 0 to 99
         term_9AL = np.empty((9, len(MOVES), COST_CODES), dtype=np.float32)
         term_9AL[..., 0] = unknown_9A
         term_9AL[..., 1:OCCUPIED_CODE] = cost_9A[..., None] * share_of_costs
         term_9AL[..., OCCUPIED_CODE] = occupied_9A
-        # The terms that do not depend on a cell count with the centre.
+        # What depends on no cell, bias and rule, is added to the terms of the centre.
         rule_A = weight_AI[:, 27] * move_rule.cuts_corners
         term_9AL[CENTRE] += (self.tensors["prices.bias"] + rule_A)[:, None]
         return term_9AL
@@ -444,9 +480,9 @@ class PropagationQNetwork(QNetwork):
     ) -> Array:
         """Return each move's cost in P patches, infinite if not possible: (P, 8).
 
-        The patches are evaluated in batches of B; I = inputs, A = 8 actions.
-        For a map with times the cost is the length times the tries, without the
-        multiplier, which follows from the times.
+        The cost is the move's length times its expected tries and its multiplier. For a
+        map with expected times it is without the multiplier, which follows from the
+        times. The patches are evaluated in batches of B; I = inputs, A = 8 actions.
         """
         costs = []
         for batch_B9 in np.split(patch_P9, range(BATCH, len(patch_P9), BATCH)):
@@ -461,12 +497,13 @@ class PropagationQNetwork(QNetwork):
 
 
 def _least_multipliers(term_2AL: Array) -> Array:
-    """Return the least multiplier on a map by the least cost code of its cells: (L,).
+    """Return a lower bound of the multipliers on a map, by its least cost code: (L,).
 
-    `term_2AL` has the terms of the cell before a move and of the cell after it, by
-    action and cost code.
+    Element c holds for maps of which each cell has the cost code c, a greater one, or 0
+    for unknown. `term_2AL` has what the cell before a move and the cell after it add to
+    the multiplier, by action and cost code.
     """
-    # A cell of such a map has the least code, a greater code, or 0 for unknown.
+    # The least term of the codes from each code on: from the greatest code down.
     greatest_first_2AL = term_2AL[..., ::-1]
     least_known_2AL = np.minimum.accumulate(greatest_first_2AL, axis=2)[..., ::-1]
     unknown_2A1 = term_2AL[..., :1]
