@@ -100,38 +100,40 @@ def certify(
 ) -> Certificate:
     """Prove which moves a network takes for possible; bound its costs' errors.
 
-    A decision is whether an action is possible where the cells of a 3x3 patch are
-    occupied so, under a rule. It is proved if it is right for all costs of the free
-    cells, and for all unknown cells among them.
+    A decision is whether an action is possible in a pattern, that is where certain
+    cells of a 3x3 patch are occupied, under a rule. It is proved if it is right for all
+    costs of the free cells, and whichever of them are unknown.
     """
-    # Shapes: P = the 512 patches of each rule, then only those with a free centre, A =
-    # 8 actions, I = inputs, 9 = the cells of a patch.
-    every_P9 = every_patch()
-    features = [network.features(every_P9, rule) for rule in move_rules]
-    legal_PA = np.concatenate([legal_in_patches(every_P9, rule) for rule in move_rules])
-    is_free_P = np.tile(every_P9[:, CENTRE] != OCCUPIED, len(move_rules))
-    decisions = int(is_free_P.sum()) * len(MOVES)
+    # Shapes: Q = the 512 patches of each rule, P = patterns, those of the patches whose
+    # centre is free, A = 8 actions, I = inputs, 9 = the cells of a patch.
+    patch_Q9 = every_patch()
+    features = [network.features(patch_Q9, rule) for rule in move_rules]
+    legal_QA = np.concatenate([legal_in_patches(patch_Q9, rule) for rule in move_rules])
+    is_pattern_Q = np.tile(patch_Q9[:, CENTRE] != OCCUPIED, len(move_rules))
+    decisions = int(is_pattern_Q.sum()) * len(MOVES)
     if network.sizes["filters"] > MAX_FILTERS:
         return Certificate(decisions, decisions, 0, 0.0, math.inf)
     with np.errstate(over="ignore", invalid="ignore"):  # a broken model may overflow
         # All patches of a rule at once, as in the planner: so the floats are equal.
-        tries_PA = np.concatenate([network.tries(inputs) for inputs in features])
-        tries = float(tries_PA[legal_PA].max())
-        feature_PI = np.concatenate(features)[is_free_P]
-        legal_PA = legal_PA[is_free_P]
+        tries_QA = np.concatenate([network.tries(inputs) for inputs in features])
+        most_tries = float(tries_QA[legal_QA].max())
+        feature_PI = np.concatenate(features)[is_pattern_Q]
+        legal_PA = legal_QA[is_pattern_Q]
         margins = logit_margins(network, feature_PI, legal_PA)
-        right_PA = margins.margin > 0  # False for NaN
-        wrong = _count_wrong(network, feature_PI, legal_PA, margins, ~right_PA)
+        is_proved_PA = margins.margin > 0  # False for NaN
+        wrong = _count_wrong(network, feature_PI, legal_PA, margins, ~is_proved_PA)
         error = _multiplier_error(network, feature_PI, legal_PA)
-    open_decisions = int(np.count_nonzero(~right_PA))
-    margin = float(margins.margin[right_PA].min()) if right_PA.any() else 0.0
+    open_decisions = int(np.count_nonzero(~is_proved_PA))
+    margin = 0.0
+    if is_proved_PA.any():
+        margin = float(margins.margin[is_proved_PA].min())
     return Certificate(
         decisions=decisions,
         undecided=open_decisions - wrong,
         wrong=wrong,
         margin=margin,
         multiplier_error=error,
-        tries=tries,
+        tries=most_tries,
     )
 
 
@@ -156,8 +158,9 @@ def _count_wrong(
 ) -> int:
     """Return how many open decisions are wrong for the costs of the least margin.
 
-    The network itself is asked, with one example of costs for each open decision.
-    Shapes: P patterns, A = 8 actions, I inputs, B open decisions.
+    A decision is whether an action is possible in a pattern of occupied cells. For each
+    open one, the network itself decides, with the costs where its bound is worst.
+    Shapes: P patterns, A = 8 actions, I inputs, B open decisions, 9 cells of a patch.
 
     Parameters
     ----------
@@ -165,24 +168,28 @@ def _count_wrong(
     feature_PI : (P, I) float32
         The inputs of each pattern.
     legal_PA : (P, A) bool
+        Which actions are legal: these should be possible, and no others.
     margins : Margins
+        What each cost or unknown cell adds to the bound of a decision.
     open_PA : (P, A) bool
         The decisions that are not proved; B of them.
     """
     pattern_B, action_B = np.nonzero(open_PA)
-    # The margin is least where each free cell has the cost 0, the greatest cost, or is
-    # unknown: (3, 9, B), what these add for each cell of the patch. A network that does
-    # not observe costs has (1, 9, B), and its examples have costs of 0.
+    # 1. The costs of the least margin: each free cell has a cost of 0, the greatest
+    # cost, or is unknown. A cost of 0 adds nothing to the margin. A network that does
+    # not observe costs has gains (0, 9, B): its examples have costs of 0.
     gain_29PA = margins.gain.reshape(-1, 9, *legal_PA.shape)
     gain_29B = gain_29PA[:, :, pattern_B, action_B]
-    gain_39B = np.pad(gain_29B, ((1, 0), (0, 0), (0, 0)))  # a cost of 0 adds nothing
+    gain_39B = np.pad(gain_29B, ((1, 0), (0, 0), (0, 0)))
     value_3 = np.array([0, OCCUPIED - 1, UNKNOWN], np.int8)
     worst_B9 = value_3[gain_39B.argmin(axis=0)].T
+    # 2. The inputs of a patch with these costs and the pattern's occupied cells, for
+    # the pattern's own move rule.
     occupied_B9 = feature_PI[pattern_B, OCCUPIED_INPUTS] > 0
     example_B9 = np.where(occupied_B9, OCCUPIED, worst_B9)
     example_BI = network.features(example_B9, MOVE_RULES[0])
-    # The pattern was made for its own move rule.
     example_BI[:, RULE_INPUTS] = feature_PI[pattern_B, RULE_INPUTS]
+    # 3. The network's decision for it.
     success_BA = network.success(example_BI)
     is_possible_B = success_BA[np.arange(len(action_B)), action_B] > 0.5
     is_legal_B = legal_PA[pattern_B, action_B]
@@ -192,31 +199,38 @@ def _count_wrong(
 def logit_margins(
     network: PropagationQNetwork, feature_PI: Float32, legal_PA: NDArray[np.bool_]
 ) -> Margins:
-    """Bound how far each logit is on its right side of 0.
+    """Bound how far each logit is on its right side of 0, for all costs.
 
-    Shapes: P patterns, A = 8 actions, F filters, I inputs, C = 18 of these for costs
-    and unknown cells.
+    The logit of an action is the number from which the network computes the action's
+    probability. It should be above 0 for a legal action, and below 0 for any other.
+
+    Shapes: P patterns of occupied cells, A = 8 actions, F filters, I inputs, C = 18 of
+    these for costs and unknown cells.
 
     Parameters
     ----------
     network : PropagationQNetwork
+        Its layers are convolution, hidden and moves, with a ReLU between two layers.
     feature_PI : (P, I) float32
         The inputs of each pattern; those for costs and unknown cells are 0.
     legal_PA : (P, A) bool
-        Which actions are legal: their logits should be above 0.
+        Which actions are legal.
     """
     tensors = {
         name: tensor.astype(np.float64) for name, tensor in network.tensors.items()
     }
-    first, second = _lines_of_layers(tensors, feature_PI)
+    lines_of_convolution, lines_of_hidden = _lines_of_layers(tensors, feature_PI)
 
-    # Two lines enclose a ReLU, so two linear functions enclose a logit (CROWN, Zhang et
-    # al. 2018). From the logits, each with its right sign, back through the layers:
-    # logit >= bound + weight @ the layer's ReLUs.
+    # 1. A lower bound of each logit that is linear in the inputs (CROWN, Zhang et al.
+    # 2018). It is computed from the logits back through the layers; at each layer,
+    # sign * logit >= bound + weight @ the outputs of the layer's ReLUs.
     sign_AP = np.where(legal_PA, 1.0, -1.0).T
     bound_AP = sign_AP * tensors["moves.bias"][:, None]
     weight_APF = sign_AP[..., None] * tensors["moves.weight"][:, None]
-    for layer, lines in (("hidden", second), ("convolution", first)):
+    for layer, lines in (
+        ("hidden", lines_of_hidden),
+        ("convolution", lines_of_convolution),
+    ):
         # Each ReLU is replaced by a line: with a negative weight by the line above it,
         # with a positive weight by the line below.
         bound_AP += (np.minimum(weight_APF, 0) * lines.distance).sum(axis=2)
@@ -225,17 +239,19 @@ def logit_margins(
         bound_AP += weight_APF @ tensors[f"{layer}.bias"]
         weight_APF = weight_APF @ tensors[f"{layer}.weight"]
     weight_API = weight_APF  # after the first layer, the weights of the inputs
-
     bound_AP += (weight_API * feature_PI).sum(axis=2)
+
+    # 2. The least that costs and unknown cells may add, and rounding errors.
     gain_CPA = weight_API[..., COSTS].transpose(2, 1, 0)
     least_sum_PA, _ = _extremes(gain_CPA, feature_PI)
     greatest_of_input = [
         ("convolution", np.ones_like(feature_PI[0])),
-        ("hidden", first.greatest),
-        ("moves", second.greatest),
+        ("hidden", lines_of_convolution.greatest),
+        ("moves", lines_of_hidden.greatest),
     ]
     rounding_A = _rounding_error(network, greatest_of_input)
-    return Margins(bound_AP.T + least_sum_PA - rounding_A, gain_CPA)
+    margin_PA = bound_AP.T + least_sum_PA - rounding_A
+    return Margins(margin_PA, gain_CPA)
 
 
 def _lines_of_layers(
@@ -247,43 +263,54 @@ def _lines_of_layers(
     unknown cells. With one slope for both lines around a ReLU, one product gives the
     bounds of the hidden layer (Fast-Lin, Weng et al. 2018).
 
-    Shapes: P patterns, F filters, I inputs, C = 18 of these for costs and unknown
-    cells. `feature_PI` has the inputs of each pattern; those for costs are 0.
+    Shapes: P patterns of occupied cells, F filters, I inputs, C = 18 of these for costs
+    and unknown cells.
+
+    Parameters
+    ----------
+    tensors : dict of str to float64 array
+        The weights (outputs, inputs) and the biases of the network's layers.
+    feature_PI : (P, I) float32
+        The inputs of each pattern; those for costs and unknown cells are 0.
     """
     # Copies, as products with transposed arrays are slow.
     weight_IF = tensors["convolution.weight"].T.copy()
     hidden_FF = tensors["hidden.weight"].T.copy()
-    base_PF = feature_PI @ weight_IF + tensors["convolution.bias"]  # without costs
+    # 1. The convolution: its outputs without costs, and what costs may add.
+    base_PF = feature_PI @ weight_IF + tensors["convolution.bias"]
     least_PF, greatest_PF = _extremes(weight_IF[COSTS, None], feature_PI)
-    first = _Lines(base_PF + least_PF, base_PF + greatest_PF)
+    lines_of_convolution = _Lines(base_PF + least_PF, base_PF + greatest_PF)
 
-    # With the upper line's slope for both lines, only their distance differs.
-    base_PF = (first.slope * base_PF) @ hidden_FF + tensors["hidden.bias"]
-    weight_CPF = (first.slope * weight_IF[COSTS, None]) @ hidden_FF
+    # 2. The hidden layer. A ReLU of the convolution is replaced by its lower line; the
+    # upper line, with the same slope, lies above it by `distance`.
+    slope_PF = lines_of_convolution.slope
+    distance_PF = lines_of_convolution.distance
+    base_PF = (slope_PF * base_PF) @ hidden_FF + tensors["hidden.bias"]
+    weight_CPF = (slope_PF * weight_IF[COSTS, None]) @ hidden_FF
     least_PF, greatest_PF = _extremes(weight_CPF, feature_PI)
-    least_PF += first.distance @ np.minimum(hidden_FF, 0)
-    greatest_PF += first.distance @ np.maximum(hidden_FF, 0)
-    second = _Lines(base_PF + least_PF, base_PF + greatest_PF)
-    return first, second
+    least_PF += distance_PF @ np.minimum(hidden_FF, 0)
+    greatest_PF += distance_PF @ np.maximum(hidden_FF, 0)
+    lines_of_hidden = _Lines(base_PF + least_PF, base_PF + greatest_PF)
+    return lines_of_convolution, lines_of_hidden
 
 
 class _Lines:
     """Lines around the ReLUs of a layer, whose inputs are bounded.
 
-    Above a ReLU of x lies slope * x + distance. Below it lies slope * x, and also
-    lower_slope * x, which fits better.
+    The ReLU of x, max(x, 0), lies below the line slope * x + distance. It lies above
+    the line slope * x, and also above lower_slope * x, which fits better.
     """
 
     def __init__(self, least_PF: Float64, greatest_PF: Float64) -> None:
-        """Take the least and the greatest input of each ReLU, for P patterns."""
+        """Take the least and the greatest input of each of F ReLUs, for P patterns."""
         greatest_output_PF = np.maximum(greatest_PF, 0)
-        below_0_PF = np.minimum(least_PF, 0)
-        # The upper line leads from (least, 0) to (greatest, greatest) if these lie on
-        # both sides of 0. The tiny divisor stands for 0 where no input is above 0.
+        below_0_PF = np.minimum(least_PF, 0)  # the part of the inputs below 0
+        # If an input may have both signs, the upper line leads from the point (least,
+        # 0) to (greatest, greatest). Else it is the ReLU itself: x, or 0. A tiny
+        # divisor takes the place of 0 where no input differs from 0.
         width_PF = greatest_output_PF - below_0_PF
-        self.slope = greatest_output_PF / np.maximum(
-            width_PF, np.finfo(np.float64).tiny
-        )
+        tiny = np.finfo(np.float64).tiny
+        self.slope = greatest_output_PF / np.maximum(width_PF, tiny)
         self.distance = -below_0_PF * self.slope
         self.lower_slope = (greatest_PF > -least_PF).astype(np.float64)  # 0 or 1
         # (F,): the greatest output of each ReLU for all patterns.
@@ -291,19 +318,23 @@ class _Lines:
 
 
 def _extremes(weight_CPU: Float64, feature_PI: Float32) -> tuple[Float64, Float64]:
-    """Return the least and greatest weighted sums of costs and unknowns: (P, U).
+    """Return the least and the greatest sum that costs and unknown cells may add.
+
+    Both are (P, U), for U outputs of a layer in P patterns of occupied cells.
 
     Parameters
     ----------
     weight_CPU : (18, P or 1, U)
-        The weights of the 9 inputs for costs, then of the 9 for unknown cells.
+        The weights of the 9 inputs for costs, 0 to 0.99, then of the 9 that are 1 for
+        unknown cells; or (0, ...) for a network without such inputs.
     feature_PI : (P, I) float32
-        The inputs of each pattern, which tell the occupied cells.
+        The inputs of each pattern. The first 9 are 1 for occupied cells.
     """
-    cells = len(weight_CPU) // 2
+    cells = len(weight_CPU) // 2  # 9, or 0
     is_free_9P1 = 1 - feature_PI.T[:cells, :, None]
     weight_29PU = weight_CPU.reshape(2, cells, *weight_CPU.shape[1:])
-    # A free cell adds from 0 to the weight of its cost, or the weight for unknown.
+    # A free cell of a cost adds at most the weight of its cost, an unknown cell the
+    # weight for unknown, and a free cell of cost 0 adds 0.
     term_29PU = weight_29PU * is_free_9P1
     least_9PU = term_29PU.min(axis=0, initial=0)
     greatest_9PU = term_29PU.max(axis=0, initial=0)
@@ -324,24 +355,27 @@ def _multiplier_error(
     feature_PI : (P, I) float32
         The inputs of each pattern; those for costs and unknown cells are 0.
     legal_PA : (P, A) bool
+        Which actions are legal in each pattern.
     """
-    if not network.uses_costs:  # 1 instead of at most the greatest multiplier
+    if not network.uses_costs:  # it gives 1 in place of MAX_COST_MULTIPLIER at most
         return 1 - 1 / MAX_COST_MULTIPLIER
     weight_IA = network.tensors["prices.weight"].T.astype(np.float64, order="C")
     bias_A = network.tensors["prices.bias"].astype(np.float64)
-    # Every pair of costs of a move's two cells is tried. The layer should add nothing
-    # for the other inputs: their least and greatest sums are enough.
+    # 1. Which inputs are those of a move's two cells: of the 3x3 patch, the cell before
+    # the move and the cell after it.
     action_A = np.arange(len(MOVES))
-    # (2, A): the cell of the 3x3 patch before each move, and the cell after it.
-    cell_2A = CENTRE + np.outer([0, 1], MOVES @ [1, 3])
+    cell_2A = CENTRE + np.outer([0, 1], MOVES @ [1, 3])  # 0 to 8
     cost_input_2A = COSTS.start + cell_2A
     unknown_input_2A = cost_input_2A + 9
+    # 2. What the other inputs add: they should add nothing, so their least and greatest
+    # sums are enough.
     other_weight_IA = weight_IA.copy()
     for input_2A in (cell_2A, cost_input_2A, unknown_input_2A):
         other_weight_IA[input_2A, action_A] = 0
     base_PA = feature_PI @ other_weight_IA + bias_A
     least_PA, greatest_PA = _extremes(other_weight_IA[COSTS, None], feature_PI)
     size_A = np.abs(other_weight_IA).sum(axis=0) + np.abs(bias_A)
+    # 3. For each rule and action, every pair of costs of the two cells is tried.
     errors = [0.0]
     for cuts_corners in (False, True):
         legal_of_rule_PA = legal_PA & (feature_PI[:, -1:] == cuts_corners)
@@ -382,16 +416,18 @@ def _error_of_pairs(
     ----------
     cost_weight_2 : (2,)
         The weights of the inputs for the costs of the cell before and the cell after.
-        The input for a cost is the cost / 100.
+        The input for a cost of 0 to 99 is a hundredth of the cost.
     unknown_weight_2 : (2,)
         The weights of the inputs that are 1 if the cell before, or after, is unknown.
     other_inputs : _OtherInputs
         The bounds of all that is added for other inputs.
     """
-    share_V = _terms_of_values(1.0, 1.0)  # of the greatest surcharge
-    mean_share_VV = (share_V[:, None] + share_V) / 2  # rows: before, columns: after
+    # 1. The true multipliers, by the value of the cell before and of the cell after.
+    share_V = _terms_of_values(1.0, 1.0)  # of the greatest surcharge, 0 to 1
+    mean_share_VV = (share_V[:, None] + share_V) / 2
     true_VV = 1 + (MAX_COST_MULTIPLIER - 1) * mean_share_VV
 
+    # 2. The network's multipliers lie between bounds; by how much these err.
     before_V = _terms_of_values(cost_weight_2[0], unknown_weight_2[0])
     after_V = _terms_of_values(cost_weight_2[1], unknown_weight_2[1])
     sum_VV = before_V[:, None] + after_V
@@ -400,7 +436,7 @@ def _error_of_pairs(
     excess_VV = greatest_VV - true_VV
     shortfall_VV = (true_VV - 1) - least_surcharge_VV
 
-    # The planner adds the terms and the 1 in float32, with a rounding error each time.
+    # 3. The planner adds the terms and the 1 in float32, with an error each time.
     size_of_pair_VV = 1 + np.abs(before_V)[:, None] + np.abs(after_V)
     size_VV = size_of_pair_VV + other_inputs.sum_of_sizes
     rounding_VV = TERMS_OF_MULTIPLIER * ROUNDING * size_VV
@@ -417,17 +453,20 @@ def _terms_of_values(cost_weight: float, unknown_weight: float) -> Float64:
 def _rounding_error(
     network: PropagationQNetwork, greatest_of_input: Sequence[tuple[str, Float32]]
 ) -> Float32:
-    """Bound the rounding errors of the U outputs of the last of some layers: (U,).
+    """Bound the float32 rounding errors of the outputs of the last layer: (U,).
 
     Parameters
     ----------
     network : PropagationQNetwork
-    greatest_of_input : sequence of (str, (I,))
-        The layers in their order, and the greatest value of each input of the layer.
+        Has a layer of I inputs and U outputs for each of the names.
+    greatest_of_input : sequence of (str, (I,) float32)
+        The names of the layers, from the first one on, and the greatest value of each
+        input of the layer. A layer's outputs, through ReLUs, are the inputs of the
+        next.
     """
     # In float32, too: so the bound is infinite where the layers may overflow.
     _, greatest_of_first_layer_I = greatest_of_input[0]
-    error_I = np.zeros_like(greatest_of_first_layer_I)  # of the layer's inputs
+    error_I = np.zeros_like(greatest_of_first_layer_I)  # the first inputs are exact
     for layer, greatest_I in greatest_of_input:
         weight_UI = np.abs(network.tensors[f"{layer}.weight"])
         bias_U = np.abs(network.tensors[f"{layer}.bias"])
@@ -435,6 +474,7 @@ def _rounding_error(
         size_U = weight_UI @ greatest_I + inherited_U + bias_U
         # The greatest multiplier stands for all that is done with the last output.
         size_U += MAX_COST_MULTIPLIER
-        terms = weight_UI.shape[1] + 2
-        error_I = inherited_U + terms * ROUNDING * size_U  # of the next layer's inputs
+        terms = weight_UI.shape[1] + 2  # of the sum of each output
+        error_U = inherited_U + terms * ROUNDING * size_U
+        error_I = error_U  # the outputs are the inputs of the next layer
     return error_I
