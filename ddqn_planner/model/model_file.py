@@ -73,7 +73,10 @@ def package_version() -> str:
 
 
 def find_model(name: str | Path) -> Path:
-    """Return the file of a model given by path, or by the name of a shipped one."""
+    """Return the file of a model, given by its path or by a shipped model's name.
+
+    A ModelFileError says what to do if there is no such file.
+    """
     try:
         path = as_path(name, "the model")
     except ValueError as error:
@@ -96,7 +99,7 @@ def find_model(name: str | Path) -> Path:
 
 
 def save_model(path: str | Path, network: QNetwork, description: ModelMetadata) -> None:
-    """Write a model file; the old file stays complete until the new one is."""
+    """Write a model file; an older file stays until the new one is complete."""
     write_atomically(as_path(path), model_bytes(network, description))
 
 
@@ -167,7 +170,10 @@ def _check_tensors(
     network_class: type[QNetwork],
     sizes: Mapping[str, int],
 ) -> None:
-    """Raise a ValueError unless the tensors are those of a network."""
+    """Raise a ValueError unless the tensors are those of a network of these sizes.
+
+    Their names, dtypes and shapes must be those of the class, all values finite.
+    """
     kinds = {
         name: (tensor.dtype.name, tensor.shape) for name, tensor in tensors.items()
     }

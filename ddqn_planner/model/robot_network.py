@@ -53,8 +53,19 @@ class RobotNetwork(QNetwork):
     def untrained(cls, footprint: Float64, motions: Motions) -> RobotNetwork:
         """Return the network of a robot, without a training: all weights are 0.
 
-        Raises a ValueError if the footprint or the motions are those of no robot.
         Shapes: U units, S x S cells, P primitives, N poses of all primitives.
+
+        Parameters
+        ----------
+        footprint : (K, 2) float64
+            The corners of the body, metres from the robot's origin.
+        motions : Motions
+            Its P primitives.
+
+        Raises
+        ------
+        ValueError
+            If the footprint or the motions are those of no robot.
         """
         swept_USS = swept_cells(footprint, units_of(motions).motions)
         units, side, _ = swept_USS.shape
@@ -89,6 +100,11 @@ class RobotNetwork(QNetwork):
     def __init__(
         self, sizes: Mapping[str, int], tensors: Mapping[str, NDArray[Any]]
     ) -> None:
+        """Read footprint and motions from the tensors; a ValueError if they are wrong.
+
+        `sizes` has a number for each of `size_names`, and `tensors` an array for each
+        name in `shapes`.
+        """
         super().__init__(sizes, tensors)
         self.footprint = read_footprint(tensors["footprint"].tolist())
         self.motions = _motions_of(tensors)
@@ -114,15 +130,19 @@ class RobotNetwork(QNetwork):
     def of_primitives(self, array_USS: NDArray[Any]) -> NDArray[Any]:
         """Return an array (S, S) of cells for each primitive: (P, S, S).
 
-        It is the array of the primitive's unit, (U, S, S), turned by the quarter turns
+        It is that of the primitive's unit in `array_USS`, turned by the quarter turns
         by which the primitive differs from its unit.
         """
+        # For 0 to 3 quarter turns, the arrays of all units.
         turned = [np.rot90(array_USS, -turns, axes=(1, 2)) for turns in range(4)]
         turned_4USS = np.stack(turned)
         return turned_4USS[self.turns, self.unit]
 
     def certificate(self, move_rule: MoveRule | None = None) -> BodyCertificate:
-        """Return the proof of its primitives, for all patterns of occupied cells."""
+        """Return the proof of its primitives, for all patterns of occupied cells.
+
+        The move rule does not matter: it is one of cells.
+        """
         return certify_body(
             weight_USS=self.tensors["weight"],
             threshold_U=self.tensors["threshold"],
@@ -131,7 +151,10 @@ class RobotNetwork(QNetwork):
         )
 
     def swept(self) -> NDArray[np.bool_]:
-        """Return the cells that forbid each primitive, as proved: (P, S, S)."""
+        """Return the cells that forbid each primitive, as proved: (P, S, S) bool.
+
+        A ModelFileError if nothing is proved.
+        """
         certificate = self.certificate()
         if not certificate.proved:
             remedy = "give a model that ddqn-planner train-robot has proved"
@@ -157,12 +180,15 @@ COLUMNS: Final = _Primitives._fields
 def _motions_of(tensors: Mapping[str, NDArray[Any]]) -> Motions:
     """Return the motions in a network's tensors; a ValueError if they are damaged.
 
-    All columns of the tensor `primitive` except the cost should be whole numbers.
+    These are the tensors `primitive` (P, 6), `pose` (N, 3) with the poses of all
+    primitives, `angle` (16,) and `resolution` (1,), see `Motions`. All columns of
+    `primitive` except the cost should be whole numbers.
     """
-    column = _Primitives(*tensors["primitive"].T)  # float64
+    column = _Primitives(*tensors["primitive"].T)  # (P,) float64 each
+    # The same as integers.
     start = column.start.astype(np.int64)
     end = column.end.astype(np.int64)
-    offset = np.column_stack([column.dx, column.dy]).astype(np.int64)
+    offset = np.column_stack([column.dx, column.dy]).astype(np.int64)  # (P, 2)
     pose_count = column.pose_count.astype(np.int64)
     pose_N3 = tensors["pose"]
     angles = tensors["angle"]
@@ -180,9 +206,11 @@ def _motions_of(tensors: Mapping[str, NDArray[Any]]) -> Motions:
     )
     if is_damaged:
         raise ValueError("its primitives are damaged; train the robot again")
-    pose_ends = np.cumsum(pose_count)
-    _check_ends(pose_N3[pose_ends - pose_count], np.zeros_like(offset), start, angles)
-    _check_ends(pose_N3[pose_ends - 1], offset, end, angles)
+    # The rows of `pose_N3` of each primitive: from its first row to before its end row.
+    end_row = np.cumsum(pose_count)
+    first_row = end_row - pose_count
+    _check_ends(pose_N3[first_row], np.zeros_like(offset), start, angles)
+    _check_ends(pose_N3[end_row - 1], offset, end, angles)
     return Motions(
         resolution=float(tensors["resolution"][0]),
         angles=angles,
@@ -190,12 +218,12 @@ def _motions_of(tensors: Mapping[str, NDArray[Any]]) -> Motions:
         end=end,
         offset=offset,
         cost=column.cost.astype(np.float32),
-        poses=tuple(np.split(pose_N3, pose_ends[:-1])),
+        poses=tuple(np.split(pose_N3, end_row[:-1])),
     )
 
 
 def _are_headings(numbers: NDArray[np.int64]) -> bool:
-    """Return whether all numbers are those of headings."""
+    """Return whether all numbers are headings, 0 to 15."""
     return bool(((numbers >= 0) & (numbers < HEADINGS)).all())
 
 
@@ -210,11 +238,11 @@ def _check_ends(
     Parameters
     ----------
     pose_P3 : (P, 3)
-        The first, or the last, pose of each primitive: cells, cells, radians.
+        The first pose of each primitive, or the last: cells, cells, radians.
     cell_P2 : (P, 2)
-        The cell where it should lie.
+        The cell in whose centre the pose should lie.
     heading_P : (P,)
-        The heading that it should have. All headings should occur.
+        The heading that the pose should have, 0 to 15. Each of these should occur.
     angles : (16,)
         The yaw of each heading, radians.
     """

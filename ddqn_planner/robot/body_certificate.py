@@ -54,6 +54,7 @@ def certify_body(
 ) -> BodyCertificate:
     """Prove which cells forbid each primitive, for all patterns of occupied cells.
 
+    A primitive should be forbidden just where a cell is occupied that the body sweeps.
     Shapes: U = units of the network, which P primitives share, S x S cells with the
     robot in the middle.
 
@@ -64,24 +65,25 @@ def certify_body(
     threshold_U : (U,) float32
         A unit forbids its primitives where the sum of the weights is greater.
     swept_USS : (U, S, S) bool
-        The cells that the body sweeps.
+        The cells that the body sweeps on a primitive of each unit.
     unit_P : (P,) int64
         The unit of each primitive.
     """
-    # No weight is negative, so more occupied cells never make a primitive possible. So
-    # two cases prove all patterns: each swept cell alone must exceed the threshold, and
-    # all cells that are not swept must stay below it together. In float32 too a sum is
-    # not less than its terms, and its relative error is bounded.
+    # No weight is negative, so more occupied cells never make a primitive possible.
+    # Therefore two cases prove all patterns: the weight of each swept cell alone must
+    # exceed the threshold, and the weights of all other cells together must stay below
+    # it. In float32, too, a sum is not less than its terms, and its relative error is
+    # bounded.
     weight_USS = np.maximum(weight_USS.astype(np.float64), 0)
     threshold_U = threshold_U.astype(np.float64)
     primitives_U = np.bincount(unit_P)  # the number of primitives of each unit
 
-    # By how much each cell alone exceeds the threshold: it should, where it is swept.
+    # 1. By how much each swept cell alone exceeds the threshold. Weak cells do not.
     excess_USS = weight_USS - threshold_U[:, None, None]
     weak_U = (swept_USS & (excess_USS <= 0)).sum(axis=(1, 2))
     least_excess_U = excess_USS.min(axis=(1, 2), where=swept_USS, initial=np.inf)
 
-    # By how much all cells that are not swept stay below the threshold: they should.
+    # 2. By how much all other cells together stay below the threshold.
     sum_U = weight_USS.sum(axis=(1, 2), where=~swept_USS)
     greatest_sum_U = sum_U * (1 + weight_USS[0].size * ROUNDING)
     slack_U = threshold_U - greatest_sum_U
