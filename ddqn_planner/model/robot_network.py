@@ -159,8 +159,11 @@ class RobotNetwork(QNetwork):
         if not certificate.proved:
             remedy = "give a model that ddqn-planner train-robot has proved"
             raise ModelFileError(f"the robot's body is {certificate}; {remedy}")
-        learned_USS = self.tensors["weight"] > self.tensors["threshold"][:, None, None]
-        return self.of_primitives(learned_USS)
+        # A cell forbids the primitives of a unit if its weight alone exceeds the unit's
+        # threshold.
+        threshold_U11 = self.tensors["threshold"][:, None, None]
+        forbids_USS = self.tensors["weight"] > threshold_U11
+        return self.of_primitives(forbids_USS)
 
 
 class _Primitives(NamedTuple):

@@ -144,6 +144,7 @@ class DistanceField(QField):
     def __init__(
         self, goals: Goals, grid: GridMap, costs: MoveCosts, move_rule: MoveRule
     ) -> None:
+        """Begin with the goals alone; `grow` does the work."""
         super(QField, self).__init__()
         self.grid = grid
         self.costs = costs

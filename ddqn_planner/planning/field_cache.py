@@ -178,11 +178,11 @@ class FieldCache(Generic[AnyField]):
         Return the older field if the cache should forget it, None if it should forget
         none. `start` is where the new field is needed, None for all of it.
         """
+        # The field that was used last comes first here. Only some are tried: the maps
+        # of the fields before them are hardly more like this map.
         older_fields = [older for older in self.kept[::-1] if older.key == field.key]
-        # Only those that were used last: the maps of the fields before them are hardly
-        # more like this map.
         for older in older_fields[:ALWAYS_KEPT]:
-            changed = self.changed_cells(older.grid, field.grid)
+            changed = self.changed_cells(older.grid, field.grid)  # (N, 2) or None
             if field.take_over(older, changed, start):
                 return older
         return None

@@ -79,6 +79,7 @@ class PoseField(Field[Search]):
     # good the start's cost is.
 
     def __init__(self, goals: NDArray[np.int64], grid: GridMap, world: World) -> None:
+        """Begin with goals, (N, 3) states x, y, heading, on a map with the body."""
         super().__init__()
         self.goals = goals
         self.grid = grid
@@ -317,9 +318,11 @@ class PoseField(Field[Search]):
     def take_over(
         self, older: PoseField, changed: NDArray[np.int64] | None, start: State | None
     ) -> bool:
-        """Repair what an older field knows and take it, see `Field.take_over`.
+        """Take what an older field with the same goals knows, repaired for this map.
 
-        The cache always forgets the older field, as that takes much memory.
+        `changed` (N, 2) are the cells in which the maps of both fields differ. If it is
+        None, the maps cannot be compared, and this field begins anew. The result is
+        True: the cache should forget the older field, which takes much memory.
         """
         if changed is None:
             return True

@@ -54,6 +54,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
     """Keeps the fields of the goals used last. Several threads may use it."""
 
     def __init__(self, network: Any) -> None:
+        """Take the motions, the footprint and the swept cells of a `RobotNetwork`."""
         self._network = network
         self.motions = network.motions
         self.footprint = network.footprint
@@ -179,6 +180,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         # The same map with unknown cells free, and the body on it.
         free_grid = with_unknown_free(request.grid)
         free_world = world_of(free_grid, self.body)
+        # 1. The start. It is None if the body has no room even there.
         start = self._state_at(free_grid, request.start, free_world)
         has_several_goals = len(request.goals) > 1
         if plan.status is PlanStatus.START_OCCUPIED:
@@ -188,7 +190,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
             return f"the start {place}; {unknown_space.REMEDY}"
         if start is None and not has_several_goals:
             return status
-        # Why no path can end at each goal; empty words for a goal with room.
+        # 2. The goals: why no path can end at each; empty words for a goal with room.
         places = [
             self._goal_in_words(request, goal, free_grid, free_world)
             for goal in request.goals
@@ -196,6 +198,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         reason_of_places = _reason_of_places(places, request.grid, start is not None)
         if reason_of_places or start is None:
             return reason_of_places
+        # 3. A path through unknown space.
         states = self._ends_with_room(request, places, start, free_grid, free_world)
         if not len(states):
             return status
@@ -297,9 +300,9 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         Parameters
         ----------
         path : (M, 3) or empty
-            Metres and radians, in the map frame.
+            Poses x, y, yaw in metres and radians, in the map frame.
         robot : (x, y, yaw)
-            Likewise.
+            In metres and radians, in the map frame.
         grid : GridMap
         reach : (float, float)
             Cells and radians by which the robot may be beside the path.
