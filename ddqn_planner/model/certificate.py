@@ -302,7 +302,11 @@ class _Lines:
     """
 
     def __init__(self, least_PF: Float64, greatest_PF: Float64) -> None:
-        """Take the least and the greatest input of each of F ReLUs, for P patterns."""
+        """Take the least and the greatest input of each of F ReLUs, for P patterns.
+
+        For all inputs x between, max(x, 0) is at most slope * x + distance, and at
+        least slope * x and lower_slope * x.
+        """
         greatest_output_PF = np.maximum(greatest_PF, 0)
         below_0_PF = np.minimum(least_PF, 0)  # the part of the inputs below 0
         # If an input may have both signs, the upper line leads from the point (least,
@@ -420,14 +424,16 @@ def _error_of_pairs(
     unknown_weight_2 : (2,)
         The weights of the inputs that are 1 if the cell before, or after, is unknown.
     other_inputs : _OtherInputs
-        The bounds of all that is added for other inputs.
+        The least and the greatest sum of all that is added for other inputs, and the
+        sum of the absolute values of their weights.
     """
     # 1. The true multipliers, by the value of the cell before and of the cell after.
     share_V = _terms_of_values(1.0, 1.0)  # of the greatest surcharge, 0 to 1
     mean_share_VV = (share_V[:, None] + share_V) / 2
     true_VV = 1 + (MAX_COST_MULTIPLIER - 1) * mean_share_VV
 
-    # 2. The network's multipliers lie between bounds; by how much these err.
+    # 2. The network's multipliers, 1 plus a surcharge of 0 or more, lie between bounds.
+    # By how much the upper bound is too high, and the lower bound too low.
     before_V = _terms_of_values(cost_weight_2[0], unknown_weight_2[0])
     after_V = _terms_of_values(cost_weight_2[1], unknown_weight_2[1])
     sum_VV = before_V[:, None] + after_V

@@ -50,6 +50,7 @@ class QField(Field[Known]):
         legal: NDArray[np.bool_],
         move_rule: MoveRule = MoveRule.ROBOT_SAFE,
     ) -> None:
+        """Check Q and the legal moves, (8, H, W) each, and the goal, a cell (x, y)."""
         self.q: NDArray[np.float32] = numbers("q", q)
         if self.q.ndim != 3 or len(self.q) != len(MOVES) or not self.q.size:
             raise ValueError(f"q has shape {self.q.shape}; give (8, H, W)")

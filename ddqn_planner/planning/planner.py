@@ -46,6 +46,7 @@ class Planner:
     """
 
     def __init__(self, network: QNetwork, metadata: ModelMetadata) -> None:
+        """Make a planner of cells, or of poses for a network that knows a body."""
         if not (hasattr(network, "move_costs") and hasattr(metadata, "move_rule")):
             values = f"network is {network!r}, metadata is {metadata!r}"
             raise ValueError(f"{values}; give what load_model returns")
