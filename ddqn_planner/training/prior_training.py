@@ -106,7 +106,7 @@ def train_prior(new: Float32, older: Prior | None = None, seed: int = 0) -> Prio
     old = new[:0]  # no rows
     if older is not None:
         old = _not_measured_anew(older.replay, new)
-    places = _Columns.of(np.concatenate([old, new]))  # N places
+    places = _Columns.of(np.concatenate([old, new]))  # N places, first the old ones
     new_places = _Columns.of(new)
     mean = places.features.mean(axis=0)  # (F,) for F features, as the scale
     scale = np.maximum(places.features.std(axis=0), SMALLEST_SCALE)
@@ -117,22 +117,17 @@ def train_prior(new: Float32, older: Prior | None = None, seed: int = 0) -> Prio
     level = np.average(new_places.log_slowness, weights=new_places.weight)
     target = places.log_slowness - level  # (N,)
     weight = places.weight / places.weight.mean()  # (N,)
-    # Places in a row are one block, and some blocks are a fold. Network k leaves out
-    # the places of fold k, and the last network none.
-    block = _blocks(count)  # (N,)
-    fold_of_block = random.permutation(block[-1] + 1) % FOLDS
-    network = np.arange(FOLDS + 1)
-    is_left_out = fold_of_block[block] == network[:, None]  # (networks, N)
+    block = _blocks(count)  # (N,): places in a row are one block
     training = _train(
         np.column_stack([scaled, is_old]),
         target,
         weight,
-        left_out=is_left_out.astype(np.float32),
+        left_out=_left_out(block, random),
         seed=seed,
     )
     share = _share_to_believe(block, weight, training.predicted, target)
     if older is not None:
-        # All places of the older prior are left only if none lies on this map.
+        # If a place of the older prior lies on this map, it was measured anew.
         is_new_map = len(old) == len(older.replay)
         predicted = share * training.predicted[len(old) :]  # of the new places
         predicted_by_older = older.log_slowness(new_places.features)
@@ -140,7 +135,8 @@ def train_prior(new: Float32, older: Prior | None = None, seed: int = 0) -> Prio
         if is_new_map and _error(predicted_by_older, new_places) < error:
             return older
     replay = [_some_rows(old, random), _some_rows(new, random)]
-    # The last network has learned from all places.
+    # The prior is the last network, which has learned from all places. Its prediction
+    # is the level plus the share of what the two parts of the network predict.
     last = _Weights(*(tensor[-1] for tensor in training.weights))
     arrays = {
         "mean": mean,
@@ -175,6 +171,18 @@ def _blocks(count: int) -> NDArray[np.int64]:
     size = np.clip(count // BLOCKS, SMALLEST_BLOCK, LARGEST_BLOCK)
     block: NDArray[np.int64] = np.arange(count) // size
     return block
+
+
+def _left_out(block: NDArray[np.int64], random: np.random.Generator) -> Float32:
+    """Draw the places that each network leaves out: 1 there, else 0, (FOLDS + 1, N).
+
+    `block` (N,) is the number of each place's block. Each block belongs to one of FOLDS
+    folds; network k leaves out the places of fold k, and the last network none.
+    """
+    fold_of_block = random.permutation(block[-1] + 1) % FOLDS
+    network = np.arange(FOLDS + 1)
+    is_left_out = fold_of_block[block] == network[:, None]  # (FOLDS + 1, N)
+    return is_left_out.astype(np.float32)
 
 
 def _some_rows(rows: Float32, random: np.random.Generator) -> Float32:
