@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.experience.evidence import FARTHEST, Evidence
-from ddqn_planner.experience.places import Float32, Float64, Places
+from ddqn_planner.experience.places import Float32, Float64, Int64, Places
 from ddqn_planner.experience.posterior import Posterior
 from ddqn_planner.experience.prior import Prior
 from ddqn_planner.experience.visits import (
@@ -426,25 +426,46 @@ class Experience:
         corners = cells_inside(cells, grid.occupancy.shape)
         if len(corners) < 2:
             return ExpectedTime(0.0, 0.0, 0.0)
-        # The N cells along the path, (N, 2), and their positions on it, (N,): 2.5 is
-        # the middle of the third segment between two of the K corners.
-        path, position = cells_along(corners)
-        dx, dy = np.diff(corners, axis=0).T
-        metres_of_segment = np.hypot(dx, dy) * grid.resolution  # (K - 1,)
-        # (N - 1,), for the moves from each cell to the next one.
-        segment = position[:-1].astype(np.int64)
-        metres = np.diff(position) * metres_of_segment[segment]
-        x, y = path.T
-        places = posterior.place[y, x]  # (N,)
-        slowness = posterior.slowness[places]  # (N,)
-        mean_slowness = (slowness[1:] + slowness[:-1]) / 2
-        seconds_of_moves = metres / self.nominal_speed * mean_slowness
+        seconds_of_moves, places = self._seconds_of_moves(corners, posterior)
         # Of the logarithm of the path's time.
-        deviation = posterior.deviation_of(seconds_of_moves, places[1:])
+        deviation = posterior.deviation_of(seconds_of_moves, places)
         errors = np.array(self.evidence.error_range())  # (3,): low, mean, high
         seconds = float(seconds_of_moves.sum())
         low, mean, high = (seconds * np.exp(errors * deviation)).tolist()
         return ExpectedTime(mean, low, high)
+
+    def _seconds_of_moves(
+        self, corners: Int64, posterior: Posterior
+    ) -> tuple[Float64, Int64]:
+        """Return the expected times of the moves from cell to cell along a path.
+
+        Parameters
+        ----------
+        corners : (K, 2) int64
+            The x and y of the path's corners, which straight segments join.
+        posterior : Posterior
+            The posterior over the map of the path.
+
+        Returns
+        -------
+        (M,) float64
+            The expected seconds of each move.
+        (M,) int64
+            The number of the place in which each move ends.
+        """
+        grid = posterior.grid
+        # The M + 1 cells along the path, (M + 1, 2), and their positions on it, (M +
+        # 1,): 2.5 is the middle of the third segment.
+        path, position = cells_along(corners)
+        dx, dy = np.diff(corners, axis=0).T
+        metres_of_segment = np.hypot(dx, dy) * grid.resolution  # (K - 1,)
+        segment = position[:-1].astype(np.int64)  # (M,): the segment of each move
+        metres = np.diff(position) * metres_of_segment[segment]  # (M,)
+        x, y = path.T
+        places = posterior.place[y, x]  # (M + 1,)
+        slowness = posterior.slowness[places]  # (M + 1,)
+        mean_slowness = (slowness[1:] + slowness[:-1]) / 2  # (M,)
+        return metres / self.nominal_speed * mean_slowness, places[1:]
 
     def save(self, path: str | Path) -> None:
         """Save to the file at `path`; an OSError leaves an old file unchanged.

@@ -62,20 +62,8 @@ def population_of(places: Places) -> Population:
     weight = places.weight[has_visits]  # (M,), as the following arrays
     mean_log = places.sum_of_log[has_visits] / weight  # of the visits of each place
     noise = NOISE / weight  # the variance of each mean, by visits that differ
-    # (M, 2): the log slowness is about `design @ (level, prior_weight)`.
-    design = np.column_stack([np.ones(len(weight)), places.predicted[has_visits]])
-
-    variance = VARIANCE
-    count = len(weight) / ALIKE_PLACES  # the number of places that are not alike
-    for _ in range(ITERATIONS):
-        level, prior_weight = _regression(mean_log, design, variance + noise)
-        residual = mean_log - design @ (level, prior_weight)
-        # The part of each square that is not noise. The mean is over these squares and
-        # over ASSUMED_PLACES more, of the variance VARIANCE.
-        squares = residual**2 - noise
-        total = ASSUMED_PLACES * VARIANCE + squares.sum() / ALIKE_PLACES
-        mean_square = total / (ASSUMED_PLACES + count)
-        variance = float(np.clip(mean_square, LEAST_VARIANCE, MOST_VARIANCE))
+    predicted = places.predicted[has_visits]
+    level, prior_weight, variance = _fit(mean_log, noise, predicted)
 
     # The log of the mean of a lognormal is half of the variance above the mean of the
     # log. The surplus counts less while few places were visited.
@@ -89,6 +77,37 @@ def population_of(places: Places) -> Population:
         open_log = float(np.quantile(known_log, OPEN_QUANTILE))
         fastest_log = float(np.quantile(known_log, FASTEST_QUANTILE))
     return Population(level, prior_weight, variance, surplus, open_log, fastest_log)
+
+
+def _fit(
+    mean_log: Float64, noise: Float64, predicted: Float64
+) -> tuple[float, float, float]:
+    """Return the level, the weight of the prior, and the variance of M places.
+
+    The log slowness of the places is normal, with this variance, around the level plus
+    the weight times the prediction.
+
+    Parameters
+    ----------
+    mean_log, noise : (M,) float64
+        The mean log slowness of each place's visits, and the variance of this mean.
+    predicted : (M,) float64
+        The log slowness that the prior predicts for each place.
+    """
+    # (M, 2): the log slowness is about `design @ (level, prior_weight)`.
+    design = np.column_stack([np.ones(len(predicted)), predicted])
+    variance = VARIANCE
+    count = len(predicted) / ALIKE_PLACES  # the number of places that are not alike
+    for _ in range(ITERATIONS):
+        level, prior_weight = _regression(mean_log, design, variance + noise)
+        residual = mean_log - design @ (level, prior_weight)
+        # The part of each square that is not noise. The mean is over these squares and
+        # over ASSUMED_PLACES more, of the variance VARIANCE.
+        squares = residual**2 - noise
+        total = ASSUMED_PLACES * VARIANCE + squares.sum() / ALIKE_PLACES
+        mean_square = total / (ASSUMED_PLACES + count)
+        variance = float(np.clip(mean_square, LEAST_VARIANCE, MOST_VARIANCE))
+    return level, prior_weight, variance
 
 
 def _regression(

@@ -518,13 +518,13 @@ def _percent_of_grey(document: dict[str, Any], mode: str) -> NDArray[np.int8]:
             f"free_thresh is {free_thresh}; give at most {occupied_thresh}"
         )
     is_negated = _truth(document, "negate")
-    grey = np.arange(256)
+    grey = np.arange(256)  # (256,), as all that follow
     if mode == "raw":
         return np.where(grey <= 100, grey, UNKNOWN).astype(np.int8)
     # map_server computes in single precision, and a grey value may equal a threshold.
     free = np.float32(free_thresh)
     occupied = np.float32(occupied_thresh)
-    darkness = grey.astype(np.float32) / np.float32(255)
+    darkness = grey.astype(np.float32) / np.float32(255)  # 0 to 1: free to occupied
     if not is_negated:
         darkness = np.float32(1) - darkness
     percent = np.full(256, float(UNKNOWN))

@@ -292,11 +292,11 @@ class RobotTrainer:
         by_q_BK = double_dqn_gradient(batch, q_BK, q_of_target)
         # By the chain rule: the gradient by the success of each action that was taken,
         # then by the logit of the success. The first B rows are those of the states.
-        taken = np.arange(p.batch_size), batch.action
-        success_B = success_2BK[taken]
-        by_success_B = by_q_BK[taken] * gain_2BK[taken]
+        taken_actions = np.arange(p.batch_size), batch.action
+        success_B = success_2BK[taken_actions]
+        by_success_B = by_q_BK[taken_actions] * gain_2BK[taken_actions]
         by_logit_B = by_success_B * (success_B * (1 - success_B))
-        self._descend(unit_2BK[taken], place_2B[: p.batch_size], by_logit_B)
+        self._descend(unit_2BK[taken_actions], place_2B[: p.batch_size], by_logit_B)
         self.updates += 1
         if self.updates % p.target_interval == 0:
             self._settle()
