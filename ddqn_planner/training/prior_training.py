@@ -181,7 +181,7 @@ def _left_out(block: NDArray[np.int64], random: np.random.Generator) -> Float32:
     """
     fold_of_block = random.permutation(block[-1] + 1) % FOLDS
     network = np.arange(FOLDS + 1)
-    is_left_out = fold_of_block[block] == network[:, None]  # (FOLDS + 1, N)
+    is_left_out: NDArray[np.bool_] = fold_of_block[block] == network[:, None]
     return is_left_out.astype(np.float32)
 
 
