@@ -102,7 +102,8 @@ def certify(
 
     A decision is whether an action is possible in a pattern, that is where certain
     cells of a 3x3 patch are occupied, under a rule. It is proved if it is right for all
-    costs of the free cells, and whichever of them are unknown.
+    costs of the free cells, and whichever of them are unknown. Decisions under each of
+    the `move_rules` are tried.
     """
     # Shapes: Q = the 512 patches of each rule, P = patterns, those of the patches whose
     # centre is free, A = 8 actions, I = inputs, 9 = the cells of a patch.

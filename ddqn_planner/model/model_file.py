@@ -132,7 +132,7 @@ def load_model(name: str | Path) -> tuple[QNetwork, ModelMetadata]:
 
 
 def model_of(data: bytes) -> tuple[QNetwork, ModelMetadata]:
-    """Return the model that `model_bytes` made bytes of.
+    """Return the model in the content of a model file, see `model_bytes`.
 
     Raises
     ------
@@ -190,7 +190,10 @@ def _check_tensors(
 
 
 def _description_of(values: object) -> ModelMetadata:
-    """Return a network's description from JSON; a ValueError says what is wrong."""
+    """Return a network's description from JSON; a ValueError says what is wrong.
+
+    `values` is the decoded JSON: it should be a dict with the keys of `TYPES`.
+    """
     if not isinstance(values, dict):
         raise ValueError(f"it is {reprlib.repr(values)}; it must be a JSON object")
     wrong_keys = sorted(values.keys() ^ TYPES.keys())
@@ -219,7 +222,10 @@ def _description_of(values: object) -> ModelMetadata:
 def _sizes_of(
     values: Mapping[str, object], network_class: type[QNetwork]
 ) -> dict[str, int]:
-    """Return the sizes of a network, from JSON; a ValueError says what is wrong."""
+    """Return the sizes of a network, from JSON; a ValueError says what is wrong.
+
+    `values` should have an int for each of the class's `size_names`.
+    """
     size_names = network_class.size_names
     if network_class is PaperQNetwork:
         # Missing in files of version 0.1.0, whose networks have no hidden units.

@@ -116,9 +116,9 @@ class MoveCosts(NamedTuple):
         def with_part(
             array: NDArray[Number], array_of_part: NDArray[Number]
         ) -> NDArray[Number]:
-            """Return a copy of the map's array (C,) with the part's values in `cells`.
+            """Return a copy of a map's array (C,), in `cells` with the part's values.
 
-            An array that the map does not have is empty.
+            `array_of_part` is the same array of the region; empty if the map has none.
             """
             if array_of_part.size == 0:
                 return array

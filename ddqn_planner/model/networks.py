@@ -105,9 +105,9 @@ class QNetwork:
         raise NotImplementedError
 
     def _layer(self, name: str, input_BI: Array) -> Array:
-        """Return the O outputs of a fully connected layer for B rows of inputs: (B, O).
+        """Return the outputs (B, O) of a fully connected layer for inputs (B, I).
 
-        The layer's tensors are `name`.weight, (O, I), and `name`.bias.
+        The layer's tensors are `name`.weight, (O, I), and `name`.bias, (O,).
         """
         with np.errstate(
             over="ignore", invalid="ignore"
@@ -328,7 +328,8 @@ class PropagationQNetwork(QNetwork):
         """Return how many tries each move takes in B patches, 1/p: (B, 8).
 
         It is 1 for a p of `CERTAIN` or more, and infinite if p is at most 1/2, or NaN:
-        then the move counts as impossible.
+        then the move counts as impossible. `feature_BI` has the inputs for B patches;
+        see `features`.
         """
         p_BA = self.success(feature_BI)
         p_BA = np.where(p_BA >= CERTAIN, np.float32(1), p_BA)
@@ -480,9 +481,10 @@ class PropagationQNetwork(QNetwork):
     ) -> Array:
         """Return each move's cost in P patches, infinite if not possible: (P, 8).
 
-        The cost is the move's length times its expected tries and its multiplier. For a
-        map with expected times it is without the multiplier, which follows from the
-        times. The patches are evaluated in batches of B; I = inputs, A = 8 actions.
+        The cost is the move's length times its expected tries and its multiplier. With
+        `has_times` it is without the multiplier, which follows from the map's expected
+        times. The patches (P, 9), see `patches`, are evaluated in batches of B; I =
+        inputs, A = 8 actions.
         """
         costs = []
         for batch_B9 in np.split(patch_P9, range(BATCH, len(patch_P9), BATCH)):

@@ -200,8 +200,8 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
     def _from_known_field(self, task: _Task) -> Plan | None:
         """Return the plan by a kept field that is known as far as the start.
 
-        Return None if there is no such field, or if its greedy steps find no path: then
-        `task.failed_rollout` is set.
+        Return None if the start is occupied, if there is no such field, or if its
+        greedy steps find no path: then `task.failed_rollout` is set.
         """
         request = task.request
         if not request.grid.is_free(request.start):

@@ -681,7 +681,8 @@ def write_policy(distance: Any, policy: Any, costs: Any) -> None:
     """Write the greedy action of each cell from which a path leads to a goal.
 
     `policy` (C,) gets the actions, by cell of the padded map. `distance` (C,) is the
-    cost from each cell to a goal, 0 without a path, and known of all cells.
+    cost from each cell to a goal, 0 without a path, and known of all cells. `costs` are
+    `StepCosts`.
     """
     # The first and the last row are the border.
     for cell in range(costs.width + 1, distance.size - costs.width - 1):
@@ -697,6 +698,7 @@ def write_q(distance: Any, q: Any, costs: Any) -> None:
 
     `q` (8, C) is by action and cell of the padded map, and stays where no path leads to
     a goal. `distance` (C,) is the cost from each cell to a goal, 0 without a path.
+    `costs` are `StepCosts`.
     """
     for action in range(8):
         for cell in range(costs.width + 1, distance.size - costs.width - 1):

@@ -50,7 +50,10 @@ class QField(Field[Known]):
         legal: NDArray[np.bool_],
         move_rule: MoveRule = MoveRule.ROBOT_SAFE,
     ) -> None:
-        """Check Q and the legal moves, (8, H, W) each, and the goal, a cell (x, y)."""
+        """Check the arguments: `q` and `legal` (8, H, W), and the goal, a cell (x, y).
+
+        A ValueError says what is wrong with them.
+        """
         self.q: NDArray[np.float32] = numbers("q", q)
         if self.q.ndim != 3 or len(self.q) != len(MOVES) or not self.q.size:
             raise ValueError(f"q has shape {self.q.shape}; give (8, H, W)")
@@ -232,10 +235,20 @@ class DistanceField(QField):
         changed: NDArray[np.int64] | None,
         start: Cell | None = None,
     ) -> bool:
-        """Repair what an older field knows and take it, see `Field.take_over`.
+        """Repair what an older field knows and take it, where that is quicker.
 
-        A field on a map that cannot be compared stays in the cache: requests may take
-        turns between maps.
+        Return whether the cache should forget the older field. It should not if the
+        maps cannot be compared: requests may take turns between them.
+
+        Parameters
+        ----------
+        older : DistanceField
+            With the same goals. It may hand over what it knows, and then begins anew.
+        changed : (N, 2), optional
+            The cells x, y in which the maps of both fields differ; None if they cannot
+            be compared.
+        start : (x, y), optional
+            Where this field is needed; None for all of the map.
         """
         if changed is None:
             return False
@@ -347,7 +360,7 @@ def network_field(
     """Return the field of a network that gives no proved costs of moves.
 
     Either its predicted costs may be wrong, as for a propagation network, or it
-    computes Q from the whole map at once.
+    computes Q toward the goal (x, y) from the whole map at once.
     """
     if isinstance(network, PropagationQNetwork):
         costs = network.believed_costs(grid, move_rule)

@@ -199,8 +199,8 @@ def obstacles_in_the_way(
 ) -> Occupancy:
     """Return the obstacles through which no way out of a start may lead: (H, W) bool.
 
-    These are the map's obstacles without inflation. If the start is an obstacle itself,
-    no obstacle within the clearing radius, in cells, of the start counts.
+    These are the map's obstacles without inflation. If the start, (x, y), is an
+    obstacle itself, no obstacle within `clearing_radius` cells of the start counts.
     """
     obstacles = grid.uninflated
     if clearing_radius > 0 and grid.is_obstacle(start):

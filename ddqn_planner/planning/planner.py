@@ -46,7 +46,10 @@ class Planner:
     """
 
     def __init__(self, network: QNetwork, metadata: ModelMetadata) -> None:
-        """Make a planner of cells, or of poses for a network that knows a body."""
+        """Make a planner of cells, or of poses for a network that knows a body.
+
+        A ValueError if these are no network and no metadata of a model.
+        """
         if not (hasattr(network, "move_costs") and hasattr(metadata, "move_rule")):
             values = f"network is {network!r}, metadata is {metadata!r}"
             raise ValueError(f"{values}; give what load_model returns")
@@ -214,12 +217,13 @@ class Planner:
             As for `plan`. The tolerance holds for each goal. A simplified path keeps
             all goals.
         goals : sequence of (x, y)
-            At least one. If one has no path, the plan's status tells why, and its goal
-            which.
+            At least one. If no path leads to one of them, the plan's goal is that one,
+            and its status tells why there is no path.
         """
         plans: list[Plan] = []
         cells = _cells_of_goals(goals)
         for number, goal in enumerate(cells, 1):
+            # What a reason begins with.
             name = f"goal {number} of {len(cells)}: " if len(cells) > 1 else ""
             plan = self.plan(
                 grid,
@@ -321,7 +325,8 @@ class Planner:
     ) -> Plan:
         """Check the arguments and return the plan to the nearest of one or more goals.
 
-        The arguments are those of `plan`; the goals, (x, y) each, are checked already.
+        The goals, (x, y) each, are checked already. All other arguments are those of
+        `plan`; a ValueError says what is wrong with them.
         """
         rule = self._rule(move_rule)
         check_grid(grid)

@@ -327,7 +327,9 @@ class PoseField(Field[Search]):
         if changed is None:
             return True
         with older._lock:
-            search = older._take_known()
+            search = older._take_known()  # the older field then knows its goals alone
+            # A repair may take back the cost that is known from the start. So the lower
+            # bound of that cost must not be above it.
             self._lower_bound = min(older._lower_bound, _cost_from_start(search))
             self._known = self._repaired(search._replace(world=self.world), changed)
         return True

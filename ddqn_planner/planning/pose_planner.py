@@ -252,6 +252,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
                 return ""
             if bound is not None:
                 return unknown_space.THROUGH_UNKNOWN_SPACE
+            # More states must be visited.
             yield  # a pause: a slow step follows
         return unknown_space.MAYBE_THROUGH_UNKNOWN_SPACE
 
@@ -475,12 +476,12 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         """Return the rest of a path that was planned before, if the start lies on it.
 
         The path led to the same goals with the same tolerance, on a map with the same
-        cells; and the bound that is proved of its rest is no greater than the bound of
-        the request. Return None if there is no such path.
+        cells. Its rest is proved to cost at most the request's bound times the least
+        cost. Return None if there is no such path.
         """
         for field in self.fields.kept:
             path = field.path  # the last one that was made from the field
-            goals, tolerance, _ = field.key
+            goals, tolerance, _ = field.key  # the last part: the states of the goals
             is_for_goals = goals == request.goals and tolerance == request.tolerance
             if path is None or not is_for_goals:
                 continue

@@ -376,7 +376,7 @@ def _layers_for_body(grid: GridMap) -> Layers:
 
 
 def differences(old: GridMap, new: GridMap) -> NDArray[np.int64] | None:
-    """Return the cells (N, 2), x and y, in which two maps differ for a body.
+    """Return the cells (N, 2) in which an old and a new map differ for a body.
 
     None means that a comparison does not pay: the maps show different places, or differ
     in too many cells, see `changed_cells`.

@@ -191,8 +191,9 @@ def segment_cost(
     """Return the cost of the segment from cell (x, y) to cell (last_x, last_y).
 
     It is the segment's length in cells, on a map with costs times the mean multiplier
-    of the cells that the segment crosses. It is infinite if the segment must be legal
-    but is not. Both cells lie on the map, and the segment joins their centres.
+    of the cells that the segment crosses. With `must_be_legal`, it is infinite for a
+    segment that is not legal, see `simplify`. Both cells lie on the map, and the
+    segment joins their centres.
     """
     dx = last_x - x
     dy = last_y - y
@@ -287,7 +288,8 @@ def _write_costs(
     """Write the cost of the segment that ends in each cell of a path (N, 2) to `costs`.
 
     `costs` is (N,), and its first element is not written. A cost is infinite if an end
-    of the segment lies outside the map, or if the segment must be legal but is not.
+    of the segment lies outside the map; with `must_be_legal`, also if the segment is
+    not legal.
     """
     for index in range(1, path.shape[0]):
         x = path[index - 1, 0]
@@ -363,8 +365,8 @@ def _cost_between(
 ) -> float:
     """Return the cost of the segment between two cells, in the direction of driving.
 
-    `first` and `last` are rows of the path (N, 2). A backward path leads from the goal
-    to the start, against the direction of driving.
+    `first` and `last` are rows of the path (N, 2). With `is_backward` the path leads
+    from the goal to the start, against the direction of driving.
     """
     begin = last if is_backward else first
     end = first if is_backward else last

@@ -191,9 +191,10 @@ def _points(value: Any) -> Corners:
 
 
 def _without_repeats(points: Corners) -> Corners:
-    """Return a polygon's corners without those that repeat the corner before: (K, 2).
+    """Return a polygon's corners (K, 2): points (N, 2) without repeated ones.
 
-    The corner before the first one is the last.
+    A point that is the same as the corner before is left out. The corner before the
+    first one is the last.
     """
     corners: list[NDArray[np.float64]] = []
     for point in points:
@@ -216,7 +217,7 @@ def _cross(first: Points, second: Points) -> NDArray[np.float64]:
 
 
 def _sides_cross(corners: Corners) -> bool:
-    """Return whether two sides of a polygon cross.
+    """Return whether two sides of a polygon with corners (K, 2) cross.
 
     Sides that only meet in a corner, touch, or lie on one line do not cross.
     """
@@ -406,11 +407,11 @@ def placed(corners: Corners, poses: Poses) -> NDArray[np.float64]:
 
 
 def swept_cells(corners: Corners, motions: Motions) -> NDArray[np.bool_]:
-    """Return the cells that the body touches on each primitive: (P, S, S) bool.
+    """Return the cells that a body touches on each primitive: (P, S, S) bool.
 
     The index is (primitive, y, x); the robot starts in the middle, x = y = S // 2. All
     cells within `MARGIN` of the body count, so that cells that the body touches between
-    two poses count, too.
+    two poses count, too. The body's corners (K, 2) are in metres.
 
     Raises
     ------

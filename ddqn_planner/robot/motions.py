@@ -144,9 +144,9 @@ def _cell_size(name: str, metres: Any) -> float:
 
 
 def _radius_in_cells(motion: Motion, turning_radius: float, cell_size: float) -> float:
-    """Return a turning radius, given in metres, in cells.
+    """Return a turning radius in cells. `turning_radius` and `cell_size` are in metres.
 
-    A ValueError if it is too small for a car, or too large. `cell_size` is in metres.
+    A ValueError if the radius is too large, or too small for the motion of a car.
     """
     metres = as_number(
         "the turning radius", turning_radius, 0, math.inf, "metres, 0 or more"
@@ -178,7 +178,7 @@ def _straight(
     Parameters
     ----------
     heading : int
-        The robot's heading.
+        The robot's heading, 0 to 15.
     relative_heading : int
         The direction of the steps: by how many headings it lies to the left of ahead.
     angles : (16,) float64
@@ -536,10 +536,10 @@ def _heading(field: str, name: str, primitive: object) -> int:
 
 
 def _from_heading_to_heading(poses: Poses, start_yaw: float, end_yaw: float) -> Poses:
-    """Return a primitive's poses from the origin on, with exact yaws at both ends.
+    """Return a primitive's poses from the origin on, from `start_yaw` to `end_yaw`.
 
     The yaws, in radians, have no jumps by whole turns. `poses` (N, 3), x and y in
-    cells, may lack the pose in the origin; its last yaw is changed in place.
+    cells, may lack the pose in the origin; their last yaw is changed in place.
     """
     poses[-1, 2] = end_yaw
     start_pose = np.array([0, 0, start_yaw])
