@@ -119,6 +119,7 @@ class MoveCosts(NamedTuple):
             """Return a copy of a map's array (C,), in `cells` with the part's values.
 
             `array_of_part` is the same array of the region; empty if the map has none.
+            Both have a border of one cell.
             """
             if array_of_part.size == 0:
                 return array
@@ -138,18 +139,19 @@ class MoveCosts(NamedTuple):
     def on_map(
         self, grid: GridMap, patch_number: NDArray[Any] | None = None
     ) -> MoveCosts:
-        """Return the costs on a map with all of its layers.
+        """Return the costs on a map with all of its layers, from those of any map.
 
         Parameters
         ----------
         grid : GridMap
         patch_number : (C,), optional
-            The row of the table for each cell of the padded map. By default the patches
-            of the map are read.
+            The row of the table for each of the C cells of the padded map. By default
+            the patches of the map are read.
         """
         if patch_number is not None:
             costs = self._replace(patch_number=patch_number, width=grid.width + 2)
         else:
+            # Without terms, the costs of cells do not count.
             cost = grid.cost if self.terms.size else None
             cells = read_cells(grid.occupancy, cost)
             least_multiplier = 1.0

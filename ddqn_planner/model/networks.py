@@ -268,7 +268,10 @@ class PropagationQNetwork(QNetwork):
     )
 
     def __init__(self, sizes: Mapping[str, int], tensors: Mapping[str, Array]) -> None:
-        """Keep the tensors, and set tiny weights of cost multipliers to 0."""
+        """Keep the tensors, and set tiny weights of cost multipliers to 0.
+
+        `tensors` has a weight and a bias for each layer, by name: "hidden.weight".
+        """
         super().__init__(sizes, tensors)
         for name, tensor in tensors.items():
             if name.startswith("prices"):

@@ -309,7 +309,7 @@ def _roll_out(task: _Task, field: QField) -> Plan | None:
     task and return None.
     """
     request = task.request
-    task.clock.end_field()
+    task.clock.end_field()  # the time from here on is that of the rollout
     start = task.escape_path[-1] if task.escape_path else request.start
     rollout = field.rollout(start, request.simplified)
     if rollout.path.size:

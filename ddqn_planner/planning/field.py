@@ -260,9 +260,9 @@ class DistanceField(QField):
         most_repaired = max(REPAIRED, int(REPAIRED_SHARE * self.grid.occupancy.size))
         limit = most_repaired if start is None else REPAIRED  # cells of a repair
         with older._lock:
-            known = older._take_known()
+            known = older._take_known()  # distances and open cells
             repaired = cell_space.take_back(known, self.costs, cells_to_judge, limit)
-            while repaired is None:
+            while repaired is None:  # it would take back more cells than the limit
                 limit *= 4
                 is_repair_slower = start is None or limit > most_repaired
                 if is_repair_slower or self.grow(start, VISITS * limit):
@@ -286,9 +286,11 @@ class DistanceField(QField):
         offsets = (steps[:, None] * width + steps).reshape(9, 1)
         x, y = cells.T
         numbers = (offsets + self._number(x, y)).astype(np.int32)  # (9, N)
+        # Without the first and the last row, and so without number 0.
         end = self.costs.patch_number.size - width - 1
         inside = np.sort(numbers[(numbers > width) & (numbers < end)])
-        is_new = np.diff(inside, prepend=0) > 0  # a fifth of the time of `np.unique`
+        # In a fifth of the time of `np.unique`.
+        is_new = np.diff(inside, prepend=0) > 0
         return inside[is_new]
 
     def _layer(self, write: Callable[..., None], layer: NDArray[Any]) -> NDArray[Any]:

@@ -301,7 +301,7 @@ def follow(search: Search, start: int, limit: int, rows: NDArray[np.float64]) ->
     cost_before = 0.0  # from the start to the state
     for _ in range(limit):
         cost_from_state = search.distance[number]
-        if cost_from_state == 0:
+        if cost_from_state == 0:  # a goal
             break
         # Each primitive leads to a state of a lower cost.
         _, primitive = cheapest_primitive(
@@ -309,6 +309,7 @@ def follow(search: Search, start: int, limit: int, rows: NDArray[np.float64]) ->
         )
         cost = np.float64(cost_of_primitive(x, y, primitive, world))
         cost_after = cost_before + cost
+        # The poses of the primitive, from the cell in which it begins.
         for place in range(body.first_pose[primitive], body.first_pose[primitive + 1]):
             rows[0, count] = x + body.pose[place, 0]
             rows[1, count] = y + body.pose[place, 1]
@@ -598,12 +599,13 @@ def _step_over_tiles(
         Its aim's `corner_bound`, (rows + 1, columns + 1), holds the steps from the
         start to each corner; changes in place.
     passability : (rows, columns)
-        Of each tile, see `is_passable`; changes in place.
+        UNSEEN, PASSABLE or IMPASSABLE for each tile; changes in place.
     box : (4,)
-        See `steps_to_box`.
+        Holds all goals: the least x, the least y, the greatest x and the greatest y of
+        corners.
     """
     rows, columns = passability.shape
-    shift = search.aim.shift
+    shift = search.aim.shift  # a tile has 2**shift cells along a side
     step_count = search.aim.corner_bound  # (rows + 1, columns + 1)
     steps_before = step_count[y, x]
     for row in range(max(y - 1, 0), min(y + 1, rows)):
@@ -632,9 +634,10 @@ def _turn_into_cost(search: Any, last_key: Any, box: Any) -> None:
         corners that A* has queued and not visited.
     last_key : float
         The key of the last corner that A* has visited: its steps, plus a lower bound
-        of the steps from there to a box around all goals.
+        of the steps from there to the box.
     box : (4,)
-        See `steps_to_box`.
+        Holds all goals: the least x, the least y, the greatest x and the greatest y of
+        corners.
     """
     aim = search.aim
     was_stopped = search.heap.size[0] > 0
