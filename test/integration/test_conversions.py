@@ -498,6 +498,25 @@ def test_a_set_start_outlives_time_and_a_jump_of_the_clock() -> None:
     assert poses.robot() is pose
 
 
+def test_each_set_start_is_news_and_of_odometry_the_first_pose() -> None:
+    node, source, starts = new_node(), ["initialpose"], list[str]()
+    poses = Poses(
+        node,
+        Diagnostics(node),
+        lambda: replace(PlannerSettings(), start_source=source[0]),
+        lambda: "map",
+        lambda: starts.append(source[0]),
+    )
+    expected = list[str]()
+    for source[0], news in (("odometry", 1), ("initialpose", 3), ("odometry", 1)):
+        poses.listen_to_source()
+        assert refusal("NO_START", poses.robot)  # another source's pose is forgotten
+        for _ in range(3):
+            poses.receive(pose_at(NOW, "map"))
+        expected += news * source
+        assert starts == expected
+
+
 def test_other_frames_are_refused_without_tf_and_the_remedy_names_it(
     listening: Any,
 ) -> None:

@@ -29,6 +29,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode
 from rclpy.utilities import try_shutdown
 
+from ddqn_planner.nodes.lifecycle import ManagedNode
+from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.planner_node import PlannerNode
 from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.nodes.trainer_node import TrainerNode
@@ -333,6 +335,47 @@ def test_the_lifecycle_is_that_of_rclpys_own_nodes() -> None:
     finally:
         for node in (*nodes, listener):
             node.destroy_node()
+        executor.shutdown()
+        try_shutdown()
+
+
+class Failing(ManagedNode):
+    """A node that cannot be configured at first."""
+
+    has_failed = False
+
+    def configure(self) -> None:
+        super().configure()
+        if not self.has_failed:
+            self.has_failed = True
+            raise OSError("not yet")
+
+
+def test_a_transition_that_failed_can_be_tried_again() -> None:
+    rclpy.init(args=[])
+    node, executor = Failing("failing", PLANNER_PARAMETERS), SingleThreadedExecutor()
+    executor.add_node(node)
+    client = node.create_client(ChangeState, "~/change_state")
+    assert client.wait_for_service(TIMEOUT)
+
+    def change(label: str) -> bool:
+        request = ChangeState.Request(transition=Transition(label=label))
+        future = client.call_async(request)
+        executor.spin_until_future_complete(future, TIMEOUT)
+        return bool(future.result().success)
+
+    try:
+        states = []
+        for label, succeeds in (
+            ("configure", False),
+            ("configure", True),
+            ("activate", True),
+        ):
+            assert change(label) == succeeds
+            states.append(node.state)
+        assert states == ["unconfigured", "inactive", "active"]
+    finally:
+        node.destroy_node()
         executor.shutdown()
         try_shutdown()
 
