@@ -84,7 +84,8 @@ class Field(Generic[Known]):
         ----------
         older : Field
         changed : (N, 2) int64, optional
-            The cells in which the maps of both fields differ, see `Comparison`.
+            The cells x, y in which the maps of both fields differ; None if they cannot
+            be compared.
         start : cell or pose state, optional
             None for any.
 
@@ -146,7 +147,7 @@ class FieldCache(Generic[AnyField]):
         Parameters
         ----------
         key : hashable
-            See `Field.key`.
+            The goals, and whatever else a request must have in common to use a field.
         grid : GridMap
         new_field : callable
             Makes a field with this key on this map that knows its goals alone.

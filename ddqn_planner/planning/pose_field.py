@@ -144,6 +144,7 @@ class PoseField(Field[Search]):
                     has_no_path = self._proved_bound() == math.inf
                     if has_no_path and not self._can_leave():
                         return math.inf
+                    # Finer tiles give better lower bounds: a new round begins.
                     aim = self.known.aim
                     self._begin_round(self.with_look_at_map(aim, aim.shift - 1))
                 else:
@@ -152,7 +153,7 @@ class PoseField(Field[Search]):
             return self._proved_bound()
 
     def _aim_at(self, start: State, bound: float) -> None:
-        """Begin the first round toward a start, unless the field aims at it already.
+        """Begin the first round of A* toward a start, unless the field aims at it.
 
         The start is (x, y, heading), and the bound the factor by which the cost from
         the start may exceed the least cost.

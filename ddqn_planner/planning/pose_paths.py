@@ -39,13 +39,14 @@ class PosePath(NamedTuple):
     def plan(self, first: int, grid: GridMap) -> PosePlan:
         """Return the plan along the rest of the path, from pose number `first` on.
 
-        Its cost is in seconds on a map `grid` of expected times, else in cells.
+        The plan's cost is in seconds on a map `grid` of expected times, else in cells.
         """
-        poses = self.poses[first:]
+        poses = self.poses[first:]  # (M, 3): metres and radians
         poses.flags.writeable = False
-        cells = self.cells[first:]
+        cells = self.cells[first:]  # (M, 2): in which the poses lie
         is_new_cell = np.append(True, (cells[1:] != cells[:-1]).any(axis=1))
-        cost_before = float(self.costs[first])  # of the part that is left out
+        # Costs are in cells, from the first pose of the path to each pose.
+        cost_before = float(self.costs[first])
         cost = float(self.costs[-1]) - cost_before
         # If the rest could cost less, so could the whole path.
         least_cost = self.least_cost - cost_before
@@ -54,7 +55,7 @@ class PosePath(NamedTuple):
             bound = 1.0
         elif least_cost > 0:
             bound = max(cost / least_cost, 1.0)
-        steps = np.diff(poses[:, :2], axis=0)  # (N - first - 1, 2), in metres
+        steps = np.diff(poses[:, :2], axis=0)  # (M - 1, 2), in metres
         goal_x, goal_y = cells[-1].tolist()
         return PosePlan(
             PlanStatus.SUCCEEDED,

@@ -167,7 +167,7 @@ def _expand_pose(number: int, distance: Any, mark: Any, heap: Any, search: Any) 
     Parameters
     ----------
     number : int
-        A state that was just closed, see `number_of_state`.
+        The number of a state (x, y, heading) that was just closed.
     distance : (N,) float32
         The cost from each state to a goal, in cells; changes in place.
     mark : (N,) uint8
@@ -242,7 +242,7 @@ def cheapest_primitive(
     Parameters
     ----------
     number : int
-        The state, see `number_of_state`.
+        The number of the state (x, y, heading).
     limit : float
         Only primitives count that lead to a state of a lower cost.
     greatest_cost : float32

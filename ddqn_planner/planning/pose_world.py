@@ -399,7 +399,8 @@ def differences(old: GridMap, new: GridMap) -> NDArray[np.int64] | None:
 def touches(x: int, y: int, mask: int, world: Any) -> bool:
     """Return whether an occupied cell lies in a mask around cell (x, y).
 
-    `mask` is the number of a mask, see `Body`: a set of cells, in rows of 64 bits.
+    `mask` is the number of a set of cells around the body, see `has_room`. The cells of
+    a mask are bits, in words of 64 cells of a row.
     """
     body = world.body
     for number in range(body.first_row[mask], body.first_row[mask + 1]):
@@ -490,8 +491,9 @@ def leaves_map(x: int, y: int, primitive: int, world: Any) -> bool:
 def has_room(x: int, y: int, mask: int, world: Any) -> bool:
     """Return whether no occupied cell lies in a mask around cell (x, y).
 
-    `mask` is the number of a mask, see `Body`. Mask p has the cells that the body
-    sweeps on primitive p: then the origin must not leave the map on p either.
+    `mask` is the number of a set of cells around the body: p for the cells that the
+    body sweeps on primitive p, higher numbers for the cells where it stands in each
+    heading, and others. On a primitive, the origin must not leave the map either.
     """
     if is_far(x, y, world):  # no mask around the cell touches an occupied cell
         return True

@@ -191,9 +191,9 @@ def segment_cost(
     """Return the cost of the segment from cell (x, y) to cell (last_x, last_y).
 
     It is the segment's length in cells, on a map with costs times the mean multiplier
-    of the cells that the segment crosses. With `must_be_legal`, it is infinite for a
-    segment that is not legal, see `simplify`. Both cells lie on the map, and the
-    segment joins their centres.
+    of the cells that the segment crosses. With `must_be_legal`, it is infinite if the
+    segment passes or touches an occupied cell, or leaves a cell by an action that the
+    cell forbids. Both cells lie on the map, and the segment joins their centres.
     """
     dx = last_x - x
     dy = last_y - y
@@ -265,7 +265,7 @@ def _may_not_leave(
     step_x, step_y : int
         The signs of the segment's extents, -1, 0 or 1.
     actions : int
-        A bit set, see `actions_of_segment`.
+        A bit set, bit a for action a: those between whose directions the segment lies.
     is_at_corner : bool
         Whether the segment leaves the cell at a corner.
     layers : Layers
