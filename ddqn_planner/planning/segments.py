@@ -192,8 +192,9 @@ def segment_cost(
 
     It is the segment's length in cells, on a map with costs times the mean multiplier
     of the cells that the segment crosses. With `must_be_legal`, it is infinite if the
-    segment passes or touches an occupied cell, or leaves a cell by an action that the
-    cell forbids. Both cells lie on the map, and the segment joins their centres.
+    segment crosses an occupied cell, touches a corner of one that must not be cut, or
+    leaves a cell by an action that the cell forbids. Both cells lie on the map, and the
+    segment joins their centres.
     """
     dx = last_x - x
     dy = last_y - y
