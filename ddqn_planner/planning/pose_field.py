@@ -94,7 +94,7 @@ class PoseField(Field[Search]):
     def _goals_alone(self) -> Search:
         """Return what is known before any growth: the goals cost 0 and are open."""
         world = self.world
-        tiles = world.nearness.size
+        tiles = world.nearness.size  # it has an element for each tile
         states = tiles << pose_space.TILE_BITS  # on the map
         search = Search(
             distance=_untouched(states, np.float32),  # 0 everywhere

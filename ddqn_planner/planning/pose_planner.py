@@ -435,7 +435,8 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         rows = np.arange(grid.height) - goal_row
         rows = rows[abs(rows) <= radius]  # (R,)
         distance = np.hypot(columns, rows[:, None])  # (R, C): from the goal, in cells
-        # Paths end in a ring: beyond a distance for each heading, within the radius.
+        # A path ends as soon as it may: in a ring, within the radius and beyond a
+        # distance that depends on the heading.
         least_distance = self._least_distance_of_ends(may_end, radius)  # (16,)
         is_end = (least_distance[:, None, None] < distance) & (distance <= radius)
         heading, row, column = np.nonzero(is_end)  # of (16, R, C)

@@ -488,7 +488,8 @@ def is_passable(
         The body on the map.
     """
     if passability[row, column] == UNSEEN:
-        # Impassable, as long as no cell was found that may be passed.
+        # Impassable, as long as no cell was found that may be passed. After the first
+        # such cell, no other cell is judged.
         passability[row, column] = IMPASSABLE
         for y in range(row << shift, min((row + 1) << shift, world.height)):
             for x in range(column << shift, min((column + 1) << shift, world.width)):

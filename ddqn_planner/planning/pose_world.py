@@ -234,7 +234,8 @@ def rows_of(masks: NDArray[np.bool_]) -> Rows:
     # (M, S, words): bit b of word w is the cell in column 64 w + b.
     words = np.packbits(whole_words, axis=-1, bitorder="little").view("<u8")
     mask, y, word = np.nonzero(words)  # (R,) each: the indices of a word
-    begins = np.column_stack([y, 64 * word]) - middle  # (R, 2): y and x
+    # (R, 2): y and x of a word's first cell, from the middle of the mask.
+    begins = np.column_stack([y, 64 * word]) - middle
     counts = np.bincount(mask, minlength=len(masks))  # (M,)
     return Rows(begins, words[mask, y, word], counts)
 
