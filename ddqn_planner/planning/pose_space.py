@@ -644,7 +644,8 @@ def _turn_into_cost(search: Any, last_key: Any, box: Any) -> None:
     was_stopped = search.heap.size[0] > 0
     for y in range(aim.corner_bound.shape[0]):
         for x in range(aim.corner_bound.shape[1]):
-            # A corner that was not visited has at least the key of the last one.
+            # A corner that A* has not visited has at least the key of the last one: so
+            # at least so many steps lead there. If A* was not stopped, none lead there.
             least_steps = np.inf
             if was_stopped:
                 least_steps = last_key - steps_to_box(x, y, box)

@@ -116,6 +116,7 @@ def _parsed(text: str) -> Any:
     position = 0  # up to where the text was read
     while position < len(text):
         token = _token_at(text, position)
+        # All but one are None: a bracket that opens or closes, a comma or a number.
         opens, closes, _, number = token.groups()
         if opens:
             lists.append([])
@@ -438,8 +439,8 @@ def _reach(radius: float, motions: Motions) -> int:
     The body's radius, its greatest distance from the robot's origin, is in cells. A
     ValueError if the cells are too many.
     """
-    poses = np.concatenate(motions.poses)
-    distances = np.hypot(poses[:, 0], poses[:, 1])
+    poses = np.concatenate(motions.poses)  # (N, 3): of all primitives
+    distances = np.hypot(poses[:, 0], poses[:, 1])  # cells from the start
     reach = math.ceil(radius + float(distances.max())) + 1
     if reach > MAX_REACH:
         problem = f"the body sweeps {reach} cells to a side; at most {MAX_REACH} can be"
