@@ -393,7 +393,7 @@ class Experience:
     def slowness(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: seconds, with waits, over those at nominal speed."""
         posterior = self.evidence.posterior_over(grid)
-        return posterior.to_cells(posterior.slowness.astype(np.float32), 1)
+        return posterior.to_cells(posterior.slowness.astype(np.float32), occupied=1)
 
     def uncertainty(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: the standard deviation of the log slowness.
@@ -401,7 +401,7 @@ class Experience:
         It is greatest where nothing is known.
         """
         posterior = self.evidence.posterior_over(grid)
-        unknown = posterior.to_cells(posterior.unknown.astype(np.float32), 1)
+        unknown = posterior.to_cells(posterior.unknown.astype(np.float32), occupied=1)
         return math.sqrt(self.evidence.population.variance) * unknown
 
     def expected_time(self, grid: GridMap, cells: Cells) -> ExpectedTime:

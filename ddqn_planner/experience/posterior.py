@@ -326,7 +326,7 @@ class Posterior:
         values = STEPS[steps]  # (P,)
         painted = self._painted.get(name)
         if painted is None or not np.array_equal(values, painted.values):
-            painted = Painted(values, self.to_cells(values, 1))
+            painted = Painted(values, self.to_cells(values, occupied=1))
             self._painted[name] = painted
         return painted.layer
 

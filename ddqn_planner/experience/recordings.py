@@ -291,6 +291,7 @@ def _are_apart(samples: Sequence[Sample], reference: Sequence[Sample]) -> bool:
     """
     if len(samples) < SMALLEST_SHARE * len(reference):
         return False
+    # (N,) each: seconds and metres, in the order of the times.
     times, x, y = np.array(sorted(samples)).T
     reference_times, reference_x, reference_y = np.array(sorted(reference)).T
     away_x = x - np.interp(times, reference_times, reference_x)

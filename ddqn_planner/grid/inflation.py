@@ -244,8 +244,9 @@ def grid_from_costmap(
     """Make a grid map from a costmap that Nav2 publishes as an ``OccupancyGrid``.
 
     `values` are (H, W) integers: 0 to 98 are costs of free cells, 99 is a cell in which
-    the robot would touch an obstacle, 100 an obstacle, and -1 unknown. The other
-    parameters are those of `GridMap.from_occupancy_values`.
+    the robot would touch an obstacle, 100 an obstacle, and -1 unknown. `resolution` is
+    in metres per cell, `origin` is the pose (x, y, yaw) of the corner of cell (0, 0),
+    and `allow_unknown` says whether unknown cells are free.
     """
     # A robot that starts in a cell of value 99 (inscribed) may leave: such cells are
     # occupied, but no obstacles.

@@ -115,7 +115,8 @@ def cells_along(
     (M, 2) int32
         Cells of which each is a neighbour of the one before it.
     (M,) float64
-        Their positions, see `positions`.
+        The position of each cell on the path: the index of its segment, plus the share
+        of the segment before the cell. The last position is N - 1.
     """
     extents = np.diff(path, axis=0)  # (N - 1, 2)
     steps = np.abs(extents).max(axis=1)  # (N - 1,): from cell to cell of each segment

@@ -168,7 +168,10 @@ def _is_meant(section: Section, declared_names: Collection[str], node: str) -> b
 
 
 def _remedy(sections: Sequence[Section], node: str) -> str:
-    """Return in words which nodes sections are for, and which section a node needs."""
+    """Return in words for which nodes sections are, and which section a node needs.
+
+    `node` is the node's full name. A section with a similar name is to be renamed.
+    """
     listing = ", ".join(section.pattern for section in sections[:MOST_NAMES])
     if len(sections) > MOST_NAMES:
         listing += ", ..."

@@ -30,6 +30,8 @@ class ReplayBuffer:
         """Make an empty buffer for `capacity` transitions."""
         self.capacity = capacity
         self.added = 0  # the number of transitions that were ever added
+        # (capacity,) each: the ring, of which the first `len(self)` elements are in
+        # use.
         self.transitions = Transitions(
             scenario=np.zeros(capacity, np.int64),
             cell=np.zeros(capacity, np.int64),
