@@ -25,6 +25,7 @@ def flood(
     Parameters
     ----------
     layers : Layers
+        The map of H x W cells, with the rule of its moves.
     backward : bool
         Whether to mark the cells from which paths lead to the first cells instead.
     reached : (H, W) bool

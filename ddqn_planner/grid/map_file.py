@@ -91,6 +91,7 @@ class MapFile:
         )
         values = values.astype(np.int8)
         values.flags.writeable = False
+        # A grid map checks the place and the one-way zones.
         grid = GridMap(
             values == OCCUPIED, self.resolution, self.origin, forbidden=self.forbidden
         )

@@ -412,10 +412,11 @@ def check_pose(
 
 
 def cell_from_pose(name: str, stamped: PoseStamped, grid: GridMap, frame: str) -> Cell:
-    """Return the cell (x, y) of a pose, which may be off the map.
+    """Return the cell (x, y) of a pose on the map `grid`; it may be off the map.
 
-    The parameters are those of `check_pose`, and so are the reasons for a ValueError;
-    a pose that is too far away to have a cell is one, too.
+    `frame` is the frame of the map, in which the pose must be, and `name` is what
+    errors call the pose. A ValueError if it is no such pose, see `check_pose`, or too
+    far away to have a cell.
     """
     check_pose(name, stamped, frame)
     position = stamped.pose.position

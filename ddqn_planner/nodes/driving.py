@@ -349,7 +349,10 @@ class Driving:
         return Answer(True, f"recording in {folder.folder} after drive {folder.drives}")
 
     def stop(self) -> Answer:
-        """End and record the drives that robots are on, save, and stop recording."""
+        """End and record the drives that robots are on, save, and stop recording.
+
+        If saving fails, the recording continues, and the answer says why.
+        """
         folder = self._folder
         if folder is None:
             self._node.state = "stopped"

@@ -515,6 +515,7 @@ def add_windows_of_robot(
         for column in range(x // 2, last_column + 1):
             window = row * window_columns + column
             copy_window(windows, scenario, window, row_count)
+            # The first cell of the window is (2 * column - 1, 2 * row - 1) of the map.
             y_in_window = y + 1 - 2 * row
             x_in_window = x + 1 - 2 * column
             windows.patch[row_count, 3 * y_in_window + x_in_window] = ROBOT
