@@ -2,9 +2,12 @@
 
 import os
 import resource
+import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import FrameType, ModuleType
+from typing import Any
 
 from processes import memory
 
@@ -27,3 +30,34 @@ def memory_grows_less_than(megabytes: float) -> Iterator[None]:
     before = memory(os.getpid(), "VmHWM")
     yield
     assert memory(os.getpid(), "VmHWM") - before < megabytes
+
+
+@contextmanager
+def memory_ends_at_line(
+    number: int, *modules: ModuleType, atomic: type | None = None
+) -> Iterator[None]:
+    """Fail where so many lines of some modules were run, as without memory, if they
+    are. Lines of the methods of `atomic` do not count.
+    """
+    files = {module.__file__ for module in modules}
+    lines_left = number
+
+    def trace(frame: FrameType, event: str, _: object) -> Any:
+        nonlocal lines_left
+        is_atomic = atomic is not None and isinstance(
+            frame.f_locals.get("self"), atomic
+        )
+        if is_atomic or frame.f_code.co_filename not in files:
+            return None
+        lines_left -= event == "line"
+        if not lines_left:
+            raise MemoryError
+        return trace
+
+    before = sys.gettrace()
+    with suppress(MemoryError):
+        sys.settrace(trace)
+        try:
+            yield
+        finally:
+            sys.settrace(before)

@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from action_msgs.msg import GoalStatus
 from rclpy.action.client import ActionClient
@@ -19,10 +19,6 @@ from ddqn_planner.nodes.quality import SERVICE_QUALITY
 GivenUp = Callable[[], Outcome | None]
 
 ACTIONS = ("compute_path_to_pose", "compute_path_through_poses")
-SERVER_WAIT = 1.0  # seconds until a server that was just started is discovered
-ACCEPT_WAIT = 5.0  # seconds in which a server says whether it accepts a goal
-# Seconds until a server is asked for the result again: a new server lacks the goal.
-ASK_PERIOD = 2.0
 # Seconds between two checks whether a goal is given up, or its server is gone.
 TICK = 0.05
 
@@ -34,6 +30,20 @@ QUEUES = {
 # Statuses of outcomes.
 INVALID = "INVALID_PLANNER"
 LOST = "PLANNER_LOST"
+
+
+class Waits(NamedTuple):
+    """How long to wait for a server, in seconds."""
+
+    # Until a server that was just started is discovered.
+    discovery: float = 1.0
+    # Until the server says whether it accepts a goal.
+    acceptance: float = 5.0
+    # Until the server is asked for the result again: a new server lacks the goal.
+    result: float = 2.0
+
+
+DEFAULT_WAITS = Waits()
 
 
 class GoalAnswer(Protocol):
@@ -87,13 +97,31 @@ def check_prefix(node: BaseNode, prefix: str) -> None:
 
 
 class OtherPlanners:
-    """The server of one action, to which goals are sent as they are."""
+    """The server of one action, to which goals are sent as they are.
 
-    def __init__(self, node: BaseNode, action_type: Any, name: str) -> None:
-        """Make a client of the action `name` of a type, which `node` uses."""
+    Parameters
+    ----------
+    node
+        Sends the goals.
+    action_type
+        The type of the action.
+    name
+        The name of the action.
+    waits
+        How long to wait for the server.
+    """
+
+    def __init__(
+        self,
+        node: BaseNode,
+        action_type: Any,
+        name: str,
+        waits: Waits = DEFAULT_WAITS,
+    ) -> None:
         self._node = node
         self._action_type = action_type
         self._name = name
+        self.waits = waits
         self._group = ReentrantCallbackGroup()
         self._next_wake = Future()  # done by `_wake`
         self._timer = node.create_timer(TICK, self._wake, clock=STEADY)
@@ -174,7 +202,8 @@ class OtherPlanners:
             Returns the outcome if the goal is given up now, else None.
         """
         await self._wait(
-            lambda: self._client.server_is_ready() or given_up(), SERVER_WAIT
+            lambda: self._client.server_is_ready() or given_up(),
+            self.waits.discovery,
         )
         outcome = given_up()
         if outcome is not None:
@@ -186,10 +215,11 @@ class OtherPlanners:
             )
         sending = self._client.send_goal_async(goal, goal_uuid=goal_id)
         sending.add_done_callback(self._wake)
-        await self._wait(lambda: sending.done() or given_up(), ACCEPT_WAIT)
+        acceptance = self.waits.acceptance
+        await self._wait(lambda: sending.done() or given_up(), acceptance)
         if not sending.done():
             sending.add_done_callback(_cancel)
-            silence = f"{planner}: no answer from {self._name} within {ACCEPT_WAIT:g} s"
+            silence = f"{planner}: no answer from {self._name} within {acceptance:g} s"
             return given_up() or Outcome(
                 INVALID, f"{silence}; look into its server's log"
             )
@@ -215,7 +245,7 @@ class OtherPlanners:
                 """Return something true if there is an answer, or will be none."""
                 return asking.done() or given_up() or not self._client.server_is_ready()
 
-            if await self._wait(is_over, ASK_PERIOD):
+            if await self._wait(is_over, self.waits.result):
                 answer: GoalAnswer | None = asking.result() if asking.done() else None
                 return answer
 

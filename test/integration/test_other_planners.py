@@ -25,9 +25,9 @@ from rclpy.executors import (
 )
 from unique_identifier_msgs.msg import UUID
 
-from ddqn_planner.nodes import nav2, other_planners
+from ddqn_planner.nodes import nav2
 from ddqn_planner.nodes.base_node import BaseNode
-from ddqn_planner.nodes.other_planners import OtherPlanners
+from ddqn_planner.nodes.other_planners import OtherPlanners, Waits
 from ddqn_planner.nodes.outcome import Outcome
 from ddqn_planner.nodes.planner_node import PlannerNode
 
@@ -67,6 +67,9 @@ class Server:
             self.node.destroy_node()
 
 
+ON_A_BUSY_MACHINE = Waits(discovery=TIMEOUT, acceptance=TIMEOUT)
+
+
 class Fibonacci:
     """A server of sequences, and whoever asks it as the planner does."""
 
@@ -80,7 +83,7 @@ class Fibonacci:
         self.node = BaseNode("asks", {})
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
-        self.others = OtherPlanners(self.node, self.kind, name)
+        self.others = OtherPlanners(self.node, self.kind, name, ON_A_BUSY_MACHINE)
         self.outcome: Outcome | None = None
 
     def serve(self) -> Server:
@@ -131,12 +134,8 @@ class Fibonacci:
 
 
 @pytest.fixture
-def fibonacci(
-    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[Fibonacci]:
+def fibonacci(request: pytest.FixtureRequest) -> Iterator[Fibonacci]:
     pytest.importorskip("test_msgs.action", reason="test_msgs is missing")
-    for patience in ("SERVER_WAIT", "ACCEPT_WAIT"):  # on a busy machine
-        monkeypatch.setattr(other_planners, patience, TIMEOUT)
     rclpy.init()
     asked = Fibonacci(f"moved_{abs(hash(request.node.name))}/sequence")
     yield asked
@@ -168,10 +167,8 @@ def test_an_answer_comes_back_with_its_state(fibonacci: Fibonacci) -> None:
     assert [goal.order for goal in fibonacci.goals] == [SUCCEED, ABORT, REJECT]
 
 
-def test_without_a_server_the_answer_is_said_soon(
-    fibonacci: Fibonacci, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(other_planners, "SERVER_WAIT", 0.1)
+def test_without_a_server_the_answer_is_said_soon(fibonacci: Fibonacci) -> None:
+    fibonacci.others.waits = Waits(discovery=0.1)
     outcome = fibonacci.answer(fibonacci.ask(SUCCEED))
     assert outcome.status == "INVALID_PLANNER"
     assert (
@@ -226,9 +223,9 @@ def test_what_is_given_up_before_it_is_accepted_is_canceled(
 
 
 def test_a_server_that_ends_is_said_and_the_next_one_is_asked(
-    fibonacci: Fibonacci, monkeypatch: pytest.MonkeyPatch
+    fibonacci: Fibonacci,
 ) -> None:
-    monkeypatch.setattr(other_planners, "ASK_PERIOD", 0.2)
+    fibonacci.others.waits = ON_A_BUSY_MACHINE._replace(result=0.2)
     for is_replaced in (False, True):  # another server of the name is there at once
         server = fibonacci.serve()
         asking = fibonacci.ask(WAIT)

@@ -5,9 +5,10 @@ node.
 import importlib.util
 import json
 import re
+import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from itertools import product
@@ -236,6 +237,20 @@ NEEDS_TF = (
 )
 
 
+@contextmanager
+def signals_given_back() -> Iterator[None]:
+    """Give signals back to pytest after a node has listened to them."""
+    handlers = {
+        number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(-1)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+
 @pytest.mark.parametrize(
     "case",
     [
@@ -312,11 +327,8 @@ def test_what_a_node_cannot_start_with_is_said_and_ends_with_1(
     monkeypatch.setattr(sys, "argv", ["node", "--ros-args", *given, *arguments])
     for variable, value in environment.items():
         monkeypatch.setenv(variable, value)
-    # Signals are pytest's here.
-    monkeypatch.setattr(
-        "ddqn_planner.nodes.stop_signal.StopSignal.listen", lambda *_: None
-    )
-    assert import_module(f"ddqn_planner.nodes.{name}_node").main() == 1
+    with signals_given_back():
+        assert import_module(f"ddqn_planner.nodes.{name}_node").main() == 1
     log = capfd.readouterr().err
     assert re.search(f"cannot start: .*({reason})", log)
     assert "Traceback" not in log

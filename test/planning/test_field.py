@@ -1,12 +1,9 @@
 import copy
-import sys
 import tracemalloc
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
-from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -14,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_st
+from limits import memory_ends_at_line
 from networks import ANY_MAP, new_planner
 from random_maps import generate_map
 from strategies import (
@@ -437,29 +435,12 @@ def run_until(line: int, step: Callable[[], object]) -> None:
     there.
     """
     modules = fields, field_cache, cell_space, queues, wavefront
-    files = {module.__file__ for module in modules}
-    left = line
-
-    def trace(frame: FrameType, event: str, _: object) -> Any:
-        nonlocal left
-        # A trace that fails where a lock is left leaves it locked.
-        is_cache = isinstance(frame.f_locals.get("self"), field_cache.FieldCache)
-        if is_cache or frame.f_code.co_filename not in files:
-            return None
-        left -= event == "line"
-        if not left:
-            raise MemoryError
-        return trace
-
-    before = sys.gettrace()
-    with pytest.MonkeyPatch.context() as patch, suppress(MemoryError):
+    with pytest.MonkeyPatch.context() as patch:
         for name in ("spread_over_cells", "lose_unsupported", "reopen"):
             patch.setattr(cell_space, name, getattr(cell_space, name).__wrapped__)
-        sys.settrace(trace)
-        try:
+        # A failure where a lock is left would leave it locked.
+        with memory_ends_at_line(line, *modules, atomic=field_cache.FieldCache):
             step()
-        finally:
-            sys.settrace(before)
 
 
 def test_after_too_many_changes_both_fields_are_kept(
