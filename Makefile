@@ -72,7 +72,8 @@ test: $(VENV)/compiled
 test-fast: setup
 	$(PYTEST) --ignore test/integration -m "not slow"
 
-# Which lines and branches the fast tests run, as a table; compiled functions do not count.
+# Which lines and branches the fast tests run, as a table, without compiled functions and
+# nodes.
 coverage: setup
 	$(PYTEST) --ignore test/integration -m "not slow" --cov --cov-report term-missing:skip-covered
 

@@ -194,6 +194,11 @@ def test_a_wrong_argument_is_a_value_error_that_names_it(
         call(**{**right, name: value})
 
 
+def test_a_number_that_python_does_not_write_is_named() -> None:
+    with pytest.raises(ValueError, match="tolerance is a number of thousands of digit"):
+        PLANNER.plan(GRID, (0, 0), (1, 1), tolerance=-(10**5000))
+
+
 def test_a_path_for_experience_is_a_path() -> None:
     for wrong, call in product(
         (3, None, b"x", ["x"]), (EXPERIENCE.save, Experience.load)

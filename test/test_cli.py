@@ -15,6 +15,7 @@ from processes import executable
 
 from ddqn_planner.grid import GridMap, MapFile, MoveRule
 from ddqn_planner.model import load_model
+from ddqn_planner.resources import ROS, with_remedy
 from ddqn_planner.training.any_map import ANY_MAP, random_scenarios
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
@@ -157,6 +158,18 @@ def test_each_hyper_parameter_can_be_given(
         not given.items() & {entry.name: entry.default for entry in PARAMETERS}.items()
     )
     assert load_model(tmp_path / "run" / "model.safetensors")[1].seed == 5
+
+
+def test_a_training_on_no_map_is_refused(console: Any, tmp_path: Path) -> None:
+    refused = console("train-any-map --maps 0 --out", tmp_path / "run", status=2).err
+    assert "--maps is 0; give at least 1" in refused
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_missing_library_of_ros_is_named_with_its_remedy() -> None:
+    for module in ("rclpy", "nav_msgs.msg", "rcl_interfaces"):
+        error = ImportError(f"No module named {module!r}", name=module)
+        assert with_remedy(error) == f"{error}; {ROS}"
 
 
 def test_the_model_for_any_map_is_trained_with_parameters_of_its_own(

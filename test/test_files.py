@@ -2,6 +2,7 @@
 of none.
 """
 
+import errno
 import os
 import pwd
 from collections.abc import Callable, Iterator
@@ -16,7 +17,7 @@ from hypothesis import strategies as st
 
 from ddqn_planner import Experience, Planner, load_map
 from ddqn_planner.experience.drives import DriveFolder
-from ddqn_planner.files import as_path
+from ddqn_planner.files import FileWriteError, as_path
 from ddqn_planner.model import load_model, save_model
 from ddqn_planner.model.model_file import find_model
 from ddqn_planner.resources import find_map
@@ -79,6 +80,12 @@ def test_without_the_variable_the_home_is_that_of_the_users_list(
         ValueError, match="no home folder of this user is known; give the full"
     ):
         as_path("~/x")
+
+
+def test_a_full_disk_is_named_with_its_remedy(tmp_path: Path) -> None:
+    for number in (errno.ENOSPC, errno.EDQUOT):
+        error = FileWriteError(tmp_path / "x", OSError(number, os.strerror(number)))
+        assert str(error).endswith("; make room there, or give another path")
 
 
 NO_PATHS = {

@@ -32,10 +32,7 @@ def shift_between(old: GridMap, new: GridMap) -> Cell | None:
     if old.origin[2] != new.origin[2]:
         return None
     centre = old.cell_to_world((0, 0))
-    try:
-        cell = new.world_to_cell(*centre)
-    except (OverflowError, ValueError):  # too far away for a whole number of cells
-        return None
+    cell = new.world_to_cell(*centre)
     distance = math.dist(centre, new.cell_to_world(cell))
     if distance >= SAME_PLACE * new.resolution:
         return None

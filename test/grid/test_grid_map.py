@@ -394,6 +394,17 @@ def test_maps_that_come_one_after_another_are_inflated_as_if_each_were_the_first
             np.testing.assert_array_equal(found.obstacles, grid.occupancy)  # type: ignore[arg-type]
 
 
+def test_patches_side_by_side_are_inflated_as_one_box() -> None:
+    body, inflation = (2.0, 0.5), Inflation()
+    grid = GridMap(np.zeros((40, 60)), 0.5)
+    inflation(grid, *body)
+    for x in range(10, 20):
+        grid = grid.with_patch([[True]], x, 20)
+    found, expected = inflation(grid, *body), inflate(grid, *body)
+    assert found.same_cells(expected)
+    np.testing.assert_array_equal(found.obstacles, grid.occupancy)  # type: ignore[arg-type]
+
+
 def test_costs_are_those_of_navfn() -> None:
     costs = np.arange(253).reshape(1, -1)
     published = np.where(

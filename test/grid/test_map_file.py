@@ -255,6 +255,8 @@ def test_an_impossible_map_file_is_not_made() -> None:
             ({"negate": wrong}, f"negate is '{wrong}'; give 0 or 1")
             for wrong in ("0x1", "tRUE", "0.0", "")
         ),
+        ({"negate": []}, r"negate is \[\]; give 0 or 1"),
+        ({"image": None, "imgae": "map.png"}, "write 'image:' instead of 'imgae:'"),
         ({"occupied_thresh": 1.5}, r"occupied_thresh is 1\.5"),
         *(
             ({"free_thresh": 0.7}, r"free_thresh is 0\.7"),

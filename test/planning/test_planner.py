@@ -544,6 +544,26 @@ def test_a_path_through_goals_is_the_sum_of_its_pieces(
         assert plan.cost == pytest.approx(sum(piece.cost or 0 for piece in pieces))
 
 
+def test_a_model_without_a_body_plans_no_poses() -> None:
+    grid = GridMap(np.zeros((3, 3)))
+    with pytest.raises(ValueError, match="the model knows no body; give one of ddqn-"):
+        ANY_MAP.plan_poses(grid, (0.5, 0.5, 0.0), (1.5, 1.5, 0.0))
+
+
+def test_a_path_to_another_goal_is_not_kept() -> None:
+    grid, start, goal = GridMap(np.zeros((9, 9))), (0, 4), (8, 4)
+    new = ANY_MAP.plan(grid, start, goal, MoveRule.ROBOT_SAFE)
+    request = PlanRequest(grid, start, (goal,), MoveRule.ROBOT_SAFE)
+    for end, is_kept in (((8, 3), False), (goal, True)):
+        path = ANY_MAP.plan(grid, start, end, MoveRule.ROBOT_SAFE).path
+        under_way = replace(request, under_way=path, switch_threshold=1.0)
+        np.testing.assert_array_equal(ANY_MAP.rest_of_path(under_way), path)
+        plan = last_step(ANY_MAP.steps(under_way))
+        assert plan is not None
+        assert (plan.extra_cost is not None) == is_kept
+        assert plan.cells == new.cells
+
+
 def test_wrong_goals_are_named() -> None:
     grid = GridMap(np.zeros((3, 3)))
     for plan in (ANY_MAP.plan_nearest, ANY_MAP.plan_through):

@@ -312,6 +312,14 @@ def test_unknown_space_that_a_body_touches_is_named(
     )
 
 
+def test_a_body_has_its_own_model_and_map(car: Planner) -> None:
+    grid = body_hall()
+    with pytest.raises(ValueError, match="use plan_poses, or a planner_node"):
+        car.plan(grid, (28, 40), (138, 40))
+    outside = car.plan_poses(grid, POSES[0], (99.0, 2.0, 0.0))
+    assert outside.reason.startswith("the goal lies outside the map")
+
+
 def test_the_goals_of_a_body_are_numbered(car: Planner) -> None:
     grid = body_hall(goal=UNKNOWN)
     plan = car.plan_poses(grid, POSES[0], [(99.0, 2.0, 0.0), POSES[1], (6.9, 2.0, 0.0)])

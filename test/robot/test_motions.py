@@ -172,6 +172,8 @@ def test_every_polygon_without_crossing_sides_is_taken(points: Any) -> None:
     form=st.sampled_from([*FORMS, LONG, "0.2", "triangle"]),
     padding=st.floats(1e-3, 0.5),
 )
+@example(form="triangle", padding=0.1)  # its tip is cut
+@example(form="U", padding=0.3)
 def test_padding_makes_a_body_larger_on_each_side(form: str, padding: float) -> None:
     footprint = {"triangle": [(0.9, 0), (-0.2, 0.05), (-0.2, -0.05)], **FORMS}.get(
         form, form

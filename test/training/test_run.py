@@ -156,6 +156,18 @@ def test_a_failed_save_is_tried_again_later(small: Scenario, tmp_path: Path) -> 
     run.close()
 
 
+def test_a_run_that_is_stopped_is_saved_and_ends(
+    small: Scenario, tmp_path: Path
+) -> None:
+    run = open_run(tmp_path, small)
+    for _ in run.steps():
+        run.requests.add("stop")
+    assert 0 < run.trainer.steps < PARAMETERS.steps
+    assert run.saved_at == run.trainer.steps
+    assert run.checkpoint_path.exists()
+    run.close()
+
+
 def test_a_training_that_diverged_is_not_saved(small: Scenario, tmp_path: Path) -> None:
     run = open_run(tmp_path, small)
     next(run.steps())

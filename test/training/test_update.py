@@ -269,6 +269,11 @@ def test_hyper_parameters_of_a_wrong_kind_are_named(
         HyperParameters(**{name: value})
 
 
+def test_more_environments_than_the_buffer_holds_are_named() -> None:
+    with pytest.raises(ValueError, match="environments is 9; give at most replay_cap"):
+        HyperParameters(environments=9, replay_capacity=8)
+
+
 def test_hyper_parameters_are_plain_numbers() -> None:
     made = HyperParameters(steps=np.int64(7), batch_size=4.0, gamma=1)  # type: ignore[arg-type]
     assert [type(value) for value in (made.steps, made.batch_size, made.gamma)] == [
