@@ -632,7 +632,7 @@ class Navigator:
 
         rclpy's action client ignores an answer that comes before the request is noted.
         """
-        return done(self.robot.client._executor.create_task(function, *arguments))
+        return done(self.robot.client.run(function, *arguments))
 
     def send(self, goal: PoseStamped | list[PoseStamped], **fields: Any) -> Any:
         if isinstance(goal, list):
