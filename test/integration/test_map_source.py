@@ -381,11 +381,8 @@ def test_a_map_waits_a_second_for_a_publisher_that_sends_nothing(
 
 
 def test_each_new_publisher_is_awaited_for_a_second_whoever_was_awaited_before(
-    node: BaseNode, source: Source, monkeypatch: pytest.MonkeyPatch
+    node: BaseNode, source: Source
 ) -> None:
-    now = [100.0]
-    clock = SimpleNamespace(monotonic=lambda: now[0])
-    monkeypatch.setattr("ddqn_planner.nodes.directions.time", clock)
     for stamp in (1, 2):
         publisher = node.create_publisher(OccupancyGrid, "map_directions", LATCHED)
         wait_for("publisher", lambda: node.count_publishers("map_directions") > 0)
@@ -398,7 +395,7 @@ def test_each_new_publisher_is_awaited_for_a_second_whoever_was_awaited_before(
         )
         assert source.used() == (stamp, None)
         assert not source.is_settling
-        now[0] += 10.0
+        source.now += 10.0
 
 
 @pytest.mark.usefixtures("published")
