@@ -346,7 +346,7 @@ def _padded(content: bytes, offset: int) -> bytes:
 
 
 def bytes_message(kind: str, data: bytes) -> UInt8MultiArray:
-    """Make the message that carries the bytes of a file.
+    """Make the message that carries the bytes `data` of a file.
 
     `kind` is "model" or "experience": the label of the message has the kind, a version
     and a digest of the bytes.

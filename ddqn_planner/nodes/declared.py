@@ -189,7 +189,10 @@ def parameter(
     read_only: bool = False,
     replaced: Mapping[str, str] = NOTHING_REPLACED,
 ) -> T:
-    """Declare a parameter as a field of a dataclass of settings; see `Declared`."""
+    """Declare a parameter as a field of a dataclass of settings.
+
+    The arguments are the fields of `Declared`, which becomes the field's metadata.
+    """
     declaration = Declared(default, description, allowed, read_only, replaced)
     entry: T = field(default=default, metadata={"declaration": declaration})
     return entry

@@ -37,8 +37,8 @@ class Diagnostics:
     def receiving(self, input_name: str, is_frequent: bool = False) -> Iterator[None]:
         """Accept an input, or refuse it if the body of the with statement raises.
 
-        A ValueError or a MemoryError of the body ends here. Of a frequent input, only
-        the first refusal is logged.
+        A ValueError or a MemoryError of the body ends here. `input_name` is the name of
+        the input in reports. If `is_frequent`, only its first refusal is logged.
         """
         try:
             yield
@@ -75,7 +75,9 @@ class Diagnostics:
     ) -> None:
         """Publish the status of a task, with the problems of the node's topics.
 
-        Problems of topics are logged once, and make the level a warning at least.
+        `level` is OK, WARN or ERROR of DiagnosticStatus, `message` says why, and
+        `values` are shown by their names. Problems of topics are logged once, and make
+        the level a warning at least.
         """
         problems = self.node.topic_problems()
         if problems:

@@ -214,7 +214,7 @@ def _is_outlined(poses: Float64) -> NDArray[np.bool_]:
 
 
 def footprint_message(outlines: Float64, header: Header) -> MarkerArray:
-    """Make a message that draws outlines, (M, K, 2) metres, as lines."""
+    """Make a message with a header that draws outlines, (M, K, 2) metres, as lines."""
     marker = _marker(header, Marker.ADD)
     for outline in outlines.tolist():
         # The lines share their points, because most of the time goes into making
@@ -245,9 +245,10 @@ def _point(x: float, y: float) -> Point:
 
 
 def _value_message(picture: Picture, is_empty: bool) -> OccupancyGrid:
-    """Make the message of the field toward a goal; compute the field if need be.
+    """Make the message of a picture's field toward the goal.
 
-    In an empty message, no cell of the map has a value.
+    The field is computed unless the planner has it. If `is_empty`, no cell of the map
+    has a value.
     """
     planner = picture.outcome.planner
     request = picture.outcome.request
@@ -263,9 +264,9 @@ def _value_message(picture: Picture, is_empty: bool) -> OccupancyGrid:
 
 
 def _footprint_message(picture: Picture, is_empty: bool) -> MarkerArray:
-    """Make the message of a body's outlines along the path of a plan.
+    """Make the message of a body's outlines along the path of a picture's plan.
 
-    An empty message deletes the last outlines.
+    If `is_empty`, the message deletes the last outlines instead.
     """
     if is_empty:
         return MarkerArray(markers=[_marker(picture.header, Marker.DELETE)])

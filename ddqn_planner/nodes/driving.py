@@ -232,7 +232,7 @@ class Driving:
         )
 
     def _check_speed(self, folder: DriveFolder) -> None:
-        """Warn once when drives show that the nominal speed is wrong."""
+        """Warn once when a folder's drives show that the nominal speed is wrong."""
         experience = folder.experience
         # The log slowness is 0 where the robot drives at the nominal speed, and below 0
         # where it is faster.

@@ -97,19 +97,7 @@ def check_prefix(node: BaseNode, prefix: str) -> None:
 
 
 class OtherPlanners:
-    """The server of one action, to which goals are sent as they are.
-
-    Parameters
-    ----------
-    node
-        Sends the goals.
-    action_type
-        The type of the action.
-    name
-        The name of the action.
-    waits
-        How long to wait for the server.
-    """
+    """The server of one action, to which goals are sent as they are."""
 
     def __init__(
         self,
@@ -118,6 +106,19 @@ class OtherPlanners:
         name: str,
         waits: Waits = DEFAULT_WAITS,
     ) -> None:
+        """Make a client of the server.
+
+        Parameters
+        ----------
+        node
+            Sends the goals.
+        action_type
+            The type of the action.
+        name
+            The name of the action.
+        waits
+            How long to wait for the server.
+        """
         self._node = node
         self._action_type = action_type
         self._name = name

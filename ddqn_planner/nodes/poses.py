@@ -328,7 +328,7 @@ def vector(message: Point | Vector3) -> Vector:
 
 
 def transformed(stamped: PoseStamped, transform: TransformStamped) -> PoseStamped:
-    """Return a pose turned and shifted by a transform, in the plane.
+    """Return the pose `stamped` turned and shifted by a transform, in the plane.
 
     The result is in the parent frame of the transform; its z, roll and pitch are 0. A
     ValueError if the transform's numbers are those of no transform.

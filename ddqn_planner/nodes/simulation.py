@@ -88,9 +88,10 @@ class Simulation:
             self._poses[name] = pose
 
     def _on_pose(self, name: str, stamped: PoseStamped) -> None:
-        """Use a pose as the "start" or the "goal" of the next training.
+        """Use a pose as the start or the goal of the next training.
 
-        A ValueError refuses the pose.
+        `name` is "start" or "goal". A ValueError refuses a malformed pose, and a pose
+        that lies on no free cell of the map.
         """
         # A pose may come before the map: ~/start then checks its cell.
         check_pose(f"the {name}", stamped)
@@ -182,8 +183,8 @@ class Simulation:
     def _train(self, run: TrainingRun, map_in_frame: MapInFrame) -> None:
         """Train until the training has finished or is stopped, in the worker's thread.
 
-        Rewards and episodes are published; the node's state tells how the training
-        ended.
+        `run` is the training, on the map `map_in_frame`. Rewards and episodes are
+        published; the node's state tells how the training ended.
         """
         node = self._node
         # Episodes are drawn in the executor's thread, in which replays begin: no
@@ -219,9 +220,9 @@ class Simulation:
             self._node.get_logger().info(place)
 
     def recorded(self, file: Path, map_in_frame: MapInFrame) -> Recording:
-        """Return the episodes of a file, whose cells lie on a map.
+        """Return the episodes of a file, whose cells lie on the map `map_in_frame`.
 
-        If the last training wrote the file, the map of that training is used.
+        If the last training wrote the file, the map of that training is used instead.
         """
         if self._run is not None and self._run.folder == file.parent:
             assert self._map_of_run is not None

@@ -89,7 +89,7 @@ def _reason(error: Exception) -> str:
 
 
 def _spin(node: Node, executor: Executor, stop: StopSignal) -> None:
-    """Run a node until the signal to stop, and destroy it."""
+    """Run a node in an executor until the signal to stop, and destroy it."""
     try:
         executor.add_node(node)
         with suppress(Interrupted):
