@@ -127,8 +127,9 @@ class FieldCache(Generic[AnyField]):
         """
         for field in self.kept:
             if field.key == key and field.is_on(grid):
-                # The same cells may lie at another origin, in other arrays.
-                _put_on(field, grid)
+                if field.grid is not grid:
+                    # The same cells may lie at another origin, in other arrays.
+                    _put_on(field, grid)
                 with self._lock:
                     others = [other for other in self.kept if other is not field]
                     self.kept = [*others, field]
