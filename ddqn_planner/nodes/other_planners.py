@@ -236,7 +236,7 @@ class OtherPlanners:
         """Return the answer to an accepted goal.
 
         None if the goal is given up, as `given_up` tells, or if the server is gone. The
-        server is asked again each ASK_PERIOD, as a new server lacks the goal.
+        server is asked again and again, as a server that was restarted lacks the goal.
         """
         while True:
             asking = sent_goal.get_result_async()
