@@ -328,7 +328,7 @@ class Evidence:
         Parameters
         ----------
         table : (N, 7) float64
-            See `Places.table`.
+            A row for each place, see `Places.table`.
         driven : () float64
             Seconds.
         errors, surprises : (D,) float64

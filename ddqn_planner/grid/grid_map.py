@@ -168,7 +168,8 @@ class GridMap:
             Occupancy in percent. Any value below 0 is unknown, any above 100 is
             occupied.
         resolution, origin, forbidden
-            As for `GridMap`.
+            Metres per cell; the pose (x, y, yaw) of the corner of cell (0, 0) in metres
+            and radians; and the one-way zones, (H, W). As for `GridMap`.
         occupied_threshold : int
             A cell of this value or more is occupied, 1..100; map_server has 65 by
             default.

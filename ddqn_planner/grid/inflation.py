@@ -105,7 +105,7 @@ def _clearance_costs(
     metres : (H, W) float64
         The distance of each cell to the nearest obstacle, minus the robot's radius.
     clearance_weight : float
-        See `inflate`.
+        0..1: the cost at the distance 0, as a share of the greatest cost.
     """
     root = 1 + np.maximum(metres, 0.0) / CLEARANCE_SCALE
     share = clearance_weight / (root * root * root)  # ** 3 takes 20 times as long

@@ -96,7 +96,7 @@ def move_costs(multiplier: NDArray[np.float32]) -> NDArray[np.float64]:
     Parameters
     ----------
     multiplier : (H, W) float32
-        See `GridMap.cost_multiplier`.
+        The cost of a path per cell of length, 1 or more, in each cell.
     """
     multiplier_of_cell = multiplier.astype(np.float64)  # (H, W)
     padded = np.pad(multiplier_of_cell, 1, mode="edge")

@@ -153,7 +153,8 @@ def load_map(
         A file, whose leading ``~`` stands for the home folder, or the name of a shipped
         map.
     occupied_threshold, allow_unknown, use_map_costs
-        As for `GridMap.from_occupancy_values`.
+        From which percent on a cell is occupied, whether unknown cells are free, and
+        whether the values of free cells are costs; see `GridMap.from_occupancy_values`.
 
     Raises
     ------
@@ -321,8 +322,9 @@ def _image_path(
     document : dict
         The part of its content with the key.
     key : str
+        The key of the image's path.
     only_below : bool
-        See `read_map_file`.
+        Whether the image must lie in the folder of the YAML file, or below.
     """
     name = _value(document, key)
     if not isinstance(name, str) or not name:

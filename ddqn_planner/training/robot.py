@@ -92,7 +92,8 @@ class RobotTrainer:
         footprint, padding
             The body, see `read_footprint`.
         motion, turning_radius, resolution
-            See `make_motions`; metres, and metres per cell.
+            The kind of motion, the radius of its tightest turns in metres, and the
+            metres per cell, see `make_motions`.
         lattice
             A file of motions that replaces the three; then `motion` must be None.
         seed

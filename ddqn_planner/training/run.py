@@ -45,7 +45,8 @@ class TrainingRun(WorkFolder):
         folder : path
             Made if it is missing. If it holds a checkpoint, that training continues.
         scenarios, parameters, seed
-            As for `Trainer`.
+            The maps to train on, the hyper-parameters, and the seed of all random
+            draws.
         trainer_class
             Makes the trainer.
         """
