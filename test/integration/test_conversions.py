@@ -34,6 +34,7 @@ from ddqn_planner.nodes.conversions import (
     centres,
     check_pose,
     grid_from_message,
+    in_outer_frame,
     occupancy_message,
     path_bytes,
     path_message,
@@ -91,6 +92,13 @@ def test_the_pose_of_a_path_that_is_not_finite_is_named() -> None:
     points[3] = 1.0, math.nan
     with pytest.raises(ValueError, match=r"pose 3 of the path is \[ ?1"):
         poses_of(path_message(points, np.zeros(5), HEADER))
+
+
+def test_poses_of_one_frame_are_turned_and_moved_to_another() -> None:
+    poses = np.array([[1.0, 0.0, 0.0], [0.0, 2.0, 0.5]])
+    in_outer = in_outer_frame(poses, (10.0, 20.0, math.pi / 2))  # to the left
+    expected = [[10.0, 21.0, math.pi / 2], [8.0, 20.0, math.pi / 2 + 0.5]]
+    np.testing.assert_allclose(in_outer, expected)
 
 
 def test_the_remedy_tells_damaged_bytes_from_those_of_another_version() -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import rclpy
 from action_msgs.msg import GoalStatus, GoalStatusArray
+from client import wait_for
 from nav_msgs.msg import OccupancyGrid
 from rclpy.executors import SingleThreadedExecutor
 
@@ -110,11 +111,13 @@ def test_who_subscribes_after_a_drive_sees_the_slowness_that_it_taught(
     executor.add_node(listener)
     while not node.count_subscribers("/trainer/slowness"):
         executor.spin_once(timeout_sec=0.01)
-    for _ in range(100):
+
+    def is_shown() -> bool:
         let_a_second_pass()
         executor.spin_once(timeout_sec=0.05)
-        if shown:
-            break
+        return bool(shown)
+
+    wait_for("slowness", is_shown, timeout=10)
     executor.shutdown()
     listener.destroy_node()
     assert max(shown[0].data) > 40

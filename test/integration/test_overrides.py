@@ -12,6 +12,7 @@ from client import TIMEOUT, wait_for
 from hypothesis import given
 from hypothesis import strategies as st
 from nav_msgs.srv import GetMap, LoadMap
+from rclpy.qos import HistoryPolicy, QoSProfile
 
 from ddqn_planner.nodes import map_server_node, trainer_node
 from ddqn_planner.nodes.declared import Declared, read_all
@@ -22,6 +23,7 @@ from ddqn_planner.nodes.overrides import (
     wrong_argument,
 )
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
+from ddqn_planner.nodes.quality import overriding_options
 
 ROBOTS = trainer_node.PARAMETERS["robots"]
 PARAMETERS = trainer_node.PARAMETERS | map_server_node.PARAMETERS | PLANNER_PARAMETERS
@@ -299,6 +301,14 @@ def test_arguments_that_ros_reads_are_not_wrong(tmp_path: Path) -> None:
         wrong_argument(["node", "--ros-args", "--params-file", str(file), *settings])
         == ""
     )
+
+
+def test_a_queue_may_have_the_depth_0_which_leaves_it_to_the_middleware() -> None:
+    check = overriding_options("/map").callback
+    assert check is not None
+    for depth in (0, 1, 2**31 - 1):
+        quality = QoSProfile(history=HistoryPolicy.KEEP_ALL, depth=depth)
+        assert check(quality).successful
 
 
 @pytest.mark.parametrize(
