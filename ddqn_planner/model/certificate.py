@@ -216,6 +216,11 @@ def logit_margins(
         The inputs of each pattern; those for costs and unknown cells are 0.
     legal_PA : (P, A) bool
         Which actions are legal.
+
+    Returns
+    -------
+    Margins
+        The bounds, (P, A), and how much they grow with each cost, (C, P, A).
     """
     tensors = {
         name: tensor.astype(np.float64) for name, tensor in network.tensors.items()
@@ -224,7 +229,8 @@ def logit_margins(
 
     # 1. A lower bound of each logit that is linear in the inputs (CROWN, Zhang et al.
     # 2018). It is computed from the logits back through the layers; at each layer,
-    # sign * logit >= bound + weight @ the outputs of the layer's ReLUs.
+    # sign * logit >= bound + weight @ the outputs of the layer's ReLUs. The sign is 1
+    # for a legal action.
     sign_AP = np.where(legal_PA, 1.0, -1.0).T
     bound_AP = sign_AP * tensors["moves.bias"][:, None]
     weight_APF = sign_AP[..., None] * tensors["moves.weight"][:, None]

@@ -186,7 +186,9 @@ def _expand_cell(
     mark : (C,) uint8
         Changes in place.
     queue : Buckets
+        The open cells, by their keys; changes in place.
     space : CellSpace
+        The costs of the map's moves, and the lower bounds of costs to the start.
     """
     costs = space.costs
     bound = space.bound
@@ -196,6 +198,7 @@ def _expand_cell(
     # long as those of 64.
     dx = np.int64(np.uint32(cell) % np.uint32(costs.width)) - bound.start_x
     dy = np.int64(np.uint32(cell) // np.uint32(costs.width)) - bound.start_y
+    # A quick look at all 8 actions first: mostly few of them help.
     promising = _promising_actions(cell, distance, space)
     while promising:
         action = LOWEST_BIT[promising]

@@ -256,12 +256,14 @@ def cheapest_primitive(
     x, y, heading = state_of(number, world)
     least_cost = greatest_cost
     best_primitive = NO_PRIMITIVE
+    # The primitives that start with this heading.
     for primitive in range(
         body.first_starting[heading], body.first_starting[heading + 1]
     ):
         end = end_of(x, y, primitive, world)
         if end == OUTSIDE or search.mark[end] == UNREACHED:
             continue
+        # First judged by the least cost of the primitive, which is known.
         cost_from_end = search.distance[end]
         if cost_from_end >= limit or cost_from_end + body.cost[primitive] > least_cost:
             continue
@@ -439,6 +441,7 @@ def may_pass(x: int, y: int, world: Any) -> bool:
     # origin passes: with an occupied cell in the core, none of them leads through.
     if not has_room(x, y, body.common_core_mask, world):
         return False
+    # The masks of heading h have the numbers of those of heading 0, plus h.
     for heading in range(HEADINGS):
         if has_room(x, y, body.standing_mask + heading, world):
             return True
@@ -614,12 +617,12 @@ def _step_over_tiles(
             for number in range(4):  # of the tile's corners
                 end_y = row + (number >> 1)
                 end_x = column + (number & 1)
-                fewer = steps_before + steps(abs(end_x - x), abs(end_y - y))
-                if fewer >= step_count[end_y, end_x]:
+                steps_to_end = steps_before + steps(abs(end_x - x), abs(end_y - y))
+                if steps_to_end >= step_count[end_y, end_x]:
                     continue
                 if is_passable(row, column, shift, passability, search.world):
-                    step_count[end_y, end_x] = fewer
-                    key = fewer + steps_to_box(end_x, end_y, box)
+                    step_count[end_y, end_x] = steps_to_end
+                    key = steps_to_end + steps_to_box(end_x, end_y, box)
                     push_to_heap(key, end_y * (columns + 1) + end_x, search.heap)
 
 
