@@ -131,8 +131,8 @@ class FieldCache(Generic[AnyField]):
                     # The same cells may lie at another origin, in other arrays.
                     _put_on(field, grid)
                 with self._lock:
-                    others = [other for other in self.kept if other is not field]
-                    self.kept = [*others, field]
+                    other_fields = [other for other in self.kept if other is not field]
+                    self.kept = [*other_fields, field]
                 return field
         return None
 
@@ -169,8 +169,8 @@ class FieldCache(Generic[AnyField]):
         _put_on(field, grid)
         replaced = self._repaired_by(field, start)
         with self._lock:
-            others = [other for other in self.kept if other is not replaced]
-            fields = [*others, field]
+            other_fields = [other for other in self.kept if other is not replaced]
+            fields = [*other_fields, field]
             self.kept = fields[-self._count_to_keep(fields) :]
         return field
 

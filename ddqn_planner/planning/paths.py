@@ -359,25 +359,27 @@ def keep_or_switch(request: PlanRequest, new_path: Path) -> tuple[Path, float | 
     grid = request.grid
     rule = request.move_rule
     start_x, start_y = new_path[0].tolist()
-    rest = rest_of_path(request.under_way, (start_x, start_y), grid, rule)
-    if not len(rest):
+    remaining_path = rest_of_path(request.under_way, (start_x, start_y), grid, rule)
+    if not len(remaining_path):
         return new_path, None
     new_end_x, new_end_y = new_path[-1].tolist()
-    end_x, end_y = rest[-1].tolist()
+    end_x, end_y = remaining_path[-1].tolist()
     if (end_x, end_y) not in {(new_end_x, new_end_y), *request.goals}:
         return new_path, None
-    straight_rest = straightened(rest, grid, rule) if request.simplified else rest
-    cost = cost_along(straight_rest, grid, rule)
+    kept_path = remaining_path
+    if request.simplified:
+        kept_path = straightened(remaining_path, grid, rule)
+    cost = cost_along(kept_path, grid, rule)
     new_cost = cost_along(new_path, grid, rule)
     if not request.keeps(cost, new_cost):
         return new_path, None
     # Is the rest cheap enough only after it was made straight? Then it leads through
     # cells that have become free: it counts as a new path.
-    if not request.keeps(cost_along(rest, grid, rule), new_cost):
-        return straight_rest, None
+    if not request.keeps(cost_along(remaining_path, grid, rule), new_cost):
+        return kept_path, None
     if new_cost == 0:  # the robot is at the goal
-        return straight_rest, 0.0
-    return straight_rest, cost / new_cost - 1
+        return kept_path, 0.0
+    return kept_path, cost / new_cost - 1
 
 
 def _legal_from(cells: Path, grid: GridMap, move_rule: MoveRule | str) -> int:

@@ -129,13 +129,13 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
         which the primitive begins in the middle.
     """
     # For each primitive, the cells that the origin passes.
-    passed = [_passed_cells(poses) for poses in motions.poses]
-    lowest = np.array([cells.min(axis=0) for cells, _, _ in passed])  # (P, 2)
-    highest = np.array([cells.max(axis=0) for cells, _, _ in passed])
-    passed_rows = [np.column_stack([cells, actions]) for cells, actions, _ in passed]
-    shares = np.concatenate([shares for _, _, shares in passed])
+    passes = [_passed_cells(poses) for poses in motions.poses]
+    lowest = np.array([cells.min(axis=0) for cells, _, _ in passes])  # (P, 2)
+    highest = np.array([cells.max(axis=0) for cells, _, _ in passes])
+    passed_rows = [np.column_stack([cells, actions]) for cells, actions, _ in passes]
+    shares = np.concatenate([shares for _, _, shares in passes])
 
-    masks = _masks_of(motions, swept, passed)
+    masks = _masks_of(motions, swept, passes)
     farthest_swept = np.abs(np.argwhere(masks.swept) - swept.shape[1] // 2).max()
     # An origin outside of the body may reach farther than what the body sweeps.
     reach = int(max(farthest_swept, (highest - lowest).max()))
@@ -186,7 +186,7 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
 
 
 def _masks_of(
-    motions: Motions, swept: NDArray[np.bool_], passed: list[PassedCells]
+    motions: Motions, swept: NDArray[np.bool_], passes: list[PassedCells]
 ) -> Masks:
     """Return where the body stands, and what the primitives of a heading all sweep.
 
@@ -197,7 +197,7 @@ def _masks_of(
     swept : (P, S, S)
         The cells that the body sweeps on each primitive, by y and x, with the cell in
         which the primitive begins in the middle.
-    passed : list of PassedCells
+    passes : list of PassedCells
         For each primitive, the cells that the origin passes.
     """
     shape = swept.shape[1:]
@@ -210,7 +210,7 @@ def _masks_of(
         end = motions.end[primitive]
         # (C, S, S): what the primitive sweeps, with each of the C cells that the origin
         # passes moved to the middle.
-        passed_cells = passed[primitive].cells.tolist()
+        passed_cells = passes[primitive].cells.tolist()
         swept_around = np.array(
             [np.roll(mask, (-y, -x), axis=(0, 1)) for x, y in passed_cells]
         )
@@ -458,7 +458,7 @@ def cost_of_primitive(x: int, y: int, primitive: int, world: Any) -> Any:
     layers = world.layers
     if not has_costs(layers) and layers.forbidden.size == 0:
         return body.cost[primitive]
-    one = np.float32(1)  # the type in which a multiplier is computed
+    one_float32 = np.float32(1)  # has the type in which multipliers are computed
     mean_multiplier = np.float32(0)  # along the path of the origin
     # The rows of `passed_cells` of this primitive.
     for place in range(body.first_passed[primitive], body.first_passed[primitive + 1]):
@@ -467,11 +467,11 @@ def cost_of_primitive(x: int, y: int, primitive: int, world: Any) -> Any:
         action = body.passed_cells[place, 2]  # by which the origin leaves the cell
         if forbids(cell_x, cell_y, action, layers):
             return np.float32(np.inf)
-        multiplier = multiplier_at(cell_x, cell_y, one, layers)
+        multiplier = multiplier_at(cell_x, cell_y, one_float32, layers)
         mean_multiplier += body.passed_shares[place] * multiplier
     # Shares are rounded, so the mean may be less than 1; but lower bounds rely on the
     # cost of the primitive as the least.
-    return body.cost[primitive] * max(mean_multiplier, one)
+    return body.cost[primitive] * max(mean_multiplier, one_float32)
 
 
 @inlined

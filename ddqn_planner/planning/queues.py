@@ -66,8 +66,8 @@ def make_buckets(
         # state has a greater key, and `advance_buckets` returns NEXT_KEY.
         cursor[FRONT] = opened_bucket[0] - 1
     bucket = np.empty((buckets, capacity), np.int32)
-    used = np.zeros(buckets, np.int64)  # states in each bucket
-    return Buckets(opened, opened_bucket, bucket, used, cursor, per_unit)
+    counts = np.zeros(buckets, np.int64)  # of the states in each bucket
+    return Buckets(opened, opened_bucket, bucket, counts, cursor, per_unit)
 
 
 def states_in_buckets(queue: Buckets) -> NDArray[np.int32]:
@@ -96,12 +96,12 @@ def push_to_bucket(key: Any, state: Any, queue: Any) -> None:
     # No bucket is before the front: a state of a smaller key is added to the front.
     number = max(np.int64(key * queue.per_unit), queue.cursor[FRONT])
     place = _place_in_ring(number, queue)
-    used = queue.used[place]
-    queue.bucket[place, np.uint64(used)] = state
-    queue.used[place] = used + 1
+    count = queue.used[place]  # states in the bucket
+    queue.bucket[place, np.uint64(count)] = state
+    queue.used[place] = count + 1
     if number > queue.cursor[LAST]:
         queue.cursor[LAST] = number
-    if used + 1 > queue.bucket.shape[1] - NEIGHBOURS:
+    if count + 1 > queue.bucket.shape[1] - NEIGHBOURS:
         queue.cursor[IS_FULL] = 1
 
 

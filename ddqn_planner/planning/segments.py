@@ -215,7 +215,7 @@ def segment_cost(
     next_row = half_row if dy != 0 else end + 1
     position = 0  # where the segment enters cell (x, y)
     weighted_length = 0.0  # each cell's part of the segment times the cell's multiplier
-    one = np.float64(1)  # the type in which the multiplier is computed
+    one_float64 = np.float64(1)  # has the type in which multipliers are computed
     costs_differ = has_costs(layers)
     while position < end:
         # Cell (x, y): the segment leaves it at `cell_end`, unless the segment ends.
@@ -229,7 +229,8 @@ def segment_cost(
             ):
                 return np.inf
         if costs_differ:
-            weighted_length += (cell_end - position) * multiplier_at(x, y, one, layers)
+            multiplier = multiplier_at(x, y, one_float64, layers)
+            weighted_length += (cell_end - position) * multiplier
         # On to the next cell, in another column, another row or both.
         position = cell_end
         if next_column == cell_end:
