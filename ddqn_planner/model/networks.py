@@ -363,8 +363,9 @@ class PropagationQNetwork(QNetwork):
     def move_costs(self, grid: GridMap, move_rule: MoveRule) -> MoveCosts | None:
         """Return the costs of a map's moves, or None.
 
-        None means that the network takes an illegal move for possible, or a legal move
-        for impossible. On a map of expected times, its slowness replaces its costs.
+        None means that it is not proved that exactly the legal moves are possible, or
+        that a move's cost follows from its two cells. On a map of expected times, its
+        slowness replaces its costs.
         """
         has_times = grid.slowness is not None
         with_costs = self.uses_costs and grid.cost is not None and not has_times

@@ -258,9 +258,9 @@ class Planner:
         start : (x, y, yaw)
             Metres and radians in the map frame. The path begins in the middle of the
             start's cell, with one of 16 headings: the nearest one, or else the next,
-            where the body has room. A planner keeps its last paths to each goal: if the
-            start lies within half a cell and 11.25 degrees of such a path, the plan is
-            the rest of that path.
+            where the body has room. A planner keeps its last path to each of the goals
+            used last: if the start lies within half a cell and 11.25 degrees of that
+            path, the plan is the rest of it.
         goal : (x, y, yaw), or several
             Likewise; of several, the one that the cheapest path reaches.
         tolerance : (float, float)
