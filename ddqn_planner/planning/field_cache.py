@@ -78,7 +78,8 @@ class Field(Generic[Known]):
         """Repair what an older field with the same key knows, and take it.
 
         The older field then begins anew, if it is still used. Where growing this field
-        toward a start is quicker than the repair, it takes nothing.
+        toward a start is quicker than the repair, it takes nothing. This class has no
+        repair: nothing is taken.
 
         Parameters
         ----------
@@ -87,7 +88,7 @@ class Field(Generic[Known]):
             The cells x, y in which the maps of both fields differ; None if they cannot
             be compared.
         start : cell or pose state, optional
-            None for any.
+            Where this field is needed; None for all of the map.
 
         Returns
         -------

@@ -630,6 +630,8 @@ def _step_over_tiles(
 def _turn_into_cost(search: Any, last_key: Any, box: Any) -> None:
     """Turn the steps in `aim.corner_bound` into lower bounds of costs, in cells.
 
+    A side of a tile counts 5 steps, a diagonal 7.
+
     Parameters
     ----------
     search : Search
