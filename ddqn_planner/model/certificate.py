@@ -105,12 +105,13 @@ def certify(
     costs of the free cells, and whichever of them are unknown. Decisions under each of
     the `move_rules` are tried.
     """
-    # Shapes: Q = the 512 patches of each rule, P = patterns, those of the patches whose
-    # centre is free, A = 8 actions, I = inputs, 9 = the cells of a patch.
-    patch_Q9 = every_patch()
-    features = [network.features(patch_Q9, rule) for rule in move_rules]
-    legal_QA = np.concatenate([legal_in_patches(patch_Q9, rule) for rule in move_rules])
-    is_pattern_Q = np.tile(patch_Q9[:, CENTRE] != OCCUPIED, len(move_rules))
+    # Shapes: N = 512 patches, Q = the N patches of the first rule, then of the next, P
+    # = patterns: those of the Q patches whose centre is free. A = 8 actions, I =
+    # inputs, 9 = the cells of a patch.
+    patch_N9 = every_patch()
+    features = [network.features(patch_N9, rule) for rule in move_rules]
+    legal_QA = np.concatenate([legal_in_patches(patch_N9, rule) for rule in move_rules])
+    is_pattern_Q = np.tile(patch_N9[:, CENTRE] != OCCUPIED, len(move_rules))
     decisions = int(is_pattern_Q.sum()) * len(MOVES)
     if network.sizes["filters"] > MAX_FILTERS:
         return Certificate(decisions, decisions, 0, 0.0, math.inf)

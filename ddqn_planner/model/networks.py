@@ -472,7 +472,7 @@ class PropagationQNetwork(QNetwork):
         """
         has_times = grid.slowness is not None
         if self.uses_costs and grid.cost is not None and not has_times:
-            # A row of the table for each patch that occurs on the map.
+            # P rows of the table, one for each patch that occurs on the map.
             patch_number, patch_P9 = unique_patches(grid.occupancy, grid.cost)
             table_PA = self._costs_of(patch_P9, move_rule, has_times)
             return MoveCosts.of_table(table_PA).on_map(grid, patch_number)

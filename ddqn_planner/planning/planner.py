@@ -136,8 +136,8 @@ class Planner:
             Whether to leave out cells, see `simplify`.
         start_clearing_radius : float
             For a start on an obstacle: obstacles within this distance of the start, in
-            cells, do not count until the path has reached its first free cell. That is
-            the free cell nearest to the start. With 0, all obstacles count.
+            cells, do not count until the path has reached its first free cell, which is
+            the one nearest to the start. With 0, all obstacles count.
 
         Returns
         -------
