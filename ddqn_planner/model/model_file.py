@@ -81,8 +81,9 @@ def find_model(name: str | Path) -> Path:
         path = as_path(name, "the model")
     except ValueError as error:
         raise ModelFileError(str(error)) from None
-    if path.suffix == MODEL_SUFFIX or path.name != str(name):
-        kind = kind_of(path)
+    is_path = path.suffix == MODEL_SUFFIX or path.name != str(name)
+    if is_path:
+        kind = kind_of(path)  # such as "a folder"; empty for a regular file
         if kind:
             raise ModelFileError(
                 f"the model {str(path)!r} is {kind}; give a model file"

@@ -448,6 +448,7 @@ def cheapest_move(
         The first action whose path costs no more is returned, without a look at the
         actions after it.
     costs : StepCosts
+        The costs of the moves of all cells.
     """
     cheapest = np.inf
     cheapest_action = NO_ACTION

@@ -194,9 +194,9 @@ class PoseField(Field[Search]):
     def _should_look_at_map(self) -> bool:
         """Return whether to look at the map's tiles now, for a better lower bound.
 
-        Each look is at tiles of half the side of the look before: it takes 4 times as
-        long, and shows that narrower gaps are closed. It pays after 8 times as many
-        visits of states; once a path is known, only the first look pays.
+        Each look is at tiles of half the side of those in the look before: it takes 4
+        times as long, and shows that narrower gaps are closed. It pays after 8 times as
+        many visits of states; once a path is known, only the first look pays.
         """
         shift = self.known.aim.shift - 1  # the next look is at tiles of 2**shift cells
         is_first_look = shift == SHIFT
