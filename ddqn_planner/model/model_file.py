@@ -83,7 +83,7 @@ def find_model(name: str | Path) -> Path:
         raise ModelFileError(str(error)) from None
     is_path = path.suffix == MODEL_SUFFIX or path.name != str(name)
     if is_path:
-        kind = kind_of(path)  # such as "a folder"; empty for a regular file
+        kind = kind_of(path)  # such as "a pipe"; empty for a regular or missing file
         if kind:
             raise ModelFileError(
                 f"the model {str(path)!r} is {kind}; give a model file"
