@@ -390,6 +390,7 @@ def _multiplier_error(
     # 3. For each rule and action, every pair of costs of the two cells is tried.
     errors = [0.0]
     for cuts_corners in (False, True):
+        # The last input of a pattern tells the rule.
         legal_of_rule_PA = legal_PA & (feature_PI[:, -1:] == cuts_corners)
         for action in np.flatnonzero(legal_of_rule_PA.any(axis=0)):
             is_legal_P = legal_of_rule_PA[:, action]

@@ -82,7 +82,11 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
     def _find_on_map(
         self, request: PoseRequest, clock: Clock
     ) -> PausingGenerator[PosePlan]:
-        """Return the plan on a map without an exploration."""
+        """Return the plan on a map without an exploration.
+
+        It is the rest of the last path to the goals, if the start lies on that, or a
+        plan by a field. The rest of the path under way may take its place.
+        """
         plan = self._from_last_path(request)
         if plan is None:
             plan = yield from self._from_grown_field(request, clock)

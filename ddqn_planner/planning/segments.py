@@ -203,9 +203,9 @@ def segment_cost(
     length = _length(abs(dx), abs(dy))
     actions = actions_of_segment(step_x, step_y, abs(dx), abs(dy))  # a bit set
     # Positions on the segment are whole numbers, 0 at its first point and `end` at its
-    # last point. To cross a column takes the same distance each time, and to cross a
-    # row another one. The two ends lie in the middle of a cell, so they are half of
-    # these distances away from the first and from the last edge.
+    # last point. The segment crosses |dx| columns, each over a distance of 2 |dy|; and
+    # |dy| rows, each over 2 |dx|: both make 2 |dx| |dy|, the end. Its two ends lie in
+    # the middles of cells, half of these distances away from the nearest edges.
     half_column = max(abs(dy), 1)
     half_row = max(abs(dx), 1)
     end = 2 * half_column * half_row

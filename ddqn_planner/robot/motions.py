@@ -373,8 +373,8 @@ def _motions(
 def dense_poses(poses: Poses, spacing: float, lever: float) -> Poses:
     """Return poses (N, 3), and more poses between them: (M, 3).
 
-    From one pose to the next, no point of the body moves by more than `spacing`: points
-    lie at most `lever` from the robot's origin. Both have the unit of the poses' x, y.
+    From one pose to the next, a point of the body moves by `spacing` at most, if it
+    lies at most `lever` from the robot's origin. Both have the unit of the poses' x, y.
     """
     parts = [poses[:1]]
     for pose, next_pose in pairwise(poses):
