@@ -159,10 +159,11 @@ def queue_open_states(search: Search, tiles: NDArray[np.int64]) -> float:
 
 @inlined
 def _expand_pose(number: int, distance: Any, mark: Any, heap: Any, search: Any) -> None:
-    """Lower the cost of each state from which a path by way of a state is cheaper.
+    """Lower the cost of each predecessor that is nearer to a goal by way of a state.
 
-    Each state is judged from which a primitive leads to state `number`. Where its cost
-    falls, it is marked as open and queued.
+    The predecessors of state `number` are the states from which a primitive leads to
+    it. One whose cost falls is marked as open and queued; if it was closed before, and
+    the lower bound is weighted, it is marked as waiting instead.
 
     Parameters
     ----------
@@ -189,8 +190,8 @@ def _expand_pose(number: int, distance: Any, mark: Any, heap: Any, search: Any) 
         if not is_inside(begin_x, begin_y, world):
             continue
         previous = number_of_state(begin_x, begin_y, body.start[primitive], world)
-        # First judged by the least cost of the primitive: it takes longer to tell
-        # whether the body has room for it, and what it costs on the map.
+        # The predecessor is first judged by the least cost of the primitive: it takes
+        # longer to tell whether the body has room, and what the primitive costs here.
         is_reached = mark[previous] != UNREACHED
         if is_reached and cost_from_state + body.cost[primitive] >= distance[previous]:
             continue
