@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from experience.straight_drives import straight
+from experience.straight_drives import HALL, driven, straight
 from hypothesis import given
 from strategies import occupancies
 
@@ -75,6 +75,15 @@ def test_a_prior_survives_as_arrays() -> None:
     assert all(
         np.array_equal(one, other) for one, other in zip(prior, again, strict=True)
     )
+
+
+def test_without_its_prior_an_experience_is_as_before() -> None:
+    experience = driven(straight((2, 5), (12, 5), 3))
+    before = experience.slowness(HALL).copy()
+    experience.prior = some_prior()
+    assert np.abs(experience.slowness(HALL) / before - 1).max() > 0.5
+    experience.prior = None
+    np.testing.assert_allclose(experience.slowness(HALL), before, rtol=0.02)
 
 
 def test_what_was_predicted_of_places_stays_with_them_after_a_merge() -> None:

@@ -564,6 +564,15 @@ def test_a_path_to_another_goal_is_not_kept() -> None:
         assert plan.cells == new.cells
 
 
+def test_the_next_leg_begins_where_the_last_one_ends() -> None:
+    grid = GridMap(np.zeros((9, 9)))
+    request = PlanRequest(grid, (0, 4), ((4, 4),), MoveRule.ROBOT_SAFE)
+    assert request.cells == ((0, 4), (4, 4))
+    leg = last_step(ANY_MAP.steps(request))
+    assert leg is not None
+    assert request.after(leg, (8, 8)).cells == ((4, 4), (8, 8))
+
+
 def test_wrong_goals_are_named() -> None:
     grid = GridMap(np.zeros((3, 3)))
     for plan in (ANY_MAP.plan_nearest, ANY_MAP.plan_through):

@@ -268,11 +268,14 @@ def car() -> Planner:
     return Planner.load("car")
 
 
-def body_hall(across: int = FREE, start: int = FREE, goal: int = FREE) -> Any:
+def body_hall(
+    across: int = FREE, start: int = FREE, goal: int = FREE, beside: int = FREE
+) -> Any:
     values = np.full((80, 160), FREE, dtype=np.int8)
     values[:, 80] = across
     values[40, 28] = start
     values[40, 138] = goal
+    values[5, 20] = beside
     return GridMap.from_occupancy_values(values, 0.05)
 
 
@@ -318,6 +321,20 @@ def test_a_body_has_its_own_model_and_map(car: Planner) -> None:
         car.plan(grid, (28, 40), (138, 40))
     outside = car.plan_poses(grid, POSES[0], (99.0, 2.0, 0.0))
     assert outside.reason.startswith("the goal lies outside the map")
+
+
+@pytest.mark.parametrize("to_goals", [{}, {"tolerance": (0.2, 0.1)}])
+def test_what_lies_between_a_body_and_its_goals_is_named(
+    car: Planner, to_goals: dict[str, Any]
+) -> None:
+    start, goal = POSES
+    for across, words in ((UNKNOWN, ", but a path leads through unk"), (WALL, "")):
+        grid = body_hall(across, beside=UNKNOWN)
+        one = car.plan_poses(grid, start, goal, **to_goals).reason
+        assert one.startswith(f"no path leads from the start to the goal{words}")
+        several = car.plan_poses(grid, start, [goal, (6.5, 2.0, 0.0)]).reason
+        assert several.startswith(f"no path leads to goals 1, 2{words}")
+        assert all(("unknown" in reason) == bool(words) for reason in (one, several))
 
 
 def test_the_goals_of_a_body_are_numbered(car: Planner) -> None:
