@@ -282,7 +282,10 @@ class MapSource:
         self._on_map()
 
     def take(self, message: OccupancyGrid) -> None:
-        """Let a map wait until it may be used, at best at once; or refuse the map."""
+        """Take a map message: use it as soon as nothing has to be waited for.
+
+        A message that is no map is refused, and the last map stays in use.
+        """
         try:
             grid = self._read(message, self._newest_map)
         except (ValueError, MemoryError) as error:

@@ -79,6 +79,7 @@ class PlannerNode(ManagedNode):
     _checks_first_parameters = True  # in the constructor of `BaseNode`
 
     def __init__(self) -> None:
+        """Make the node and its workers; with ``autostart``, begin to start it."""
         super().__init__("planner", PLANNER_PARAMETERS)
         self._checks_first_parameters = False
         self._settings = PlannerSettings(**self.values())
@@ -274,10 +275,12 @@ class PlannerNode(ManagedNode):
     # Map, start and goal
 
     def _on_map(self) -> None:
+        """Wake the requests that wait, and plan again: the map has changed."""
         self.requests.wake_waiting()
         self._replan.trigger()
 
     def _on_start(self) -> None:
+        """Plan to the active goal from the robot's new pose."""
         self._set_active_goal(self._active_goal.poses, self._active_goal.followed)
 
     def _set_active_goal(
@@ -365,7 +368,11 @@ class PlannerNode(ManagedNode):
     async def _plan_for_action(
         self, query: PathQuery, given_up: GivenUp
     ) -> tuple[Path, Outcome]:
-        """Return the path for a goal of an action, and the outcome."""
+        """Return the path for a goal of an action, and the outcome.
+
+        `query` is what the goal asks for; `given_up` returns the outcome if the goal is
+        given up now, else None. The path is published, too.
+        """
         planning = self.requests.plan(query, self._path_of_action)
         outcome = await self._answer(query.goals, planning, given_up)
         poses = path_poses(outcome)
@@ -380,9 +387,9 @@ class PlannerNode(ManagedNode):
     async def _await_other_planner(
         self, asking: Awaitable[GoalAnswer | Outcome]
     ) -> GoalAnswer | Outcome:
-        """Return another planner's answer to a goal, or an outcome without an answer.
+        """Await another planner's answer to a goal, or an outcome without one.
 
-        The outcome is reported in the log and in the diagnostics.
+        An outcome is reported in the log and in the diagnostics.
         """
         answer: GoalAnswer | Outcome
         try:
@@ -398,7 +405,7 @@ class PlannerNode(ManagedNode):
         return answer
 
     def _improve_later(self, outcome: Outcome) -> None:
-        """Let the executor search the cheapest path, if the robot may switch to it.
+        """Let the executor search a cheaper path than that of an outcome, if it pays.
 
         Only a path of a robot with a body may cost more than the cheapest path: at most
         `plan.bound` times as much.
@@ -491,6 +498,7 @@ class PlannerNode(ManagedNode):
         self._set_check_period(SOON_PERIOD)
 
     def _set_check_period(self, seconds: float) -> None:
+        """Check each `seconds` from now on what requests wait for."""
         nanoseconds = int(1e9 * seconds)
         # A timer that is reset wakes the node.
         if self._check_timer.timer_period_ns != nanoseconds:

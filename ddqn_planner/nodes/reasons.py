@@ -47,19 +47,19 @@ def reason_of(
     robot_radius: float,
     path: ExactPath = NO_PATH,
 ) -> str:
-    """Say how a path was found, or why there is no path and what to do.
+    """Return in words how a path was found, or why there is none and what to do.
 
     Parameters
     ----------
     request : Request
     plan : Plan
-        Of the request.
+        The plan for the request, with or without a path.
     start, goal : PoseStamped
-        In the map's frame.
+        Start and goal of the plan, in the map's frame.
     robot_radius : float
-        The parameter, in metres.
+        The parameter ``robot_radius``, in metres.
     path : ExactPath
-        A disc's path between the exact poses; a body has none.
+        For a disc, the plan's path between the exact poses; a body has none.
     """
     if plan.status is PlanStatus.SUCCEEDED:
         return reason_of_path(request, plan, path)
@@ -73,9 +73,17 @@ def reason_of_failure(
     goal: PoseStamped,
     robot_radius: float,
 ) -> str:
-    """Say why there is no path, between which places, and what to do.
+    """Return in words why there is no path, between which places, and what to do.
 
-    The parameters are as of `reason_of`; the plan has no path.
+    Parameters
+    ----------
+    request : Request
+    plan : Plan
+        The plan for the request, without a path.
+    start, goal : PoseStamped
+        Start and goal of the plan, in the map's frame.
+    robot_radius : float
+        The parameter ``robot_radius``, in metres.
     """
     grid = request.grid
     start_cell, *goal_cells = request.cells
@@ -98,7 +106,7 @@ def reason_of_failure(
     reason = f"{problem} ({place})"
     if plan.status is PlanStatus.GOAL_OCCUPIED and not is_unknown:
         goals_on_map = filter(grid.contains, goal_cells)
-        # A goal that is no obstacle is in the inflated cells around one.
+        # An occupied goal that is no obstacle lies in the inflated cells around one.
         if not all(map(grid.is_obstacle, goals_on_map)):
             limit = _clearance_in_words(plan, robot_radius)
             reason += f", nearer to an obstacle than {limit}"
@@ -109,9 +117,11 @@ def reason_of_failure(
 
 
 def reason_of_path(request: Request, plan: Plan, path: ExactPath) -> str:
-    """Say how long a path is, how it was found, and what moved or was ignored.
+    """Return in words how long a path is, how it was found, and what was changed.
 
-    The parameters are as of `reason_of`; the plan has a path.
+    The goal may have moved, or obstacles at the start may have been ignored. `plan` is
+    the plan for `request`, with a path; `path` is this path between the exact poses for
+    a disc, and empty for a body.
     """
     grid = request.grid
     _, *goal_cells = request.cells
@@ -137,7 +147,7 @@ def reason_of_path(request: Request, plan: Plan, path: ExactPath) -> str:
 
 
 def _method_in_words(plan: Plan) -> str:
-    """Return how a path was found."""
+    """Return in words by which method the path of a plan was found."""
     if isinstance(plan, PosePlan):
         if math.isinf(plan.bound):  # no field leads from the start: nothing is proved
             return (
@@ -166,6 +176,7 @@ def _clearance_in_words(plan: Plan, robot_radius: float) -> str:
 
 
 def _cells_in_words(goal_cells: Sequence[Cell]) -> str:
+    """Return a list of at most MOST_CELLS goals in words."""
     cells = ", ".join(map(str, goal_cells[:MOST_CELLS]))
     if len(goal_cells) > MOST_CELLS:
         cells += ", ..."

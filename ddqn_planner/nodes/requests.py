@@ -76,12 +76,19 @@ class Requests:
         wake.set_result(None)
 
     async def plan(self, query: PathQuery, current: Outcome | None = None) -> Outcome:
-        """Plan as `plan_once`; after a failure for the same goal, on the next costmaps.
+        """Plan as `plan_once`; after a repeated failure, on the next costmaps, too.
 
         A client that clears the costmap after a failure, as Nav2's behavior trees do,
-        asks again before the cleared costmap has come. So a query that fails again
-        waits for that. As a costmap from before the clear may come first, the query
-        waits for several. Their stamps are no help: they may be those of another clock.
+        asks again before the cleared costmap has come. So a query whose goal has failed
+        before waits for new costmaps, and is planned on each. It waits for several, as
+        a costmap from before the clear may come first; stamps do not tell, as they may
+        be those of another clock.
+
+        Parameters
+        ----------
+        query : PathQuery
+        current : Outcome, optional
+            The outcome with the path that the robot follows, see `plan_once`.
         """
         costmap = self.map.arrivals.number
         outcome = await self.plan_once(query, current)
@@ -103,7 +110,11 @@ class Requests:
     def _may_succeed_soon(
         self, query: PathQuery, costmap: int, outcome: Outcome
     ) -> bool:
-        """Return whether a query failed again, on the costmap of a number."""
+        """Return whether a query with the same last goal has failed before.
+
+        `costmap` is the number, in `Arrivals`, of the costmap that was planned on, and
+        `outcome` that of the query; False if it has not failed.
+        """
         if not outcome.has_failed or outcome.request is None:
             return False
         resolution = outcome.request.grid.resolution
@@ -135,8 +146,8 @@ class Requests:
         ----------
         query : PathQuery
         current : Outcome, optional
-            Of the path that the robot follows. A query with one goal may keep the rest
-            of this path.
+            The outcome with the path that the robot follows. A query with one goal may
+            keep the rest of this path.
         """
         # The parameters, the map and the model may change while the query is planned.
         settings = self.settings
@@ -193,7 +204,10 @@ class Requests:
         return outcome
 
     async def improve(self, outcome: Outcome) -> Outcome:
-        """Return an outcome for a robot with a body again, with the cheapest path."""
+        """Return an outcome for a robot with a body, with the cheapest path instead.
+
+        `outcome` has a path that may cost more than the cheapest one.
+        """
         planner = outcome.planner
         goal = outcome.goal
         assert isinstance(outcome.request, PoseRequest)
@@ -211,7 +225,10 @@ class Requests:
     async def _plan_legs(
         self, planner: Planner, request: Request, later_goals: Sequence[MapPose]
     ) -> Legs:
-        """Plan to the goal of a request, then on to later goals, until a leg fails."""
+        """Plan to the goal of a request, then on to later goals, until a leg fails.
+
+        Each leg begins at the end of the leg before it.
+        """
         plan = await self._plan(planner, request)
         plans = [plan]
         for goal in later_goals:
@@ -223,7 +240,10 @@ class Requests:
         return Legs(request, plans)
 
     async def _plan(self, planner: Planner, request: Request) -> Plan:
-        """Plan in steps by the worker: other requests have a turn between steps."""
+        """Return the plan for a request, computed in steps by the worker.
+
+        Between two steps, other requests have a turn.
+        """
         # A generator: its last value is the plan, the values before are None.
         steps = planner.steps(request)
         try:
@@ -278,7 +298,7 @@ class Requests:
     async def _goals_in_map(
         self, inputs: PlanInputs, names: Sequence[str], goals: Sequence[PoseStamped]
     ) -> list[MapPose]:
-        """Return goals in the map; errors call each goal by one of the names."""
+        """Return goals in the map's frame; `names` are what errors call them."""
         map_poses = []
         for name, goal in zip(names, goals, strict=True):
             map_pose = await self.in_map(inputs, name, goal)
@@ -288,7 +308,7 @@ class Requests:
     async def _start_in_map(
         self, inputs: PlanInputs, start: PoseStamped | None = None
     ) -> MapPose:
-        """Return the start of a query in the map, by default the robot's pose."""
+        """Return the start of a query in the map's frame, by default the robot."""
         if start is None:
             start = await self.robot()
         return await self.in_map(inputs, THE_START, start)
@@ -373,8 +393,15 @@ def request_to(
 ) -> Request:
     """Return the planner's request for a path to the nearest of some goals.
 
-    The tolerance, in metres, says how far a single goal may move; one of several goals
-    does not move.
+    Parameters
+    ----------
+    inputs : PlanInputs
+        The map, and the planner: its model decides between cells and poses.
+    settings : PlannerSettings
+    start, goals : MapPose, and sequence of MapPose
+        In the map's frame.
+    tolerance : float
+        Metres by which a single goal may move; one of several goals does not move.
     """
     grid, planner = inputs.grid, inputs.planner
     if len(goals) > 1:
@@ -424,24 +451,30 @@ def outcome_of(
     legs: Legs,
     stops: Sequence[MapPose],
 ) -> Outcome:
-    """Return the outcome of the plans of some legs.
+    """Return the outcome of a request, from the plans of its legs.
+
+    A request through several goals has a leg from each stop to the next one. A request
+    to the nearest of several goals has one leg.
 
     Parameters
     ----------
     inputs : PlanInputs
+        The map and the planner of the plans.
     settings : PlannerSettings
     legs : Legs
-        The plans from stop to stop, and the request of the last of them. Or one plan,
-        from the start to the nearest of several goals.
+        The plans, and the planner's request for the last plan. If the last plan has no
+        path, there may be fewer legs than goals.
     stops : sequence of MapPose
-        The start, and then the goals. There may be fewer legs than goals.
+        The start, and then all goals.
     """
     request, plans = legs
     plan = plans[0] if len(plans) == 1 else joined(plans)
     leg_starts = [stop.message for stop in stops[: len(plans)]]
-    # Of the last leg; or its goal, and behind it the goals that no leg reaches.
-    possible_goals = stops[len(plans) :]
-    goal = possible_goals[nearest_goal(request, plan)].message
+    # The goals of the last leg come first among these stops: one goal, or all goals if
+    # the leg leads to the nearest one. `nearest_goal` is an index among the leg's
+    # goals.
+    later_stops = stops[len(plans) :]
+    goal = later_stops[nearest_goal(request, plan)].message
     path = NO_PATH
     if len(plan.path):
         path = exact_path_through([*leg_starts, goal], plans, request)
@@ -454,6 +487,7 @@ def outcome_of(
         goal,
         map_header=inputs.header,
         path=path,
+        # Controllers need poses along long straight lines.
         is_dense=settings.path_simplification == "straight",
     )
 
@@ -463,8 +497,8 @@ def with_partial_path(
 ) -> Outcome:
     """Return a failed outcome with the path of all legs before the leg that failed.
 
-    The outcome is the same if the first leg failed. The stops are the start and then
-    the goals.
+    `outcome` is that of the last of the `legs`, which has failed; if it is the first
+    leg, too, it is returned unchanged. `stops` are the start and then all goals.
     """
     plans = legs.plans[:-1]
     if not plans:
@@ -489,8 +523,8 @@ def exact_path_through(
 ) -> ExactPath:
     """Return the path of a disc along the plans of its legs; empty for a body.
 
-    It leads through the exact positions of the stops, of which there is one more than
-    there are plans. The request is for any of the legs.
+    The path leads through the exact positions of the `stops`, of which there is one
+    more than there are `plans`. `request` is that of any leg: all have the same map.
     """
     if isinstance(request, PoseRequest):
         return NO_PATH
