@@ -41,7 +41,7 @@ class PaperModule(nn.Module):
 
 
 class TorchLearner:
-    """Trains the paper's network with autograd and torch's Adam."""
+    """Trains the paper's network with autograd and torch's AdamW."""
 
     def __init__(self, trainer: Trainer) -> None:
         self.environment = trainer.environment
@@ -54,8 +54,9 @@ class TorchLearner:
             for name, weight in module.named_parameters():
                 weight.data.copy_(torch.from_numpy(part[name]))
                 part[name] = weight.data.numpy()
-        weights, rate = [*self._online.parameters()], trainer.parameters.learning_rate
-        self._adam = torch.optim.Adam(weights, rate, fused=FUSED)
+        weights = [*self._online.parameters()]
+        decay = trainer.parameters.weight_decay
+        self._adam = torch.optim.AdamW(weights, weight_decay=decay, fused=FUSED)
         for name, weight in self._online.named_parameters():
             state = {"step": torch.tensor(float(trainer.updates))}
             for key, part in zip(("exp_avg", "exp_avg_sq"), moments, strict=True):
@@ -81,7 +82,7 @@ class TorchLearner:
     def settle(self) -> None:
         """Do nothing: the modules share the memory of the trainer's weights."""
 
-    def update(self, batch: Transitions, number: int) -> None:
+    def update(self, batch: Transitions, number: int, learning_rate: float) -> None:
         """Make an update, of this number."""
         with torch.no_grad():
             target_BA = self._target(self._observe(batch.scenario, batch.next_cell))
@@ -93,6 +94,7 @@ class TorchLearner:
         gradient_BA = torch.from_numpy(double_dqn_gradient(batch, q_BA, next_q))
         self._online.zero_grad()
         torch.autograd.backward(q_2BA[: len(gradient_BA)], gradient_BA)
+        self._adam.param_groups[0]["lr"] = learning_rate
         self._adam.step()
         if number % p.target_interval == 0:
             self._target.load_state_dict(self._online.state_dict())

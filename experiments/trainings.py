@@ -56,6 +56,7 @@ PROFILES: Final[dict[str, HyperParameters]] = {
         network="propagation",
         filters=64,
         learning_rate=0.001,
+        learning_rate_decay=1.0,
         batch_size=128,
         target_interval=100,
         steps=10_000,

@@ -22,6 +22,7 @@ ANY_MAP: Final = HyperParameters(
     p_r=1.0,
     filters=64,
     learning_rate=0.003,
+    learning_rate_decay=1.0,
     batch_size=512,
     environments=64,
     update_interval=64,

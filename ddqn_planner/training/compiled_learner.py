@@ -44,6 +44,10 @@ BETA_1 = 0.9
 BETA_2 = 0.999
 EPSILON = np.float32(1e-8)
 SMALLEST_MEAN = np.float32(1e-30)  # of a gradient: a smaller one moves no weight
+# Absolute errors of Q, in rewards. A transition with the greatest one or more is drawn
+# whenever its slot is; the other one is added, so that each transition has a chance.
+GREATEST_ERROR = 10.0
+LEAST_ERROR = 0.1
 # Windows that the steps of one call evaluate, so that it returns within milliseconds.
 WINDOWS_OF_A_CALL = 5_000
 
@@ -98,7 +102,12 @@ class Settings(NamedTuple):
     """The hyper-parameters that compiled functions need."""
 
     gamma: float
+    steps: int
     learning_rate: float
+    learning_rate_decay: float
+    weight_decay: float
+    weight_averaging: float
+    priority: float
     learning_starts: int
     update_interval: int
     target_interval: int
@@ -143,6 +152,12 @@ class Learning(NamedTuple):
     gradient: Network
     mean: Floats  # Adam's first moment of the gradient, as `Network.weights`
     square: Floats  # its second moment
+    # The average of θ, as `Network.weights`; empty if `weight_averaging` is 0.
+    average: Floats
+    # The absolute error of each transition in the replay buffer, (capacity,), when it
+    # was drawn last; and the slots of the batch in this buffer, (B,).
+    error: Floats
+    drawn: Integers
 
 
 class Counters(NamedTuple):
@@ -163,20 +178,23 @@ class Training(NamedTuple):
 
 def training_of(
     parts: Sequence[dict[str, Floats]],
+    average: dict[str, Floats],
     environment: GridVectorEnvironment,
     replay: ReplayBuffer,
     next_q_of: Callable[[Q, Q], NextQ],
 ) -> Training:
     """Return the arrays of a training, for compiled code.
 
-    They share their memory with `parts`, `environment` and `replay`: what compiled code
-    changes, changes in these objects.
+    They share their memory with all arguments: what compiled code changes, changes in
+    these objects.
 
     Parameters
     ----------
     parts
         Four dictionaries of tensors by name: of θ, of θ⁻ and of Adam's two moments.
         Their tensors are replaced by others that share the memory of the arrays.
+    average
+        The same of the average of θ, or empty if there is none.
     environment, replay
         The robots and the replay buffer that `play` changes.
     next_q_of
@@ -188,9 +206,13 @@ def training_of(
     # The networks evaluate either a batch or the states of all robots.
     states = max(parameters.batch_size, parameters.environments)
     windows, networks = networks_of(
-        environment.background, environment.shape, [*parts, gradients], states
+        environment.background,
+        environment.shape,
+        [*parts, gradients, *([average] if average else [])],
+        states,
     )
-    online, target, mean, square, gradient = networks
+    online, target, mean, square, gradient, *averaged = networks
+    no_weights = _zeros((0,), environment.background)
     learning = Learning(
         settings=_settings(parameters),
         windows=windows,
@@ -202,6 +224,9 @@ def training_of(
         gradient=gradient,
         mean=mean.weights,
         square=square.weights,
+        average=averaged[0].weights if averaged else no_weights,
+        error=replay.error,
+        drawn=np.zeros(parameters.batch_size, np.int64),
     )
     robots = Robots(
         scenario=environment.scenario,
@@ -354,6 +379,20 @@ def add_to(array: Floats, values: Floats) -> None:
     """Add the values (N,) to an array (N,)."""
     for n in range(array.size):
         array[n] += values[n]
+
+
+@inner_in_place
+def scale(array: Floats, factor: np.float32) -> None:
+    """Multiply an array (N,) by a factor."""
+    for n in range(array.size):
+        array[n] *= factor
+
+
+@inner_in_place
+def approach(array: Floats, values: Floats, share: np.float32) -> None:
+    """Move an array (N,) by a share, 0 to 1, of its distance to the values (N,)."""
+    for n in range(array.size):
+        array[n] += share * (values[n] - array[n])
 
 
 @inlined
@@ -609,7 +648,7 @@ def play(
         if steps > settings.learning_starts:
             for _ in range(updates_due):
                 updates += 1
-                update(learning, sampling, updates, replayed)
+                update(learning, sampling, Counters(steps, updates, replayed))
     return Counters(steps, updates, replayed)
 
 
@@ -665,6 +704,7 @@ def move_robots(game: Game, learning: Learning, robots: Robots, replayed: int) -
         replay.reward[slot] = reward
         replay.next_cell[slot] = next_cell
         replay.discount[slot] = 0.0 if terminated else settings.gamma
+        learning.error[slot] = GREATEST_ERROR  # so that it is drawn soon
         robots.terminated[n] = terminated
         robots.truncated[n] = truncated
         robots.total_reward[n] += reward
@@ -674,9 +714,7 @@ def move_robots(game: Game, learning: Learning, robots: Robots, replayed: int) -
 
 
 @inner
-def update(
-    learning: Learning, sampling: Generator, updates: int, replayed: int
-) -> None:
+def update(learning: Learning, sampling: Generator, counters: Counters) -> None:
     """Draw a batch, and change θ by Adam with its gradient, see `double_dqn_gradient`.
 
     After each `target_interval` updates θ⁻ becomes θ.
@@ -687,10 +725,8 @@ def update(
         Changed in place.
     sampling : Generator
         Draws the batch.
-    updates : int
-        The number of this update, from 1 on.
-    replayed : int
-        The number of transitions that have been put into the replay buffer.
+    counters : Counters
+        Of the training; this update is counted, too.
     """
     settings = learning.settings
     windows = learning.windows
@@ -699,7 +735,7 @@ def update(
     batch = learning.batch
     gradient = learning.gradient
     batch_size = batch.cell.size
-    draw_batch(learning, sampling, replayed)
+    draw_batch(learning, sampling, counters.replayed)
     evaluate(online, windows, batch.scenario, batch.next_cell)
     evaluate(target, windows, batch.scenario, batch.next_cell)
     # `next_q` are views of Q by θ or θ⁻, which select and evaluate the next action.
@@ -714,32 +750,59 @@ def update(
         action = batch.action[n]
         error = online.q[n, action] - batch.reward[n]
         gradient.q[n, action] = 2 * error / batch_size
+        learning.error[learning.drawn[n]] = abs(error)
     differentiate(online, windows, gradient, batch_size)
+    # The learning rate falls exponentially, see `HyperParameters.learning_rate_at`.
+    share_of_steps = min(counters.steps / settings.steps, 1.0)
+    decay = settings.learning_rate_decay**share_of_steps
+    learning_rate = settings.learning_rate * decay
+    if settings.weight_decay > 0:
+        scale(online.weights, np.float32(1 - learning_rate * settings.weight_decay))
     adam(
         online.weights,
         gradient.weights,
         learning.mean,
         learning.square,
-        settings.learning_rate,
-        updates,
+        learning_rate,
+        counters.updates,
     )
+    if settings.weight_averaging > 0:
+        # Greater at first, so that the random weights do not stay in the average.
+        share_of_new = max(settings.weight_averaging, 1 / counters.updates)
+        approach(learning.average, online.weights, np.float32(share_of_new))
     evaluate_common_windows(online, windows)
-    if updates % settings.target_interval == 0:
+    if counters.updates % settings.target_interval == 0:
         copy_into(target.weights, online.weights)
         evaluate_common_windows(target, windows)
 
 
+@inlined
+def chance_of(error: float, priority: float) -> float:
+    """Return the chance, 0 to 1, that a drawn transition is taken, by its error.
+
+    It is the absolute error to the power of `priority`, as a share of the greatest.
+    """
+    return float(min(1.0, (error + LEAST_ERROR) / GREATEST_ERROR) ** priority)
+
+
 @inner
 def draw_batch(learning: Learning, sampling: Generator, replayed: int) -> None:
-    """Draw ``learning.batch`` from ``learning.replay``, uniformly, with replacement.
+    """Draw ``learning.batch`` from ``learning.replay``, with replacement.
 
     The buffer is a ring, into which `replayed` transitions have been put: it holds the
-    last of them.
+    last of them. With a `priority` of 0 all are drawn alike; else a drawn slot is drawn
+    again unless chance takes it, see `chance_of`. The slots are written to `drawn`.
     """
     replay = learning.replay
     batch = learning.batch
+    priority = learning.settings.priority
+    count = min(replayed, replay.cell.size)  # of transitions in the buffer
     for n in range(batch.cell.size):
-        slot = sampling.integers(0, min(replayed, replay.cell.size))
+        slot = sampling.integers(0, count)
+        if priority > 0:
+            while sampling.random() > chance_of(learning.error[slot], priority):
+                slot = sampling.integers(0, count)
+        learning.drawn[n] = slot
         batch.scenario[n] = replay.scenario[slot]
         batch.cell[n] = replay.cell[slot]
         batch.action[n] = replay.action[slot]

@@ -40,6 +40,8 @@ class ReplayBuffer:
             next_cell=np.zeros(capacity, np.int64),
             discount=np.zeros(capacity, np.float32),
         )
+        # The absolute error of each transition when it was drawn last, for priorities.
+        self.error = np.zeros(capacity, np.float32)
 
     def __len__(self) -> int:
         return min(self.added, self.capacity)

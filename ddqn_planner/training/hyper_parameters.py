@@ -34,7 +34,31 @@ class HyperParameters:
         "paper", "path_cost", source="ours: the reward, see training/reward.py"
     )
     learning_rate: float = _number(
-        0.01, "section on the network: Adam's learning rate", 1e-6, 1.0
+        0.01, "section on the network: Adam's first learning rate", 1e-6, 1.0
+    )
+    learning_rate_decay: float = _number(
+        0.05, "ours: Adam's last learning rate over its first; 1 keeps it", 1e-6, 1.0
+    )
+    weight_decay: float = _number(
+        0.0,
+        "ours: weights lose this times the learning rate per update, as in AdamW "
+        "(Loshchilov and Hutter 2019)",
+        0.0,
+        100.0,
+    )
+    weight_averaging: float = _number(
+        0.0,
+        "ours: share of the new weights in an average, which is the model "
+        "(Polyak and Juditsky 1992); 0 for the last weights",
+        0.0,
+        1.0,
+    )
+    priority: float = _number(
+        0.0,
+        "ours: exponent of the error by which a transition is drawn again "
+        "(Schaul et al. 2016); 0 draws all alike",
+        0.0,
+        1.0,
     )
     batch_size: int = _number(32, "Table 1: transitions in a mini-batch", 1, 4096)
     gamma: float = _number(0.95, "Table 1: discount γ", 0.0, 1.0)
@@ -68,6 +92,11 @@ class HyperParameters:
     max_episode_steps: int = _number(200, "ours: steps that end an episode", 1, 10**6)
     environments: int = _number(1, "ours: environments stepped at once", 1, 4096)
 
+    def learning_rate_at(self, step: int) -> float:
+        """Return the learning rate at an environment step: it falls exponentially."""
+        share: float = min(step / self.steps, 1.0)
+        return float(self.learning_rate * self.learning_rate_decay**share)
+
     def __post_init__(self) -> None:
         """Check all values, and make them Python's numbers."""
         for entry in fields(self):
@@ -81,6 +110,12 @@ class HyperParameters:
             )
             # Numbers of any type become Python's, as dataclasses set them.
             object.__setattr__(self, entry.name, number)
+        if self.network != "paper":
+            for name in ("weight_decay", "weight_averaging", "priority"):
+                if getattr(self, name) != 0:
+                    raise ValueError(
+                        f"{name} is {getattr(self, name)}; give 0, or the network paper"
+                    )
         if self.environments > self.replay_capacity:
             raise ValueError(
                 f"environments is {self.environments}; give at most replay_capacity, "

@@ -130,7 +130,7 @@ class PropagationLearner:
             return torch.zeros(len(feature_BI), len(MOVES))
         return LENGTHS_A * (1 + _layer(weights, "prices", feature_BI).relu())
 
-    def update(self, batch: Transitions, number: int) -> None:
+    def update(self, batch: Transitions, number: int, learning_rate: float) -> None:
         """Change θ by the gradient of a batch of B transitions.
 
         `number` is that of this update, from 1 on. After each `target_interval` updates
@@ -153,7 +153,7 @@ class PropagationLearner:
             [activation[:count] for activation in evaluation.activations],
         )
         gradients = self._gradients(by_q_BA, of_states)
-        self._take_step(gradients, number, p.learning_rate)
+        self._take_step(gradients, number, learning_rate)
         if number % p.target_interval == 0:
             for name, tensor in self._target.items():
                 tensor.copy_(self._online[name])

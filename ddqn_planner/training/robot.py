@@ -45,6 +45,7 @@ Integers: TypeAlias = NDArray[np.int64]
 # teach about as much.
 ROBOT: Final = HyperParameters(
     learning_rate=4.5e-5,
+    learning_rate_decay=1.0,
     batch_size=24,
     gamma=0.2,
     obstacle_reward=-1000.0,

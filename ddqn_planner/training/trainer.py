@@ -66,7 +66,7 @@ class Learner(Protocol):
     ) -> NDArray[np.float32]:
         """Return Q(s, a), (B, 8), of robots in cells (B,) of maps `scenario` (B,)."""
 
-    def update(self, batch: Transitions, number: int) -> None:
+    def update(self, batch: Transitions, number: int, learning_rate: float) -> None:
         """Change the weights by a batch; `number` counts the updates, from 1 on."""
 
     def settle(self) -> None:
@@ -112,6 +112,10 @@ class Trainer:
             mean={name: np.zeros_like(tensor) for name, tensor in tensors.items()},
             square={name: np.zeros_like(tensor) for name, tensor in tensors.items()},
         )
+        # The average of θ by name; empty without `weight_averaging`.
+        self.average: dict[str, NDArray[np.float32]] = {}
+        if parameters.weight_averaging > 0:
+            self.average = {name: np.copy(tensor) for name, tensor in tensors.items()}
         self.replay = ReplayBuffer(parameters.replay_capacity)
         self.environment.reset()
         # The paper's network learns in compiled code, and has no learner.
@@ -122,7 +126,7 @@ class Trainer:
             )
         else:
             self._training = training_of(
-                self.learned, self.environment, self.replay, self.next_q
+                self.learned, self.average, self.environment, self.replay, self.next_q
             )
 
     def _initial_network(self, seed: int) -> QNetwork:
@@ -206,7 +210,8 @@ class Trainer:
             for _ in range(updates_due):
                 self.updates += 1
                 batch = self.replay.sample(p.batch_size, self._sampling)
-                learner.update(batch, self.updates)
+                rate = p.learning_rate_at(self.steps)
+                learner.update(batch, self.updates, rate)
 
     def _end_episodes(self) -> list[Episode]:
         """Return the episodes that have ended, and start new ones in their place."""
@@ -257,7 +262,8 @@ class Trainer:
             seed=self.seed,
             package_version=package_version(),
         )
-        tensors = {name: tensor.copy() for name, tensor in network.tensors.items()}
+        weights = self.average or network.tensors
+        tensors = {name: tensor.copy() for name, tensor in weights.items()}
         return Planner(type(network)(network.sizes, tensors), metadata)
 
     def model_bytes(self) -> bytes:
@@ -315,7 +321,8 @@ class Trainer:
     def restore(self, path: Path) -> None:
         """Continue from the checkpoint at `path`, which must be of this training.
 
-        The checkpoint's parameters may differ in `steps` alone.
+        The checkpoint's parameters may differ in `steps` alone. A learning rate that
+        falls then follows the new number of steps.
 
         Raises
         ------
@@ -354,8 +361,10 @@ class Trainer:
             raise CheckpointError(
                 "was made with another map, start or goal; give that one"
             )
-        # How long a training takes may change, and old files lack new parameters.
-        values = saved["parameters"] | {"steps": self.parameters.steps}
+        # How long a training takes may change, and old files lack new parameters. The
+        # learning rate of trainings before 0.5.0 did not fall.
+        defaults = {"learning_rate_decay": 1.0}
+        values = defaults | saved["parameters"] | {"steps": self.parameters.steps}
         saved_options = saved | asdict(HyperParameters(**values))
         options = {
             "seed": current["seed"],
@@ -411,8 +420,12 @@ class Trainer:
         for name in learned.online:
             tensors[f"network.{name}"] = learned.online[name]
             tensors[f"target.{name}"] = learned.target[name]
+        for name, tensor in self.average.items():
+            tensors[f"average.{name}"] = tensor
         for name, values in self.replay.transitions._asdict().items():
             tensors[f"replay.{name}"] = values[: len(self.replay)]
+        if self.parameters.priority > 0:
+            tensors["replay.error"] = self.replay.error[: len(self.replay)]
         if self.updates:
             # As torch's optimisers name them.
             for number, name in enumerate(learned.online):

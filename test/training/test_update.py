@@ -21,9 +21,13 @@ from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import as_seed
 from ddqn_planner.model import AnyMapQNetwork
 from ddqn_planner.model.move_costs import patches
-from ddqn_planner.training.compiled_learner import adam
-from ddqn_planner.training.double_dqn import ReplayBuffer, Transitions
-from ddqn_planner.training.environment import Scenario, paper_scenario
+from ddqn_planner.training.compiled_learner import adam, draw_batch, training_of
+from ddqn_planner.training.double_dqn import NextQ, ReplayBuffer, Transitions
+from ddqn_planner.training.environment import (
+    GridVectorEnvironment,
+    Scenario,
+    paper_scenario,
+)
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.robot import RobotTrainer
 from ddqn_planner.training.trainer import Learner, Trainer
@@ -70,9 +74,9 @@ class Recording:
         self.q_values, self.settle = learner.q_values, learner.settle
         self.learner, self.batches = learner, list[Transitions]()
 
-    def update(self, batch: Transitions, number: int) -> None:
+    def update(self, batch: Transitions, number: int, learning_rate: float) -> None:
         self.batches.append(batch)
-        self.learner.update(batch, number)
+        self.learner.update(batch, number, learning_rate)
 
 
 def mean_squared_error(
@@ -98,7 +102,7 @@ def check_update(trainer: Trainer, loss: Tensor, before: dict[str, Tensor]) -> N
     ε).
     """
     expected = torch.autograd.grad(loss, list(before.values()))
-    rate = trainer.parameters.learning_rate
+    rate = trainer.parameters.learning_rate_at(trainer.steps)
     scale = max(float(gradient.abs().max()) for gradient in expected)
     learned = map(in_torch, trainer.learned)
     weights, _, mean, square = (tensors.values() for tensors in learned)
@@ -124,6 +128,8 @@ def test_compiled_training_is_that_of_torch(
     ]
     brief = {"learning_rate": 0.001, "learning_starts": 20, "target_interval": 10}
     brief |= {
+        "steps": 180,
+        "weight_decay": 0.5,
         "epsilon_steps": 60,
         "environments": 3,
         "max_episode_steps": 7,
@@ -158,6 +164,42 @@ def check_same(compiled: Trainer, of_torch: Trainer) -> None:
         # The mean: Adam makes much of the rounding of a gradient that is nearly 0.
         error = np.abs(tensor - expected[name]).mean(dtype=np.float64)
         assert error <= 1e-3 * np.abs(expected[name]).mean(dtype=np.float64), name
+
+
+def test_the_model_of_an_averaged_training_is_the_average_of_its_weights(
+    small: Scenario,
+) -> None:
+    parameters = HyperParameters(
+        filters=4, learning_starts=20, weight_averaging=0.1, steps=60
+    )
+    trainer = Trainer([small], parameters, seed=0)
+    average = {name: 0.0 * part for name, part in trainer.network.tensors.items()}
+    for _ in trainer.run(60, every=1):
+        if trainer.updates:
+            share = max(0.1, 1 / trainer.updates)
+            for name, weights in trainer.network.tensors.items():
+                average[name] = average[name] + share * (weights - average[name])
+    assert trainer.updates == 40
+    for name, weights in trainer.planner().network.tensors.items():
+        np.testing.assert_allclose(weights, average[name], rtol=1e-4, atol=1e-6)
+
+
+def test_transitions_are_drawn_by_the_power_of_their_errors(small: Scenario) -> None:
+    parameters = HyperParameters(priority=0.5, replay_capacity=4, batch_size=4000)
+    replay = ReplayBuffer(4)
+    numbers = np.arange(4)
+    replay.add(Transitions(*[numbers] * 6))
+    replay.error[:] = [0.0, 0.9, 9.9, 99.0]
+    environment = GridVectorEnvironment([small], parameters)
+    tensors = Trainer([small], parameters, seed=0).network.tensors
+    parts = [{name: part.copy() for name, part in tensors.items()} for _ in range(4)]
+    learning = training_of(parts, {}, environment, replay, NextQ).learning
+    draw_batch(learning, np.random.default_rng(0), 4)
+    np.testing.assert_array_equal(learning.drawn, learning.batch.cell)
+    share = np.bincount(learning.batch.cell) / 4000
+    # Errors of 10 and more are drawn alike; the smallest chance is that of 0.1.
+    chance = np.sqrt([0.1, 1.0, 10.0, 10.0])
+    np.testing.assert_allclose(share, chance / chance.sum(), atol=0.03)
 
 
 def test_weights_whose_gradients_fade_move_as_those_of_torch() -> None:
