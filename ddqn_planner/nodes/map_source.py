@@ -71,21 +71,7 @@ class Received:
 
 
 class MapSource:
-    """The map to plan on, from the topic ``map`` and the topic of its updates.
-
-    Parameters
-    ----------
-    node
-        The planner's node, with its parameters.
-    diagnostics
-        Where refused messages are reported.
-    worker
-        Its thread prepares the map: inflation and expected times.
-    on_map
-        Called when anything about the map is new.
-    clock
-        Returns seconds of a steady clock.
-    """
+    """The map to plan on, from the topic ``map`` and the topic of its updates."""
 
     def __init__(
         self,
@@ -95,6 +81,21 @@ class MapSource:
         on_map: Callable[[], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        """Listen to the map, its updates and its directions.
+
+        Parameters
+        ----------
+        node
+            The planner's node, with its parameters.
+        diagnostics
+            Where refused messages are reported.
+        worker
+            Its thread prepares the map: inflation and expected times.
+        on_map
+            Called when anything about the map is new.
+        clock
+            Returns seconds of a steady clock.
+        """
         self._node = node
         self._diagnostics = diagnostics
         self._worker = worker
