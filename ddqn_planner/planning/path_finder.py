@@ -81,6 +81,8 @@ class PathFinder(ABC, Generic[Request, AnyPlan]):
         space is in the way, or what stops each of several goals.
         """
         plan = yield from self._find(request, clock)
+        if plan.path.size:
+            return plan
         has_several_goals = len(request.goals) > 1
         if unknown_space.has_more_to_say(request.grid, plan, has_several_goals):
             yield  # a pause: a slow step follows
