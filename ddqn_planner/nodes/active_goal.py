@@ -1,20 +1,17 @@
-"""The active goal: when to plan to it again, and which part of its path to keep."""
+"""The active goal: when to plan to it again, and when its path is news."""
 
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
 from geometry_msgs.msg import PoseStamped
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap
-from ddqn_planner.grid.map_changes import shift_between
 from ddqn_planner.nodes.outcome import Outcome, Request
-from ddqn_planner.planning import Planner, PlanRequest, PlanStatus
-from ddqn_planner.planning.plan import PosePlan
+from ddqn_planner.planning import Planner, PlanStatus
 from ddqn_planner.planning.pose_planner import PoseRequest
 from ddqn_planner.robot.motions import HEADINGS
 
@@ -130,42 +127,3 @@ def situation_of(request: Request, header: Header | None) -> Situation:
         turns = round(yaw / TURN_TO_PLAN)
     start_cell = request.cells[0]
     return Situation(request.grid, header, start_cell, turns)
-
-
-def with_current_path(request: Request, last: Outcome, frame: str) -> Request:
-    """Return a request that may keep the rest of the path that the robot follows.
-
-    Parameters
-    ----------
-    request : Request
-    last : Outcome
-        With the path that the robot follows, perhaps of another map or model.
-    frame : str
-        The frame of the request's map.
-
-    Returns
-    -------
-    Request
-        The same request if the path cannot be kept: it was in another frame, of a model
-        of another kind, or ended outside the request's map.
-    """
-    if frame != last.header.frame_id:
-        return request
-    if isinstance(request, PoseRequest):
-        if not isinstance(last.plan, PosePlan):
-            return request
-        return replace(request, under_way=last.plan.poses)
-    last_request = last.request
-    if not isinstance(last_request, PlanRequest):
-        return request
-    if last_request.simplified != request.simplified:
-        return request
-    # The cell of the request's map in which cell (0, 0) of the last map lies.
-    shift = shift_between(last_request.grid, request.grid)
-    if shift is None:
-        return request
-    cells = last.plan.path + np.array(shift, np.int32)  # (N, 2) in the request's map
-    x, y = cells[-1].tolist()
-    if not request.grid.contains((x, y)):
-        return request
-    return replace(request, under_way=cells)

@@ -3,6 +3,7 @@
 import math
 import re
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -29,7 +30,6 @@ from ddqn_planner.nodes.expected_times import ExpectedTimes
 from ddqn_planner.nodes.map_updates import REMEDY, MapUpdate, values_of_update
 from ddqn_planner.nodes.outcome import RequestError
 from ddqn_planner.nodes.quality import LATCHED
-from ddqn_planner.nodes.retries import Arrivals
 from ddqn_planner.nodes.ros_packages import apt_install
 from ddqn_planner.nodes.worker import Worker
 
@@ -56,6 +56,7 @@ ONE_WAY_ZONES = "one-way zones"
 
 # Seconds to wait for a costmap without a known period, as Nav2's planners do.
 UPDATE_WAIT = 1.0
+INTERVALS = 8  # between the last costmaps, whose median is the period
 NUMBER = re.compile(r"-?\d[\d.]*(e[+-]?\d+)?")
 
 
@@ -68,6 +69,37 @@ class Received:
     header: Header  # of the map, or of its last update
     time: float  # of the map or its last update, in seconds of the steady clock
     forbidden: Forbidden | None = None  # by the directions
+
+
+class Arrivals:
+    """Counts maps and their updates, and measures the time from one to the next."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self.number = 0
+        """How many maps and updates came: also the number of the last one."""
+        self.number_at_vain_wait = -1
+        """What `number` was when a request last waited, and nothing came."""
+        self.times: deque[float] = deque(maxlen=INTERVALS + 1)
+        """When the last maps and updates came, in seconds by the clock."""
+
+    def note(self) -> float:
+        """Count a map or an update that comes now; return the time in seconds."""
+        now = self._clock()
+        self.number += 1
+        self.times.append(now)
+        return now
+
+    @property
+    def period(self) -> float:
+        """Seconds between messages, the median; infinite before the second message."""
+        intervals = np.diff(self.times)
+        if len(intervals) == 0:
+            return math.inf
+        if len(intervals) <= 2:
+            # Two messages may come together, as a costmap and its first update.
+            return float(intervals.max())
+        return float(np.median(intervals))
 
 
 class MapSource:

@@ -65,7 +65,7 @@ class ModelSource:
         # Of the trainer's message that the model came in; it holds the digest.
         self.layout: MultiArrayLayout | None = None
         self._node = node
-        self.diagnostics = diagnostics
+        self._diagnostics = diagnostics
         self._worker = worker
         self.loading: Future | None = None
         """Of the `FirstModel`, until `wait_until_loaded` uses or refuses it."""
@@ -105,7 +105,7 @@ class ModelSource:
             return
         if first.model is None:
             self.loading = None
-            self.diagnostics.refuse("model", first.problem)
+            self._diagnostics.refuse("model", first.problem)
         else:
             self.use(first.model.planner, first.model.file)
 
@@ -117,8 +117,8 @@ class ModelSource:
         self.file = file
         self.layout = layout
         self.loading = None
-        self.diagnostics.ok("model")
-        self.diagnostics.change()
+        self._diagnostics.ok("model")
+        self._diagnostics.change()
         self._node.get_logger().info(f"planning with the model {file}")
 
     def describe(self, rule: str) -> dict[str, str]:

@@ -16,12 +16,11 @@ from ddqn_planner.nodes.base_node import BaseNode
 from ddqn_planner.nodes.other_planners import (
     ACTIONS,
     QUEUES,
-    GivenUp,
     GoalAnswer,
     OtherPlanners,
     action_name,
 )
-from ddqn_planner.nodes.outcome import ALL_GOALS, Outcome, PathQuery
+from ddqn_planner.nodes.outcome import ALL_GOALS, GivenUp, Outcome, PathQuery
 from ddqn_planner.nodes.ros_packages import apt_install
 from ddqn_planner.planning import PlanStatus
 

@@ -12,11 +12,8 @@ from rclpy.task import Future
 
 from ddqn_planner.nodes.base_node import BaseNode
 from ddqn_planner.nodes.clocks import STEADY
-from ddqn_planner.nodes.outcome import Outcome
+from ddqn_planner.nodes.outcome import GivenUp, Outcome
 from ddqn_planner.nodes.quality import SERVICE_QUALITY
-
-# Returns the outcome of a goal that is given up now, else None.
-GivenUp = Callable[[], Outcome | None]
 
 ACTIONS = ("compute_path_to_pose", "compute_path_through_poses")
 # Seconds between two checks whether a goal is given up, or its server is gone.

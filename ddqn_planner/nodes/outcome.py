@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -93,6 +93,9 @@ class Outcome:
         """Length of its path in cells."""
         return self.plan.length if isinstance(self.plan, PosePlan) else self.path.length
 
+
+# Returns the outcome of a request that is given up now, else None.
+GivenUp = Callable[[], Outcome | None]
 
 NO_REQUEST = Outcome("NO_REQUEST", "no plan was asked for yet")
 STOPPING = Outcome(

@@ -8,7 +8,8 @@ from std_msgs.msg import Header
 
 from ddqn_planner.nodes.conversions import frame_of, in_outer_frame, pose_of, poses_of
 from ddqn_planner.nodes.outcome import RequestError
-from ddqn_planner.nodes.requests import THE_START, PlanInputs, Requests, clearing_radius
+from ddqn_planner.nodes.reasons import THE_START
+from ddqn_planner.nodes.requests import PlanInputs, Requests, clearing_radius
 from ddqn_planner.planning.path_check import LETHAL, Float64, invalid_poses
 from ddqn_planner.planning.pose_paths import points_of
 from ddqn_planner.robot.footprint import read_footprint

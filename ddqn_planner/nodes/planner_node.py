@@ -1,16 +1,14 @@
 """The planner node: plans on the map from the robot's pose to the goal pose."""
 
-import math
-from collections.abc import Awaitable, Coroutine, Sequence
-from dataclasses import replace
+from collections.abc import Awaitable, Sequence
 from typing import Any, NamedTuple
 
-from geometry_msgs.msg import PoseArray, PoseStamped, Quaternion
+from geometry_msgs.msg import PoseArray, PoseStamped
 from nav_msgs.msg import Path
 from nav_msgs.srv import GetPlan
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.parameter import Parameter
-from std_msgs.msg import Header, UInt8MultiArray
+from std_msgs.msg import UInt8MultiArray
 
 from ddqn_planner.experience import Experience
 from ddqn_planner.memory import give_back, llvm_was_used, reuse_small_arrays
@@ -19,8 +17,6 @@ from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal
 from ddqn_planner.nodes.base_node import unless_refused
 from ddqn_planner.nodes.clocks import STEADY
 from ddqn_planner.nodes.conversions import (
-    Float64,
-    along,
     bytes_of,
     path_bytes,
     path_message,
@@ -32,7 +28,6 @@ from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.model_source import ModelSource, read_model
 from ddqn_planner.nodes.nav2 import NavigationServer, serve_nav2
 from ddqn_planner.nodes.other_planners import (
-    GivenUp,
     GoalAnswer,
     check_prefix,
 )
@@ -40,15 +35,15 @@ from ddqn_planner.nodes.outcome import (
     NO_REQUEST,
     NOT_ACTIVE,
     STOPPING,
+    GivenUp,
     Outcome,
     PathQuery,
-    RequestError,
 )
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS, PlannerSettings
 from ddqn_planner.nodes.path_validity import PathCheck, check_path
 from ddqn_planner.nodes.poses import Poses, check_source
 from ddqn_planner.nodes.quality import LATCHED
-from ddqn_planner.nodes.requests import Requests
+from ddqn_planner.nodes.requests import Requests, path_poses
 from ddqn_planner.nodes.spinning import spin_until_shutdown
 from ddqn_planner.nodes.worker import Worker
 from ddqn_planner.planning import PlanMethod, Planner
@@ -58,8 +53,6 @@ from ddqn_planner.planning.segments import SAME_COST
 CONFIGURED = ("inactive", "active")  # states with a map, a start and requests
 SOON_PERIOD = 0.1  # seconds until the next check after a change
 IDLE_PERIOD = 1.0  # seconds between checks otherwise
-
-Planning = Coroutine[None, None, Outcome]
 
 
 class LoggedPlan(NamedTuple):
@@ -131,6 +124,9 @@ class PlannerNode(ManagedNode):
         )
         """Receives the robot's pose; from `configure` to `cleanup`."""
         self.requests = Requests(
+            self,
+            self._diagnostics,
+            lambda: self._refusal,
             self._settings,
             self.map_source,
             self.poses,
@@ -323,7 +319,7 @@ class PlannerNode(ManagedNode):
         """Answer ``~/get_plan``; a start without a frame means the robot's pose."""
         start = request.start if request.start.header.frame_id else None
         query = PathQuery(start, [request.goal], tolerance=request.tolerance)
-        outcome = await self._answer(query.goals, self.requests.plan(query))
+        outcome = await self.requests.answer(query.goals, self.requests.plan(query))
         response.plan = path_message(*path_poses(outcome))
         self._diagnostics.log(outcome)
         return response
@@ -347,7 +343,7 @@ class PlannerNode(ManagedNode):
         """
         active = self._active_goal
         goals = active.poses
-        outcome = await self._answer(goals, self.requests.plan_for(active))
+        outcome = await self.requests.answer(goals, self.requests.plan_for(active))
         if outcome.status in (UNCHANGED.status, NOT_ACTIVE.status):
             return
         self._publish(outcome, active)
@@ -374,7 +370,7 @@ class PlannerNode(ManagedNode):
         given up now, else None. The path is published, too.
         """
         planning = self.requests.plan(query, self._path_of_action)
-        outcome = await self._answer(query.goals, planning, given_up)
+        outcome = await self.requests.answer(query.goals, planning, given_up)
         poses = path_poses(outcome)
         if len(outcome.plan.path):
             self._path_of_action = outcome
@@ -426,7 +422,8 @@ class PlannerNode(ManagedNode):
         def given_up() -> Outcome | None:
             return None if outcome is self._newest_outcome else UNCHANGED
 
-        better = await self._answer([], self.requests.improve(outcome), given_up)
+        improving = self.requests.improve(outcome)
+        better = await self.requests.answer([], improving, given_up)
         if outcome is self._active_goal.last and better.request is not None:
             self._publish(better, self._active_goal)
 
@@ -450,46 +447,6 @@ class PlannerNode(ManagedNode):
         if hasattr(response, "invalid_pose_indices"):
             response.invalid_pose_indices = invalid_poses
         return response
-
-    async def _answer(
-        self,
-        goals: Sequence[PoseStamped],
-        planning: Planning,
-        given_up: GivenUp = lambda: None,
-    ) -> Outcome:
-        """Return the outcome of a coroutine that plans, whatever error it raises.
-
-        Parameters
-        ----------
-        goals : sequence of PoseStamped
-            Of the request: without a map, the path has the frame of the first goal.
-        planning : coroutine
-            It is closed when the node refuses requests, or when this one is given up.
-        given_up : callable
-            Returns the outcome if the request is given up now, else None.
-        """
-        outcome: Outcome
-        try:
-            with self.answering():
-                outcome = await unless_refused(
-                    planning, lambda: self._refusal or given_up()
-                )
-        except RequestError as error:
-            outcome = Outcome(error.status, str(error))
-        except Exception as error:  # as when no memory is left: the node must survive
-            remedy = "give a smaller map, or another model"
-            outcome = Outcome("FAILED", f"the planning failed ({error!r}); {remedy}")
-        if outcome is not UNCHANGED:
-            self._diagnostics.note(outcome)
-        return replace(outcome, header=self.header(self._frame_of(outcome, goals)))
-
-    def _frame_of(self, outcome: Outcome, goals: Sequence[PoseStamped]) -> str:
-        """Return the frame of a path: its map's, or without a map the goal's."""
-        if outcome.goal is not None:  # the node's map may be another one by now
-            return str(outcome.goal.header.frame_id)
-        if self.map_source.frame or not goals:
-            return self.map_source.frame
-        return str(goals[0].header.frame_id)
 
     # Diagnostics
 
@@ -548,30 +505,6 @@ class PlannerNode(ManagedNode):
             self.model_source.planner is None and "model" in self._diagnostics.refused
         )
         self._diagnostics.publish(is_fatal, "; ".join(filter(None, missing)), values)
-
-
-class PathPoses(NamedTuple):
-    """The poses of a path in the plane; see `path_message`."""
-
-    points: Float64  # (N, 2): metres in the header's frame
-    yaws: Float64  # (N,), or (N - 1,) with a last orientation
-    header: Header
-    last_orientation: Quaternion | None = None
-
-
-def path_poses(outcome: Outcome) -> PathPoses:
-    """Return the poses of an outcome's path; none if it has no path."""
-    plan = outcome.plan
-    if isinstance(plan, PosePlan):
-        points = plan.poses[:, :2]  # (N, 2) metres
-        yaws = plan.poses[:, 2]  # (N,) radians
-        return PathPoses(points, yaws, outcome.header)
-    spacing = math.inf  # metres between poses at most
-    if outcome.is_dense and outcome.request is not None:
-        spacing = outcome.request.grid.resolution
-    points, yaws = along(outcome.path.points, spacing)
-    orientation = None if outcome.goal is None else outcome.goal.pose.orientation
-    return PathPoses(points, yaws, outcome.header, orientation)
 
 
 def main() -> int:

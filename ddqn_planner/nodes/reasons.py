@@ -1,4 +1,4 @@
-"""The reason of an outcome in words: how a path was found, or why there is none."""
+"""An outcome in words: how a path was found, or why there is none; names of goals."""
 
 import math
 from collections.abc import Sequence
@@ -7,11 +7,13 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped
 
 from ddqn_planner.grid import Cell
-from ddqn_planner.nodes.outcome import Request
+from ddqn_planner.nodes.outcome import PathQuery, Request
 from ddqn_planner.planning import Plan, PlanMethod, PlanStatus, unknown_space
 from ddqn_planner.planning.exact_paths import NO_PATH, ExactPath
 from ddqn_planner.planning.plan import PosePlan, PoseRequest
 
+THE_START = "the start"  # in errors
+THE_GOAL = "the goal"  # in errors, where there is one goal
 MOST_CELLS = 5  # of goals that a reason lists
 # No remedy for several goals: none of them moves.
 TOLERANCE = ", or a greater tolerance"
@@ -37,6 +39,30 @@ REMEDIES_OF_BODY = {
         f"set the goal where the robot's body has room{TOLERANCE}"
     ),
 }
+
+
+def goal_names(count: int, has_via_points: bool = False) -> list[str]:
+    """Return what errors call the goals of a query, from the first to the last.
+
+    With via-points, all goals but the last are via-points.
+    """
+    if has_via_points:
+        return [*(f"via-point {number}" for number in range(1, count)), THE_GOAL]
+    if count == 1:
+        return [THE_GOAL]
+    return [f"goal {number}" for number in range(1, count + 1)]
+
+
+def missed_goal_in_words(
+    query: PathQuery, names: Sequence[str], number_of_legs: int
+) -> str:
+    """Return the goal to which the last of the planned legs has no path, in words."""
+    name = names[number_of_legs - 1]
+    if name == THE_GOAL:
+        return name
+    number_of_via_points = len(names) - 1
+    count = number_of_via_points if query.has_via_points else len(names)
+    return f"{name} of {count}"
 
 
 def reason_of(

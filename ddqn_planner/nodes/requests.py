@@ -1,35 +1,57 @@
-"""From a query to its outcome, with the map, the parameters and the model."""
+"""The way of a request, from a query to its outcome.
+
+`Requests.plan_once` tells the story in order: check the query, wait for the map, the
+model and the poses, make the planner's request, plan, and word the outcome.
+`Requests.answer` runs it, and makes an outcome of each error.
+"""
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import NamedTuple, TypeVar
 
-from geometry_msgs.msg import PoseStamped
+import numpy as np
+from geometry_msgs.msg import PoseStamped, Quaternion
 from rclpy.task import Future
 from std_msgs.msg import Header
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
-from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal, with_current_path
-from ddqn_planner.nodes.conversions import cell_from_pose, pose_of
+from ddqn_planner.grid.map_changes import shift_between
+from ddqn_planner.nodes.active_goal import UNCHANGED, ActiveGoal
+from ddqn_planner.nodes.base_node import BaseNode, unless_refused
+from ddqn_planner.nodes.conversions import Float64, along, cell_from_pose, pose_of
+from ddqn_planner.nodes.diagnostics import PlannerDiagnostics
 from ddqn_planner.nodes.map_source import MapSource
 from ddqn_planner.nodes.model_source import ModelSource
-from ddqn_planner.nodes.outcome import Outcome, PathQuery, Request, RequestError
+from ddqn_planner.nodes.outcome import (
+    GivenUp,
+    Outcome,
+    PathQuery,
+    Request,
+    RequestError,
+)
 from ddqn_planner.nodes.parameters import PlannerSettings
 from ddqn_planner.nodes.poses import Poses
-from ddqn_planner.nodes.reasons import nearest_goal, reason_of
-from ddqn_planner.nodes.retries import Retries
+from ddqn_planner.nodes.reasons import (
+    THE_START,
+    goal_names,
+    missed_goal_in_words,
+    nearest_goal,
+    reason_of,
+)
 from ddqn_planner.nodes.worker import Worker
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest
 from ddqn_planner.planning.exact_paths import NO_PATH, ExactPath, exact_path
 from ddqn_planner.planning.plan import PosePlan, joined
 from ddqn_planner.planning.pose_planner import PoseRequest
 
-THE_START = "the start"  # in errors
-THE_GOAL = "the goal"  # in errors, where there is one goal
+RETRY_WITHIN = 2.0  # seconds after a failure; later if no newer costmap came
+MOST_FAILURES = 16
 
+Planning = Coroutine[None, None, Outcome]
 T = TypeVar("T")
 
 
@@ -48,6 +70,15 @@ class MapPose(NamedTuple):
     cell: Cell
 
 
+class PathPoses(NamedTuple):
+    """The poses of a path in the plane; see `path_message`."""
+
+    points: Float64  # (N, 2): metres in the header's frame
+    yaws: Float64  # (N,), or (N - 1,) with a last orientation
+    header: Header
+    last_orientation: Quaternion | None = None
+
+
 class Legs(NamedTuple):
     """The plans of the legs from stop to stop; the last plan may have no path."""
 
@@ -55,10 +86,79 @@ class Legs(NamedTuple):
     plans: list[Plan]
 
 
+class Failure(NamedTuple):
+    """A failed request; a retry may start elsewhere, or have fewer goals before."""
+
+    last_goal: PoseStamped  # in the frame of the request
+    costmap: int  # the number, in `Arrivals`, of the costmap that had no path
+    seconds: float  # when it failed, by the steady clock
+
+
+class Retries:
+    """The last requests that failed."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._failures: deque[Failure] = deque(maxlen=MOST_FAILURES)
+
+    def is_retry(
+        self, goals: Sequence[PoseStamped], costmap: int, resolution: float
+    ) -> bool:
+        """Return whether a request with the same last goal failed before.
+
+        Parameters
+        ----------
+        goals : sequence of PoseStamped
+            Of the request that may be a retry.
+        costmap : int
+            The number, in `Arrivals`, of the costmap now. A failure counts if this
+            costmap had no path, or if the failure is less than `RETRY_WITHIN` ago.
+        resolution : float
+            Metres: two goals that are no farther from each other are the same.
+        """
+        for failure in self._failures:
+            is_recent = self._clock() - failure.seconds < RETRY_WITHIN
+            may_have_been_cleared = failure.costmap == costmap or is_recent
+            is_near = _distance(failure.last_goal, goals[-1]) <= resolution
+            if may_have_been_cleared and is_near:
+                return True
+        return False
+
+    def note(
+        self, goals: Sequence[PoseStamped], costmap: int, outcome: Outcome
+    ) -> None:
+        """Forget older failures to a request's last goal; remember one if it failed.
+
+        Parameters
+        ----------
+        goals : sequence of PoseStamped
+            Of the request.
+        costmap : int
+            The number, in `Arrivals`, of the costmap that was planned on.
+        outcome : Outcome
+            Of the request.
+        """
+        if outcome.request is None:
+            return
+        last_goal = goals[-1]
+        resolution = outcome.request.grid.resolution
+        failures = [
+            failure
+            for failure in self._failures
+            if _distance(failure.last_goal, last_goal) > resolution
+        ]
+        self._failures = deque(failures, MOST_FAILURES)
+        if outcome.has_failed:
+            self._failures.append(Failure(last_goal, costmap, self._clock()))
+
+
 @dataclass
 class Requests:
-    """Plans paths; a `RequestError` says why a path cannot be planned for."""
+    """Plans paths, and answers each request; `plan` may raise a `RequestError`."""
 
+    node: BaseNode
+    diagnostics: PlannerDiagnostics
+    refusal: GivenUp  # returns the outcome if the node refuses all requests now
     settings: PlannerSettings  # of now: the node sets others when parameters change
     map: MapSource
     poses: Poses
@@ -74,6 +174,50 @@ class Requests:
         wake = self.next_wake
         self.next_wake = Future()
         wake.set_result(None)
+
+    # Answering
+
+    async def answer(
+        self,
+        goals: Sequence[PoseStamped],
+        planning: Planning,
+        given_up: GivenUp = lambda: None,
+    ) -> Outcome:
+        """Return the outcome of a coroutine that plans, whatever error it raises.
+
+        Parameters
+        ----------
+        goals : sequence of PoseStamped
+            Of the request: without a map, the path has the frame of the first goal.
+        planning : coroutine
+            It is closed when the node refuses requests, or when this one is given up.
+        given_up : callable
+            Returns the outcome if the request is given up now, else None.
+        """
+        outcome: Outcome
+        try:
+            with self.node.answering():
+                outcome = await unless_refused(
+                    planning, lambda: self.refusal() or given_up()
+                )
+        except RequestError as error:
+            outcome = Outcome(error.status, str(error))
+        except Exception as error:  # as when no memory is left: the node must survive
+            remedy = "give a smaller map, or another model"
+            outcome = Outcome("FAILED", f"the planning failed ({error!r}); {remedy}")
+        if outcome is not UNCHANGED:
+            self.diagnostics.note(outcome)
+        return replace(outcome, header=self.node.header(self._frame_of(outcome, goals)))
+
+    def _frame_of(self, outcome: Outcome, goals: Sequence[PoseStamped]) -> str:
+        """Return the frame of a path: its map's, or without a map the goal's."""
+        if outcome.goal is not None:  # the node's map may be another one by now
+            return str(outcome.goal.header.frame_id)
+        if self.map.frame or not goals:
+            return self.map.frame
+        return str(goals[0].header.frame_id)
+
+    # Planning
 
     async def plan(self, query: PathQuery, current: Outcome | None = None) -> Outcome:
         """Plan as `plan_once`; after a repeated failure, on the next costmaps, too.
@@ -263,7 +407,7 @@ class Requests:
         await self.model.wait_until_loaded()
         planner = self.model.planner
         if planner is None:
-            reason = self.model.diagnostics.refused["model"]
+            reason = self.diagnostics.refused["model"]
             raise RequestError("NO_MODEL", f"no model is loaded: {reason}")
         planner.fields.max_bytes = self.settings.field_cache_bytes
         grid: GridMap = await ready
@@ -333,6 +477,9 @@ class Requests:
             await self.next_wake
 
 
+# Understanding a query
+
+
 def check_query(query: PathQuery, own_id: str) -> None:
     """Raise a RequestError if a query has no goal, or names another planner.
 
@@ -358,30 +505,6 @@ def tolerance_of(query: PathQuery, settings: PlannerSettings) -> float:
         remedy = "give metres, finite and 0 or more"
         raise RequestError("INVALID_TOLERANCE", f"{problem}; {remedy}")
     return query.tolerance
-
-
-def goal_names(count: int, has_via_points: bool = False) -> list[str]:
-    """Return what errors call the goals of a query, from the first to the last.
-
-    With via-points, all goals but the last are via-points.
-    """
-    if has_via_points:
-        return [*(f"via-point {number}" for number in range(1, count)), THE_GOAL]
-    if count == 1:
-        return [THE_GOAL]
-    return [f"goal {number}" for number in range(1, count + 1)]
-
-
-def missed_goal_in_words(
-    query: PathQuery, names: Sequence[str], number_of_legs: int
-) -> str:
-    """Return the goal to which the last of the planned legs has no path, in words."""
-    name = names[number_of_legs - 1]
-    if name == THE_GOAL:
-        return name
-    number_of_via_points = len(names) - 1
-    count = number_of_via_points if query.has_via_points else len(names)
-    return f"{name} of {count}"
 
 
 def request_to(
@@ -437,12 +560,54 @@ def next_request(request: Request, leg: Plan, goal: MapPose) -> Request:
     return request.after(leg, goal.cell)
 
 
+def with_current_path(request: Request, last: Outcome, frame: str) -> Request:
+    """Return a request that may keep the rest of the path that the robot follows.
+
+    Parameters
+    ----------
+    request : Request
+    last : Outcome
+        With the path that the robot follows, perhaps of another map or model.
+    frame : str
+        The frame of the request's map.
+
+    Returns
+    -------
+    Request
+        The same request if the path cannot be kept: it was in another frame, of a model
+        of another kind, or ended outside the request's map.
+    """
+    if frame != last.header.frame_id:
+        return request
+    if isinstance(request, PoseRequest):
+        if not isinstance(last.plan, PosePlan):
+            return request
+        return replace(request, under_way=last.plan.poses)
+    last_request = last.request
+    if not isinstance(last_request, PlanRequest):
+        return request
+    if last_request.simplified != request.simplified:
+        return request
+    # The cell of the request's map in which cell (0, 0) of the last map lies.
+    shift = shift_between(last_request.grid, request.grid)
+    if shift is None:
+        return request
+    cells = last.plan.path + np.array(shift, np.int32)  # (N, 2) in the request's map
+    x, y = cells[-1].tolist()
+    if not request.grid.contains((x, y)):
+        return request
+    return replace(request, under_way=cells)
+
+
 def clearing_radius(settings: PlannerSettings, grid: GridMap) -> float:
     """Return the start_clearing_radius in cells."""
     metres = settings.start_clearing_radius
     if metres < 0:  # by default
         metres = max(settings.robot_radius, grid.resolution)
     return metres / grid.resolution
+
+
+# From plans to the outcome, and to the poses of its path
 
 
 def outcome_of(
@@ -531,3 +696,27 @@ def exact_path_through(
     cells = [plan.path for plan in plans]
     points = [pose_of(stop)[:2] for stop in stops]  # (x, y) in metres
     return exact_path(cells, request.grid, points)
+
+
+def path_poses(outcome: Outcome) -> PathPoses:
+    """Return the poses of an outcome's path; none if it has no path."""
+    plan = outcome.plan
+    if isinstance(plan, PosePlan):
+        points = plan.poses[:, :2]  # (N, 2) metres
+        yaws = plan.poses[:, 2]  # (N,) radians
+        return PathPoses(points, yaws, outcome.header)
+    spacing = math.inf  # metres between poses at most
+    if outcome.is_dense and outcome.request is not None:
+        spacing = outcome.request.grid.resolution
+    points, yaws = along(outcome.path.points, spacing)
+    orientation = None if outcome.goal is None else outcome.goal.pose.orientation
+    return PathPoses(points, yaws, outcome.header, orientation)
+
+
+def _distance(goal: PoseStamped, other: PoseStamped) -> float:
+    """Return the metres from one goal to another; infinite in different frames."""
+    if goal.header.frame_id != other.header.frame_id:
+        return math.inf
+    position = goal.pose.position
+    other_position = other.pose.position
+    return math.hypot(position.x - other_position.x, position.y - other_position.y)

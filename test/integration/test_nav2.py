@@ -45,8 +45,13 @@ from ddqn_planner.nodes.nav2 import (
     error_code,
     goal_poses,
 )
-from ddqn_planner.nodes.other_planners import GivenUp
-from ddqn_planner.nodes.outcome import NOT_ACTIVE, Outcome, PathQuery, RequestError
+from ddqn_planner.nodes.outcome import (
+    NOT_ACTIVE,
+    GivenUp,
+    Outcome,
+    PathQuery,
+    RequestError,
+)
 from ddqn_planner.nodes.planner_node import PlannerNode
 from ddqn_planner.nodes.quality import SERVICE_QUALITY
 from ddqn_planner.nodes.requests import check_query

@@ -24,10 +24,11 @@ from std_msgs.msg import Header
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.active_goal import ActiveGoal
 from ddqn_planner.nodes.base_node import FAREWELL
+from ddqn_planner.nodes.map_source import Arrivals
 from ddqn_planner.nodes.nav2 import CANCELED
 from ddqn_planner.nodes.outcome import NOT_ACTIVE, STOPPING, Outcome, PathQuery
 from ddqn_planner.nodes.planner_node import IDLE_PERIOD, PlannerNode
-from ddqn_planner.nodes.retries import Arrivals, Retries
+from ddqn_planner.nodes.requests import Retries
 from ddqn_planner.planning import Plan, PlanRequest, PlanStatus
 
 CLEARS = 8
