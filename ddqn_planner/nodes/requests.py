@@ -169,12 +169,6 @@ class Requests:
     retries: Retries = field(default_factory=Retries)
     clock: Callable[[], float] = time.monotonic  # returns seconds of the steady clock
 
-    def wake_waiting(self) -> None:
-        """Wake the requests that wait for a map or a pose: it may have come."""
-        wake = self.next_wake
-        self.next_wake = Future()
-        wake.set_result(None)
-
     # Answering
 
     async def answer(
@@ -399,6 +393,12 @@ class Requests:
         return plan
 
     # Waiting for the map, the model and poses
+
+    def wake_waiting(self) -> None:
+        """Wake the requests that wait for a map or a pose: it may have come."""
+        wake = self.next_wake
+        self.next_wake = Future()
+        wake.set_result(None)
 
     async def inputs(self) -> PlanInputs:
         """Wait for the map, ready to plan on, and for the model."""
