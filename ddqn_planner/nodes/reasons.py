@@ -56,7 +56,10 @@ def goal_names(count: int, has_via_points: bool = False) -> list[str]:
 def missed_goal_in_words(
     query: PathQuery, names: Sequence[str], number_of_legs: int
 ) -> str:
-    """Return the goal to which the last of the planned legs has no path, in words."""
+    """Return in words the goal to which the last of the planned legs has no path.
+
+    `names` are those of the query's goals, and `number_of_legs` counts planned legs.
+    """
     name = names[number_of_legs - 1]
     if name == THE_GOAL:
         return name

@@ -109,7 +109,7 @@ class Retries:
         Parameters
         ----------
         goals : sequence of PoseStamped
-            Of the request that may be a retry.
+            The goals of the request that may be a retry.
         costmap : int
             The number, in `Arrivals`, of the costmap now. A failure counts if this
             costmap had no path, or if the failure is less than `RETRY_WITHIN` ago.
@@ -127,16 +127,16 @@ class Retries:
     def note(
         self, goals: Sequence[PoseStamped], costmap: int, outcome: Outcome
     ) -> None:
-        """Forget older failures to a request's last goal; remember one if it failed.
+        """Forget older failures to a request's last goal, and note a failure of now.
 
         Parameters
         ----------
         goals : sequence of PoseStamped
-            Of the request.
+            The goals of the request.
         costmap : int
             The number, in `Arrivals`, of the costmap that was planned on.
         outcome : Outcome
-            Of the request.
+            The outcome of the request, which may have failed.
         """
         if outcome.request is None:
             return
@@ -182,9 +182,11 @@ class Requests:
         Parameters
         ----------
         goals : sequence of PoseStamped
-            Of the request: without a map, the path has the frame of the first goal.
+            The goals of the request: without a map, the path has the frame of the first
+            goal.
         planning : coroutine
-            It is closed when the node refuses requests, or when this one is given up.
+            Computes the outcome. It is closed when the node refuses requests, or when
+            the request is given up.
         given_up : callable
             Returns the outcome if the request is given up now, else None.
         """
