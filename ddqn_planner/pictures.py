@@ -171,6 +171,8 @@ def _draw_path(axes: Axes, cells: Sequence[Cell]) -> None:
     """Draw a line through cells (x, y), and a marker at the first and the last cell."""
     from matplotlib.patheffects import withStroke
 
+    x: NDArray[np.int64]
+    y: NDArray[np.int64]
     x, y = np.transpose(cells)
     outline = [withStroke(linewidth=5.5, foreground="white")]
     axes.plot(x, y, color=PATH_COLOUR, linewidth=3, path_effects=outline, label="path")
@@ -210,6 +212,9 @@ def draw_body(axes: Axes, footprint: Array, poses: Array, ends: Array) -> None:
     # A triangle with its tip at the front of the body shows the heading. Its base lies
     # at the robot's origin; at the body's back if the origin is behind the body, and in
     # the middle of the body if the origin is ahead of the body.
+    back: float
+    front: float
+    left: float
     back, _ = footprint.min(axis=0)
     front, left = footprint.max(axis=0)
     base = max(0.0, back)
@@ -217,6 +222,7 @@ def draw_body(axes: Axes, footprint: Array, poses: Array, ends: Array) -> None:
         base = (front + back) / 2
     triangle = np.array([[front, 0], [base, left / 2], [base, -left / 2]])
     colours = {"start": "white", "goal": PATH_COLOUR}
+    pose: Array
     for pose, (label, colour) in zip(ends, colours.items(), strict=True):
         outline = placed(footprint, pose)
         axes.fill(

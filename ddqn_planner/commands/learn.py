@@ -50,6 +50,20 @@ OPTIONS = (
 )
 
 
+class LearnOptions(Namespace):
+    """The command's options, as `run` adds them to its parser."""
+
+    drives: list[Path]
+    map: str
+    out: Path | None
+    experience: Path | None
+    nominal_speed: float | None
+    robot_width: float | None
+    topic: str
+    frame: str
+    robot_frame: str
+
+
 def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
     """Learn from all drives of the recordings, and write the experience.
 
@@ -67,7 +81,7 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
         "--map", required=True, help="ROS map YAML, or name of a shipped map"
     )
     add_options(parser, *OPTIONS)
-    options = parser.parse_args(arguments)
+    options = parser.parse_args(arguments, namespace=LearnOptions())
     first = options.drives[0]
     out = options.out or (first if first.is_dir() else first.parent) / EXPERIENCE
     check_writable(out, "--out")
@@ -89,7 +103,7 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
     return 0
 
 
-def _experience_to_teach(options: Namespace) -> Experience:
+def _experience_to_teach(options: LearnOptions) -> Experience:
     """Return the experience to which the drives are added.
 
     The option ``--experience`` names a file with older experience; without this option
@@ -110,7 +124,7 @@ def _experience_to_teach(options: Namespace) -> Experience:
 
 
 def _read_drives(
-    options: Namespace, grid: GridMap, locked_folders: ExitStack
+    options: LearnOptions, grid: GridMap, locked_folders: ExitStack
 ) -> list[Drive]:
     """Return the drives of all recordings, which were driven on the map `grid`.
 

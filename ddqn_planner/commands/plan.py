@@ -95,6 +95,31 @@ CELL_OPTIONS: Final = (
 BODY_OPTIONS: Final = ("yaws", "yaw_tolerance", "bound")
 
 
+class PlanOptions(Namespace):
+    """The command's options, as `run` adds them to its parser."""
+
+    map: str
+    start: Sequence[int] | None
+    goal: Sequence[int] | None
+    move_rule: str | None
+    model: str
+    mode: str
+    occupied_threshold: int
+    allow_unknown: bool
+    use_map_costs: bool
+    robot_radius: float
+    clearance_weight: float
+    tolerance: float
+    start_clearing_radius: float
+    yaws: tuple[float, float]
+    yaw_tolerance: float
+    bound: float
+    cells: bool
+    csv: Path | None
+    json: bool
+    picture: Path | None
+
+
 class Report(NamedTuple):
     """A plan in the forms in which the command shows it."""
 
@@ -123,7 +148,7 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
         metavar=("START", "GOAL"),
         help="body: headings in the map frame, radians (default: %(default)s)",
     )
-    options = parser.parse_args(arguments)
+    options = parser.parse_args(arguments, namespace=PlanOptions())
     for option in ("csv", "picture"):
         file = getattr(options, option)
         if file:
@@ -184,7 +209,7 @@ def _refuse_options(
 
 
 def _plan_cells(
-    options: Namespace, planner: Planner, grid: GridMap, start: Cell, goal: Cell
+    options: PlanOptions, planner: Planner, grid: GridMap, start: Cell, goal: Cell
 ) -> Report:
     """Plan a path of cells, and compare its length with that of the shortest path.
 
@@ -264,7 +289,7 @@ def _lines_of(plan: Plan, grid: GridMap, optimum: float | None) -> list[str]:
 
 
 def _plan_poses(
-    options: Namespace, planner: Planner, grid: GridMap, start: Cell, goal: Cell
+    options: PlanOptions, planner: Planner, grid: GridMap, start: Cell, goal: Cell
 ) -> Report:
     """Plan a path of poses for a model with a body.
 
@@ -307,7 +332,7 @@ def _plan_poses(
     )
 
 
-def _print(options: Namespace, grid: GridMap, report: Report) -> None:
+def _print(options: PlanOptions, grid: GridMap, report: Report) -> None:
     """Print a plan as JSON or as text, or on stderr why there is no path.
 
     `options` are the parsed arguments, `grid` is the map of the plan, and `report` has

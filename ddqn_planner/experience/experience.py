@@ -212,7 +212,7 @@ class Experience:
                 f"{FARTHEST:g}"
             )
         elapsed = np.diff(poses.time)
-        dx, dy = np.diff(poses.position, axis=0).T
+        step: Float64 = np.diff(poses.position, axis=0)  # metres
         backwards = np.count_nonzero(elapsed < 0)
         if backwards:
             return f"{backwards} times are earlier than those before; sort them"
@@ -221,7 +221,7 @@ class Experience:
                 f"the times are up to {elapsed.max():.3g} s apart; give at most "
                 f"{self.max_pause:g}"
             )
-        fastest = float((np.hypot(dx, dy) / elapsed).max())
+        fastest = float((np.hypot(step[:, 0], step[:, 1]) / elapsed).max())
         if fastest > self.max_speed:
             return self._wrong_speed(fastest, "at", "greater")
         from_start_x, from_start_y = (poses.position - poses.position[0]).T
@@ -461,7 +461,8 @@ class Experience:
         metres_of_segment = np.hypot(dx, dy) * grid.resolution  # (K - 1,)
         segment = position[:-1].astype(np.int64)  # (M,): the segment of each move
         metres = np.diff(position) * metres_of_segment[segment]  # (M,)
-        x, y = path.T
+        x = path[:, 0]
+        y = path[:, 1]
         places = posterior.place[y, x]  # (M + 1,)
         slowness = posterior.slowness[places]  # (M + 1,)
         mean_slowness = (slowness[1:] + slowness[:-1]) / 2  # (M,)

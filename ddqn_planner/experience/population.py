@@ -95,16 +95,16 @@ def _fit(
         The log slowness that the prior predicts for each place.
     """
     # (M, 2): the log slowness is about `design @ (level, prior_weight)`.
-    design = np.column_stack([np.ones(len(predicted)), predicted])
+    design: Float64 = np.column_stack([np.ones(len(predicted)), predicted])
     variance = VARIANCE
     count = len(predicted) / ALIKE_PLACES  # the number of places that are not alike
     for _ in range(ITERATIONS):
         level, prior_weight = _regression(mean_log, design, variance + noise)
-        residual = mean_log - design @ (level, prior_weight)
+        residual: Float64 = mean_log - design @ (level, prior_weight)
         # The part of each square that is not noise. The mean is over these squares and
         # over ASSUMED_PLACES more, of the variance VARIANCE.
         squares = residual**2 - noise
-        total = ASSUMED_PLACES * VARIANCE + squares.sum() / ALIKE_PLACES
+        total: float = ASSUMED_PLACES * VARIANCE + squares.sum() / ALIKE_PLACES
         mean_square = total / (ASSUMED_PLACES + count)
         variance = float(np.clip(mean_square, LEAST_VARIANCE, MOST_VARIANCE))
     return level, prior_weight, variance
@@ -126,9 +126,10 @@ def _regression(
     """
     # (2, M): the design times the inverse variance of each place. ALIKE_PLACES places
     # tell as much as one place alone.
-    weighted = design.T / variances / ALIKE_PLACES
+    weighted: Float64 = design.T / variances / ALIKE_PLACES
     inverse_variances = INVERSE_VARIANCE_OF_LEVEL, INVERSE_VARIANCE_OF_PRIOR_WEIGHT
-    covariance = np.linalg.inv(np.diag(inverse_variances) + weighted @ design)  # (2, 2)
+    precision: Float64 = np.diag(inverse_variances) + weighted @ design  # (2, 2)
+    covariance = np.linalg.inv(precision)
     # The mean of the posterior of the weight. As always with normal distributions, it
     # is the covariance times the sum of all means that were assumed or measured, each
     # over its variance.

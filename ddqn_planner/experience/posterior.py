@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,20 @@ class Painted(NamedTuple):
 
     values: Float32  # (P,)
     layer: Float32  # (H, W)
+
+
+class Links(Protocol):
+    """A sparse (P, P) array of scipy: the strengths of L links between P places."""
+
+    indptr: NDArray[np.int32]  # (P + 1,)
+    indices: NDArray[np.int32]  # (L,)
+    data: Float64  # (L,)
+
+    def sum(self, *, axis: int) -> Float64:
+        """Return the sum of each row or column: (P,)."""
+
+    def __matmul__(self, values: Float64) -> Float64:
+        """Return the products with the columns of an array."""
 
 
 class Equations(NamedTuple):
@@ -104,6 +118,9 @@ class Posterior:
         self.place = _places_of(grid, block)
         self._middle_cells = _middle_cells_of(self.place, block)
         # Each cell's place, and that of the nearest free cell for an occupied one.
+        cells_away: Float64
+        x: Int64
+        y: Int64
         cells_away, (y, x) = distance_transform_edt(  # (H, W) each
             self.place == NO_PLACE, return_indices=True
         )
@@ -112,7 +129,7 @@ class Posterior:
         count = len(self._middle_cells)  # P
         self._links = _links_of(self.place, block, count)
         # (P,): the sum over the links of each place.
-        self._strength_of_links: Float64 = self._links.sum(axis=1)
+        self._strength_of_links = self._links.sum(axis=1)
         # (P, 2), the solutions of two systems of equations: the log slowness that was
         # seen beyond the expected one, and the share that is known.
         self._solution = np.zeros((count, 2))
@@ -300,7 +317,7 @@ class Posterior:
         """
         # Each round takes the mean of a place and its neighbours: four in the open.
         for _ in range(reach):
-            sum_of_neighbours: Float64 = self._links @ values
+            sum_of_neighbours = self._links @ values
             values = (values + sum_of_neighbours) / 5
         return values
 
@@ -392,7 +409,7 @@ def _middle_cells_of(place: Int64, block: int) -> Int64:
     return np.column_stack([x[first], y[first]])
 
 
-def _links_of(place: Int64, block: int, count: int) -> Any:
+def _links_of(place: Int64, block: int, count: int) -> Links:
     """Return the links between neighbour places, a sparse (P, P) array of strengths.
 
     A link's strength is the share of a block's side along which two places touch.
@@ -416,7 +433,8 @@ def _links_of(place: Int64, block: int, count: int) -> Any:
     links = csr_array(
         (strength, (first[is_link], second[is_link])), shape=(count, count)
     )
-    return (links + links.T).tocsr()
+    both_ways: Links = (links + links.T).tocsr()
+    return both_ways
 
 
 @in_place

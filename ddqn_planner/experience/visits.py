@@ -189,9 +189,11 @@ def speeds_of(poses: Poses, window: float) -> Float64:
     """
     means = averaged(poses, window)
     elapsed = np.abs(np.diff(means.time))
-    dx, dy = np.diff(means.position, axis=0).T
+    step: Float64 = np.diff(means.position, axis=0)  # metres
     has_elapsed = elapsed > 0
-    speeds: Float64 = np.hypot(dx, dy)[has_elapsed] / elapsed[has_elapsed]
+    speeds: Float64 = (
+        np.hypot(step[:, 0], step[:, 1])[has_elapsed] / elapsed[has_elapsed]
+    )
     return speeds
 
 
@@ -201,8 +203,8 @@ def window_of(poses: Poses, speed: float) -> float:
     `speed` is the robot's usual speed, in metres per second.
     """
     # The second differences of the positions: mostly noise, as a robot turns slowly.
-    bend_x, bend_y = np.diff(poses.position, 2, axis=0).T
-    bends = np.hypot(bend_x, bend_y)
+    bend: Float64 = np.diff(poses.position, 2, axis=0)
+    bends: Float64 = np.hypot(bend[:, 0], bend[:, 1])
     if not len(bends):
         return WINDOW / speed
     noise = float(np.median(bends)) / BEND_OF_NOISE  # metres
@@ -257,8 +259,8 @@ def _believed_parts(poses: Poses, limits: Limits) -> Iterator[Poses]:
     """
     time, position = poses
     elapsed = np.diff(time)  # (N - 1,): seconds from each pose to the next one
-    dx, dy = np.diff(position, axis=0).T  # metres
-    is_jump = np.hypot(dx, dy) > limits.max_speed * elapsed + CORRECTION
+    step: Float64 = np.diff(position, axis=0)  # metres
+    is_jump = np.hypot(step[:, 0], step[:, 1]) > limits.max_speed * elapsed + CORRECTION
     is_pause = elapsed > limits.max_pause
     is_cut = is_jump | is_pause | (elapsed <= 0)
     first_poses = np.flatnonzero(is_cut) + 1  # of all parts but the first

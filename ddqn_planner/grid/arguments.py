@@ -51,7 +51,7 @@ class Choice(str, Enum, metaclass=_ByHash):
         )
 
 
-def is_flag(value: Any) -> bool:
+def is_flag(value: object) -> bool:
     """Return whether a value is True or False, which Python takes for 1 and 0."""
     return isinstance(value, (bool, np.bool_))
 
@@ -115,7 +115,7 @@ def listed(values: Any, name: str, remedy: str = "give a list") -> list[Any]:
         raise ValueError(f"{name} is {values!r}; {remedy}") from None
 
 
-def real(value: Any) -> float:
+def real(value: object) -> float:
     """Return a number of any type as a float, and anything else as NaN.
 
     So a comparison with a range refuses it, as no range contains NaN.
@@ -129,7 +129,7 @@ def real(value: Any) -> float:
 
 
 def as_number(
-    name: str, value: Any, lowest: float, highest: float, remedy: str = ""
+    name: str, value: object, lowest: float, highest: float, remedy: str = ""
 ) -> float:
     """Return a number from `lowest` to `highest` as a float."""
     number = real(value)
@@ -149,7 +149,7 @@ def as_whole(name: str, value: Any, lowest: int, highest: int) -> int:
     )
 
 
-def _short(value: Any) -> str:
+def _short(value: object) -> str:
     """Return the text of a value in an error: the beginning and end of a long one."""
     try:
         text = repr(value)
@@ -166,7 +166,7 @@ def as_seed(seed: Any) -> int:
     raise ValueError(f"the seed is {seed!r}; give a whole number, 0 to {2**63 - 1}")
 
 
-def as_flag(name: str, value: Any) -> bool:
+def as_flag(name: str, value: object) -> bool:
     """Return a truth value of any type, but not "no"."""
     if isinstance(value, (bool, np.bool_, int)) and value in (0, 1):
         return bool(value)

@@ -1,12 +1,13 @@
 """Boxes of cells: rows and columns of an array."""
 
 from collections.abc import Sequence
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 Scalar = TypeVar("Scalar", bound=np.generic)
+Span: TypeAlias = "slice[int]"  # from a start to a stop
 
 MAX_GAP = 16  # rows or columns without a set cell within one box
 MAX_BOXES = 8  # each box takes as long as some thousand cells
@@ -15,8 +16,8 @@ MAX_BOXES = 8  # each box takes as long as some thousand cells
 class Box(NamedTuple):
     """Some rows and columns of an array, which `array[box]` selects."""
 
-    rows: slice
-    columns: slice
+    rows: Span
+    columns: Span
 
 
 ORIGIN = Box(slice(0, 0), slice(0, 0))
@@ -50,7 +51,7 @@ def boxes_of(is_set: NDArray[np.bool_], max_gap: int = MAX_GAP) -> list[Box]:
     return boxes
 
 
-def _runs(is_set: NDArray[np.bool_], max_gap: int) -> list[slice]:
+def _runs(is_set: NDArray[np.bool_], max_gap: int) -> list[Span]:
     """Return slices that hold all True elements of `is_set` (N,).
 
     Two neighbouring True elements lie in one slice if the second one comes at most
@@ -73,7 +74,7 @@ def hull(boxes: Sequence[Box]) -> Box:
     )
 
 
-def _hull_of_slices(slices: Sequence[slice]) -> slice:
+def _hull_of_slices(slices: Sequence[Span]) -> Span:
     """Return the slice from the first start to the last stop."""
     start = min(part.start for part in slices)
     stop = max(part.stop for part in slices)
@@ -84,7 +85,7 @@ def cells_in(box: Box) -> int:
     """Return the number of cells of a box."""
     height = box.rows.stop - box.rows.start
     width = box.columns.stop - box.columns.start
-    return int(height * width)
+    return height * width
 
 
 def wider(box: Box, margin: int, shape: tuple[int, ...]) -> Box:
@@ -99,7 +100,7 @@ def wider(box: Box, margin: int, shape: tuple[int, ...]) -> Box:
     )
 
 
-def _wider_slice(part: slice, margin: int, size: int) -> slice:
+def _wider_slice(part: Span, margin: int, size: int) -> Span:
     """Return a slice with `margin` more elements at both ends, cut at 0 and `size`."""
     return slice(max(part.start - margin, 0), min(part.stop + margin, size))
 

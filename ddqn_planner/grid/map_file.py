@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,9 @@ from ddqn_planner.grid.arguments import (
 from ddqn_planner.grid.grid_map import GridMap
 from ddqn_planner.grid.map_yaml import as_float, as_truth, read_yaml
 from ddqn_planner.resources import find_map
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 MAX_CELLS = 2**26  # a larger map is refused before its cells are read
 MAX_YAML_BYTES = 2**16
@@ -384,13 +387,14 @@ def _read_image(file: Path, formats: tuple[str, ...], layouts: set[str]) -> Pixe
     layouts : set of str
         Pillow's names of pixel layouts, see `LAYOUTS`.
     """
-    from PIL import Image  # 17 ms, and a planner that is sent its maps reads no image
+    # 17 ms, and a planner that is sent its maps reads no image.
+    import PIL.Image
 
-    too_large = Image.DecompressionBombWarning, Image.DecompressionBombError
+    too_large = PIL.Image.DecompressionBombWarning, PIL.Image.DecompressionBombError
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            image = Image.open(file, formats=formats)
+            warnings.simplefilter("error", PIL.Image.DecompressionBombWarning)
+            image = PIL.Image.open(file, formats=formats)
         with image:
             _check_layout(image, layouts)
             return _pixels(image)
@@ -439,7 +443,7 @@ def _check_layout(image: Any, layouts: set[str]) -> None:
         )
 
 
-def _pixels(image: Any) -> Pixels:
+def _pixels(image: "Image") -> Pixels:
     """Return the pixels of an image, grey as map_server sees them."""
     is_clear = np.zeros((image.height, image.width), dtype=np.bool_)
     if "A" in image.getbands() or "transparency" in image.info:
@@ -448,7 +452,7 @@ def _pixels(image: Any) -> Pixels:
     return Pixels(_grey(image).astype(np.uint8, copy=False), is_clear)
 
 
-def _grey(image: Any) -> NDArray[np.integer[Any]]:
+def _grey(image: "Image") -> NDArray[np.integer[Any]]:
     """Return the grey values that map_server gives to a Pillow image: (H, W), 0 to 255.
 
     map_server computes the luma of Rec. 601 with 16 bits, and cuts it to 8 bits. Values
@@ -459,15 +463,14 @@ def _grey(image: Any) -> NDArray[np.integer[Any]]:
     if image.mode in ("1", "L", "LA"):
         return np.asarray(image.convert("L"))
     colours = image.convert("RGBA" if image.mode == "P" else "RGB")
-    channels = np.moveaxis(np.asarray(colours, dtype=np.int32), 2, 0)
+    channels: NDArray[np.int32] = np.moveaxis(np.asarray(colours, dtype=np.int32), 2, 0)
     red = channels[0]
     green = channels[1]
     blue = channels[2]
     # The luma of 16 bits; times 1000, so that the weights are whole numbers.
     luma_times_1000 = 257 * (299 * red + 587 * green + 114 * blue)
-    rounded_luma = (luma_times_1000 + 500) // 1000
-    grey: NDArray[np.int32] = rounded_luma // 257
-    return grey
+    rounded_luma: NDArray[np.int32] = (luma_times_1000 + 500) // 1000
+    return rounded_luma // 257
 
 
 def _value(document: dict[str, Any], key: str) -> Any:
@@ -527,15 +530,17 @@ def _percent_of_grey(document: dict[str, Any], mode: str) -> NDArray[np.int8]:
     # map_server computes in single precision, and a grey value may equal a threshold.
     free = np.float32(free_thresh)
     occupied = np.float32(occupied_thresh)
-    darkness = grey.astype(np.float32) / np.float32(255)  # 0 to 1: free to occupied
+    # 0 to 1: free to occupied.
+    darkness: NDArray[np.float32] = grey.astype(np.float32) / np.float32(255)
     if not is_negated:
         darkness = np.float32(1) - darkness
     percent = np.full(256, float(UNKNOWN))
     if mode == "scale":
-        is_between = (free < darkness) & (darkness < occupied)
+        is_between: NDArray[np.bool_] = (free < darkness) & (darkness < occupied)
         # map_server subtracts the thresholds in double precision, and rounds 0.5 up.
         range_of_scale = np.float32(occupied_thresh - free_thresh)
-        scaled = (darkness[is_between] - free) / range_of_scale * np.float32(100)
+        share: NDArray[np.float32] = (darkness[is_between] - free) / range_of_scale
+        scaled = share * np.float32(100)
         rounded_down = np.floor(scaled)
         is_rounded_up = scaled - rounded_down >= 0.5
         percent[is_between] = rounded_down + is_rounded_up

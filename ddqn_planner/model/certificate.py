@@ -223,7 +223,7 @@ def logit_margins(
     Margins
         The bounds, (P, A), and how much they grow with each cost, (C, P, A).
     """
-    tensors = {
+    tensors: dict[str, Float64] = {
         name: tensor.astype(np.float64) for name, tensor in network.tensors.items()
     }
     lines_of_convolution, lines_of_hidden = _lines_of_layers(tensors, feature_PI)
@@ -232,9 +232,9 @@ def logit_margins(
     # 2018). It is computed from the logits back through the layers; at each layer,
     # sign * logit >= bound + weight @ the outputs of the layer's ReLUs. The sign is 1
     # for a legal action.
-    sign_AP = np.where(legal_PA, 1.0, -1.0).T
-    bound_AP = sign_AP * tensors["moves.bias"][:, None]
-    weight_APF = sign_AP[..., None] * tensors["moves.weight"][:, None]
+    sign_AP: Float64 = np.where(legal_PA, 1.0, -1.0).T
+    bound_AP: Float64 = sign_AP * tensors["moves.bias"][:, None]
+    weight_APF: Float64 = sign_AP[..., None] * tensors["moves.weight"][:, None]
     for layer, lines in (
         ("hidden", lines_of_hidden),
         ("convolution", lines_of_convolution),
@@ -250,7 +250,7 @@ def logit_margins(
     bound_AP += (weight_API * feature_PI).sum(axis=2)
 
     # 2. The least that costs and unknown cells may add, and rounding errors.
-    gain_CPA = weight_API[..., COSTS].transpose(2, 1, 0)
+    gain_CPA: Float64 = weight_API[..., COSTS].transpose(2, 1, 0)
     least_sum_PA, _ = _extremes(gain_CPA, feature_PI)
     greatest_of_input = [
         ("convolution", np.ones_like(feature_PI[0])),
@@ -282,10 +282,10 @@ def _lines_of_layers(
         The inputs of each pattern; those for costs and unknown cells are 0.
     """
     # Copies, as products with transposed arrays are slow.
-    weight_IF = tensors["convolution.weight"].T.copy()
-    hidden_FF = tensors["hidden.weight"].T.copy()
+    weight_IF: Float64 = tensors["convolution.weight"].T.copy()
+    hidden_FF: Float64 = tensors["hidden.weight"].T.copy()
     # 1. The convolution: its outputs without costs, and what costs may add.
-    base_PF = feature_PI @ weight_IF + tensors["convolution.bias"]
+    base_PF: Float64 = feature_PI @ weight_IF + tensors["convolution.bias"]
     least_PF, greatest_PF = _extremes(weight_IF[COSTS, None], feature_PI)
     lines_of_convolution = _Lines(base_PF + least_PF, base_PF + greatest_PF)
 
@@ -294,7 +294,7 @@ def _lines_of_layers(
     slope_PF = lines_of_convolution.slope
     distance_PF = lines_of_convolution.distance
     base_PF = (slope_PF * base_PF) @ hidden_FF + tensors["hidden.bias"]
-    weight_CPF = (slope_PF * weight_IF[COSTS, None]) @ hidden_FF
+    weight_CPF: Float64 = (slope_PF * weight_IF[COSTS, None]) @ hidden_FF
     least_PF, greatest_PF = _extremes(weight_CPF, feature_PI)
     least_PF += distance_PF @ np.minimum(hidden_FF, 0)
     greatest_PF += distance_PF @ np.maximum(hidden_FF, 0)
@@ -315,8 +315,8 @@ class _Lines:
         For all inputs x between, max(x, 0) is at most slope * x + distance, and at
         least slope * x and lower_slope * x.
         """
-        greatest_output_PF = np.maximum(greatest_PF, 0)
-        below_0_PF = np.minimum(least_PF, 0)  # the part of the inputs below 0
+        greatest_output_PF: Float64 = np.maximum(greatest_PF, 0)
+        below_0_PF: Float64 = np.minimum(least_PF, 0)  # the part of the inputs below 0
         # If an input may have both signs, the upper line leads from the point (least,
         # 0) to (greatest, greatest). Else it is the ReLU itself: x, or 0. A tiny
         # divisor takes the place of 0 where no input differs from 0.
@@ -343,11 +343,11 @@ def _extremes(weight_CPU: Float64, feature_PI: Float32) -> tuple[Float64, Float6
         The inputs of each pattern. The first 9 are 1 for occupied cells.
     """
     cells = len(weight_CPU) // 2  # 9, or 0
-    is_free_9P1 = 1 - feature_PI.T[:cells, :, None]
+    is_free_9P1: Float32 = 1 - feature_PI.T[:cells, :, None]
     weight_29PU = weight_CPU.reshape(2, cells, *weight_CPU.shape[1:])
     # A free cell of a cost adds at most the weight of its cost, an unknown cell the
     # weight for unknown, and a free cell of cost 0 adds 0.
-    term_29PU = weight_29PU * is_free_9P1
+    term_29PU: Float64 = weight_29PU * is_free_9P1
     least_9PU = term_29PU.min(axis=0, initial=0)
     greatest_9PU = term_29PU.max(axis=0, initial=0)
     return least_9PU.sum(axis=0), greatest_9PU.sum(axis=0)
@@ -371,7 +371,8 @@ def _multiplier_error(
     """
     if not network.uses_costs:  # it gives 1 in place of MAX_COST_MULTIPLIER at most
         return 1 - 1 / MAX_COST_MULTIPLIER
-    weight_IA = network.tensors["prices.weight"].T.astype(np.float64, order="C")
+    weight_AI = network.tensors["prices.weight"]
+    weight_IA: Float64 = weight_AI.T.astype(np.float64, order="C")
     bias_A = network.tensors["prices.bias"].astype(np.float64)
     # 1. Which inputs are those of a move's two cells: of the 3x3 patch, the cell before
     # the move and the cell after it.
@@ -381,18 +382,19 @@ def _multiplier_error(
     unknown_input_2A = cost_input_2A + 9
     # 2. What the other inputs add: they should add nothing, so their least and greatest
     # sums are enough.
-    other_weight_IA = weight_IA.copy()
+    other_weight_IA: Float64 = weight_IA.copy()
     for input_2A in (cell_2A, cost_input_2A, unknown_input_2A):
         other_weight_IA[input_2A, action_A] = 0
-    base_PA = feature_PI @ other_weight_IA + bias_A
+    base_PA: Float64 = feature_PI @ other_weight_IA + bias_A
     least_PA, greatest_PA = _extremes(other_weight_IA[COSTS, None], feature_PI)
-    size_A = np.abs(other_weight_IA).sum(axis=0) + np.abs(bias_A)
+    size_A: Float64 = np.abs(other_weight_IA).sum(axis=0) + np.abs(bias_A)
     # 3. For each rule and action, every pair of costs of the two cells is tried.
     errors = [0.0]
     for cuts_corners in (False, True):
         # The last input of a pattern tells the rule.
-        legal_of_rule_PA = legal_PA & (feature_PI[:, -1:] == cuts_corners)
-        for action in np.flatnonzero(legal_of_rule_PA.any(axis=0)):
+        is_of_rule_P1: NDArray[np.bool_] = feature_PI[:, -1:] == cuts_corners
+        legal_of_rule_PA = legal_PA & is_of_rule_P1
+        for action in np.flatnonzero(legal_of_rule_PA.any(axis=0)).tolist():
             is_legal_P = legal_of_rule_PA[:, action]
             other_inputs = _OtherInputs(
                 least=float((base_PA + least_PA)[is_legal_P, action].min()),

@@ -209,18 +209,18 @@ def _outputs_by_robot_cell(
     layer : str
         The name of the layer.
     """
-    kernel_9F = tensors["convolution.weight"].reshape(-1, 9).T
+    kernel_9F: NDArray[np.float64] = tensors["convolution.weight"].reshape(-1, 9).T
     bias_F = tensors["convolution.bias"]
     cell_L9 = window_cells(grid.occupancy.shape)  # the cells of each window
     # The layer's weights have the shape (U, F * L) in the file.
     weight_UFL = tensors[f"{layer}.weight"].reshape(-1, len(bias_F), len(cell_L9))
-    weight_LFU = weight_UFL.T.copy()
+    weight_LFU: NDArray[np.float64] = weight_UFL.T.copy()
 
     # 1. Without the robot. Cells outside the map have the value 0.
     background_C = np.append(observation_background(grid.occupancy, goal), 0.0)
     value_L9 = background_C[cell_L9]
-    sum_LF = value_L9 @ kernel_9F + bias_F
-    feature_LF = np.maximum(sum_LF, 0)
+    sum_LF: NDArray[np.float64] = value_L9 @ kernel_9F + bias_F
+    feature_LF: NDArray[np.float64] = np.maximum(sum_LF, 0)
     output_U = tensors[f"{layer}.bias"] + np.tensordot(feature_LF, weight_LFU, 2)
 
     # 2. With the robot in one of the 9 cells of a window, which then has another value.
@@ -304,11 +304,11 @@ class PropagationQNetwork(QNetwork):
         One with costs has 28: the same 9, each cell's cost from 0 to 0.99, whether each
         cell is unknown, and whether corners may be cut.
         """
-        occupied_B9 = patch_B9 == OCCUPIED
+        occupied_B9: NDArray[np.bool_] = patch_B9 == OCCUPIED
         if not cls.uses_costs:
             plain_BI: Array = occupied_B9.astype(np.float32)
             return plain_BI
-        unknown_B9 = patch_B9 == UNKNOWN
+        unknown_B9: NDArray[np.bool_] = patch_B9 == UNKNOWN
         cost_B9 = np.where(occupied_B9 | unknown_B9, 0, patch_B9) / 100
         rule_B1 = np.full((len(patch_B9), 1), move_rule.cuts_corners)
         features = [occupied_B9, cost_B9, unknown_B9, rule_B1]
@@ -420,11 +420,11 @@ class PropagationQNetwork(QNetwork):
         action_A = np.arange(len(MOVES))
         target_A = CENTRE + MOVES @ [1, 3]  # the cell to which each move leads, 0 to 8
         # The terms of the cell before a move, and of the cell after it.
-        term_2AL = np.stack([term_9AL[CENTRE], term_9AL[target_A, action_A]])
+        term_2AL: Array = np.stack([term_9AL[CENTRE], term_9AL[target_A, action_A]])
         # No move leads to an occupied cell, so any term will do for it.
         term_2AL[..., OCCUPIED_CODE] = term_2AL[..., OCCUPIED_CODE - 1]
         # The terms of all other cells should be 0.
-        other_9AL = term_9AL.copy()
+        other_9AL: Array = term_9AL.copy()
         other_9AL[CENTRE] = 0
         other_9AL[target_A, action_A] = 0
         highest_multiplier_A = 1 + term_2AL.max(axis=2).sum(axis=0)
@@ -451,6 +451,9 @@ class PropagationQNetwork(QNetwork):
         weight_AI = self.tensors["prices.weight"]
         # The weights of the inputs for the 9 cells, without that of the move rule.
         weight_of_cells_AI = weight_AI[:, :27]
+        occupied_9A: Array
+        cost_9A: Array
+        unknown_9A: Array
         occupied_9A, cost_9A, unknown_9A = weight_of_cells_AI.T.reshape(3, 9, -1)
         share_of_costs = np.arange(OCCUPIED) / 100  # the inputs for costs 0 to 99
         term_9AL = np.empty((9, len(MOVES), COST_CODES), dtype=np.float32)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,9 @@ from ddqn_planner.planning.plan import (
     joined,
 )
 from ddqn_planner.planning.pose_planner import PosePlanner
+
+if TYPE_CHECKING:
+    from ddqn_planner.model.robot_network import RobotNetwork
 
 HAS_BODY = "the model plans poses of a body"
 
@@ -57,9 +60,9 @@ class Planner:
         self.metadata = metadata
         self.cell_planner = CellPlanner(network)
         self.fields = self.cell_planner.fields
-        self.pose_planner = (
-            PosePlanner(network) if hasattr(network, "motions") else None
-        )
+        self.pose_planner = None
+        if hasattr(network, "motions"):
+            self.pose_planner = PosePlanner(cast("RobotNetwork", network))
         # Here alone is the space of paths chosen: poses for a model that knows a body.
         self._finder: PathFinder[Any, Any] = self.pose_planner or self.cell_planner
 

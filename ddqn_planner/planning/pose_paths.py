@@ -127,10 +127,14 @@ def nearest_pose(
     int
         -1 if no pose is within reach.
     """
+    x: float
+    y: float
+    yaw: float
     x, y, yaw = robot
     max_distance, max_turn = reach
-    distance = np.hypot(poses[:, 0] - x, poses[:, 1] - y) / grid.resolution  # (N,)
-    turn = np.abs(turn_between(poses[:, 2], yaw))  # (N,)
+    # (N,) each.
+    distance: Float64 = np.hypot(poses[:, 0] - x, poses[:, 1] - y) / grid.resolution
+    turn: Float64 = np.abs(turn_between(poses[:, 2], yaw))
     candidates = np.flatnonzero((distance <= max_distance) & (turn <= max_turn))
     if not len(candidates):
         return -1
@@ -163,7 +167,8 @@ def is_free(poses: Float64, grid: GridMap, body: BodyPoints) -> bool:
         return True
     # Whether each cell forbids the move of the origin to the next one. Two poses in one
     # cell have the action 8, which no cell forbids: its bit is not in 8 bits.
-    x, y = cells[:-1].T
+    x = cells[:-1, 0]
+    y = cells[:-1, 1]
     steps = np.clip(np.diff(cells, axis=0), -1, 1)  # (N - 1, 2)
     actions = ACTION_OF_STEP[steps[:, 1] + 1, steps[:, 0] + 1]  # (N - 1,)
     is_forbidden = grid.forbidden[y, x] >> actions & 1

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,9 @@ from ddqn_planner.planning.pose_world import (
 )
 from ddqn_planner.robot.motions import HEADINGS, turn_between
 
+if TYPE_CHECKING:
+    from ddqn_planner.model.robot_network import RobotNetwork
+
 VISITS = 2**16  # states that a field visits in one step of a plan: some 30 ms
 # Whether a path leads through unknown space is looked for in so many such steps, some
 # 0.5 s, within a bound that hardly takes longer than any path.
@@ -53,7 +56,7 @@ ON_PATH = 0.5, math.pi / HEADINGS
 class PosePlanner(PathFinder[PoseRequest, PosePlan]):
     """Keeps the fields of the goals used last. Several threads may use it."""
 
-    def __init__(self, network: Any) -> None:
+    def __init__(self, network: RobotNetwork) -> None:
         """Take the motions, the footprint and the swept cells of a `RobotNetwork`."""
         self._network = network
         self.motions = network.motions

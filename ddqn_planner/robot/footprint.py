@@ -260,6 +260,9 @@ def _padded(corners: Corners, padding: float) -> Corners:
     double_area = float(_cross(corners, next_corners).sum())
     orientation = math.copysign(1, double_area)
     padded: list[NDArray[np.float64]] = []
+    corner: NDArray[np.float64]  # (2,) each
+    direction_in: NDArray[np.float64]
+    direction_out: NDArray[np.float64]
     for corner, direction_in, direction_out in zip(
         corners, directions_before, directions, strict=True
     ):
@@ -299,7 +302,8 @@ def _corner_offsets(
     # Two offsets, to the ends of the cut. The middle of the cut is as far from the
     # corner as the sides move, 1, and the cut lies at a right angle to that direction.
     difference = direction_in - direction_out
-    middle_of_cut = difference / math.hypot(difference[0], difference[1])
+    length = math.hypot(difference[0], difference[1])
+    middle_of_cut: NDArray[np.float64] = difference / length
     along_cut = -_turned_outward(middle_of_cut, orientation)
     half_cut = along_cut * (1 - cosine) / math.sqrt(1 - cosine**2)
     return [middle_of_cut - half_cut, middle_of_cut + half_cut]
@@ -312,6 +316,8 @@ def _turned_outward(
 
     The orientation is 1 for a counter-clockwise outline, -1 for a clockwise one.
     """
+    x: float
+    y: float
     x, y = vector
     return np.array([orientation * y, -orientation * x])
 
@@ -337,11 +343,12 @@ def _distances(points: Points, corners: Corners) -> NDArray[np.float64]:
     The polygon has K corners, (K, 2). Distances have the unit of the points.
     """
     sides = np.roll(corners, -1, axis=0) - corners  # (K, 2)
-    to_points = points[:, None] - corners  # (N, K, 2)
+    to_points: NDArray[np.float64] = points[:, None] - corners  # (N, K, 2)
     # The point of a side that is nearest to a point lies at a share of the side: 0 is
     # its begin and 1 its end.
-    dot_products = (to_points * sides).sum(axis=2)  # (N, K)
-    squared_lengths = (sides * sides).sum(axis=1)  # (K,)
+    # (N, K) and (K,).
+    dot_products: NDArray[np.float64] = (to_points * sides).sum(axis=2)
+    squared_lengths: NDArray[np.float64] = (sides * sides).sum(axis=1)
     shares = (dot_products / squared_lengths).clip(0, 1)  # (N, K)
     from_nearest = to_points - shares[..., None] * sides  # (N, K, 2)
     distances: NDArray[np.float64] = np.hypot(
@@ -358,8 +365,13 @@ def inside(points: Points, corners: Corners) -> NDArray[np.bool_]:
     # For each point, a ray leads to the right. The winding number counts the sides that
     # cross the ray upward, minus those that cross it downward.
     winding_number = np.zeros(len(points), dtype=np.int64)
-    x, y = points.T
+    x = points[:, 0]
+    y = points[:, 1]
     ends = np.roll(corners, -1, axis=0)
+    start_x: float
+    start_y: float
+    end_x: float
+    end_y: float
     for (start_x, start_y), (end_x, end_y) in zip(corners, ends, strict=True):
         if start_y == end_y:  # a side along the rays crosses none
             continue
@@ -395,6 +407,11 @@ def placed(corners: Corners, poses: Poses) -> NDArray[np.float64]:
     The corners (K, 2) are ahead and to the left of the robot's origin. The poses (N, 3)
     are in metres and radians.
     """
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    yaw: NDArray[np.float64]
+    ahead: NDArray[np.float64]
+    left: NDArray[np.float64]
     x, y, yaw = poses.T[..., None]  # (N, 1) each
     ahead, left = corners.T  # (K,) each: in the robot's own frame
     cos = np.cos(yaw)
@@ -464,10 +481,13 @@ def _mark_touched(mask: NDArray[np.bool_], edge: Points, poses: Poses) -> None:
     # The cells near a point are those that contain a corner of a square around it.
     square = MARGIN * np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)])
     middle = len(mask) // 2
+    x: float
+    y: float
+    yaw: float
     for x, y, yaw in poses:
         turned_edge = edge @ _rotation(yaw).T
         points = turned_edge + np.array([x, y])  # (M, 2)
-        corners = points[:, None] + square  # (M, 4, 2)
+        corners: NDArray[np.float64] = points[:, None] + square  # (M, 4, 2)
         cells = np.rint(corners).astype(np.int64) + middle
         column = cells[..., 0]
         row = cells[..., 1]
@@ -490,6 +510,9 @@ def _mark_covered(mask: NDArray[np.bool_], body: Points, poses: Poses) -> None:
     coordinates = np.arange(-middle, middle + 1.0)
     # (S * S, 2): the centres of all cells of the mask, from its middle.
     centres = np.stack(np.meshgrid(coordinates, coordinates), axis=-1).reshape(-1, 2)
+    x: float
+    y: float
+    yaw: float
     for x, y, yaw in poses:
         from_robot = centres - np.array([x, y])
         in_robot_frame = from_robot @ _rotation(yaw)  # turned back

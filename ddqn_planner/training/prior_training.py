@@ -48,7 +48,8 @@ def prior_of(
     The same `seed` gives the same prior.
     """
     cells, is_inside = cells_of(places.position, grid)
-    x, y = cells.T
+    x = cells[:, 0]
+    y = cells[:, 1]
     is_usable = is_inside & ~grid.occupancy[y, x] & (places.weight > 0)
     if is_usable.sum() < FEWEST_PLACES:
         return older
@@ -108,15 +109,17 @@ def train_prior(new: Float32, older: Prior | None = None, seed: int = 0) -> Prio
         old = _not_measured_anew(older.replay, new)
     places = _Columns.of(np.concatenate([old, new]))  # N places, first the old ones
     new_places = _Columns.of(new)
-    mean = places.features.mean(axis=0)  # (F,) for F features, as the scale
-    scale = np.maximum(places.features.std(axis=0), SMALLEST_SCALE)
-    scaled = np.clip((places.features - mean) / scale, -UNUSUAL, UNUSUAL)  # (N, F)
+    # (F,) for F features, as the scale.
+    mean: Float32 = places.features.mean(axis=0)
+    scale: Float32 = np.maximum(places.features.std(axis=0), SMALLEST_SCALE)
+    # (N, F)
+    scaled: Float32 = np.clip((places.features - mean) / scale, -UNUSUAL, UNUSUAL)
     # Other maps may be slower as a whole: this column of inputs learns their level.
     count = len(places.weight)
     is_old = (np.arange(count) < len(old)).astype(np.float32)  # (N,)
     level = np.average(new_places.log_slowness, weights=new_places.weight)
     target = places.log_slowness - level  # (N,)
-    weight = places.weight / places.weight.mean()  # (N,)
+    weight: Float32 = places.weight / places.weight.mean()  # (N,)
     block = _blocks(count)  # (N,): places in a row are one block
     training = _train(
         np.column_stack([scaled, is_old]),

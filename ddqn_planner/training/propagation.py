@@ -296,8 +296,8 @@ def value_iteration(
     discount = np.float32(gamma)
     r_o = np.float32(collision)
     # Q(s, a) = base + gain V(s')
-    gain_SCA = discount * success_SCA
-    base_SCA = success_SCA * reward_SCA + (1 - success_SCA) * r_o
+    gain_SCA: Floats = discount * success_SCA
+    base_SCA: Floats = success_SCA * reward_SCA + (1 - success_SCA) * r_o
     # V of the goal is 0, wherever its moves lead to.
     gain_SCA[np.arange(maps), goal_S] = 0.0
     base_SCA[np.arange(maps), goal_S] = 0.0
@@ -310,7 +310,7 @@ def value_iteration(
         np.ascontiguousarray(base_SCA),
         neighbours_CA,
     )
-    return_SCA = reward_SCA + discount * value_SC[:, neighbours_CA]
+    return_SCA: Floats = reward_SCA + discount * value_SC[:, neighbours_CA]
     return return_SCA, r_o + success_SCA * (return_SCA - r_o)
 
 
