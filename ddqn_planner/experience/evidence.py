@@ -113,12 +113,13 @@ class Evidence:
         more. All evidence fades by the time that the drive took. Slowness is the time
         in a place over that at nominal speed.
         """
-        self._add_error(visits)
+        # Before anything is learned from the drive.
+        self._add_error_of_expected_time(visits)
         slowness = visits.seconds / visits.metres * self.nominal_speed  # (V,)
         log = np.log(np.clip(slowness, 1 / MAX_SLOWNESS, MAX_SLOWNESS))  # (V,)
         rows = self._find_or_add_rows(visits.position)  # (V,)
         rows_of_waits = self._find_or_add_rows(visits.waits.position)  # (W,)
-        surprises = self._surprises_of(rows, log)
+        surprises = self._surprises_of(rows, log)  # one for each part of the drive
         if surprises:
             largest = max(surprises)
             has_changed = largest > self._usual_surprise()
@@ -127,7 +128,7 @@ class Evidence:
                 self.places.fade(SHARE_AFTER_CHANGE)
         np.add.at(self.places.waited, rows_of_waits, visits.waits.seconds)
         self._add_visits(visits, rows, log)
-        self._limit_passages(rows_of_waits)
+        self._limit_sums_of_waits(rows_of_waits)
         self.driven += visits.total_seconds
         self.places.fade(0.5 ** (visits.total_seconds / self.half_life))
         self._fit()
@@ -156,11 +157,11 @@ class Evidence:
         np.add.at(places.sum_of_log, rows, weight * log)
         np.add.at(places.passages, rows, weight * passes_wait)
 
-    def _limit_passages(self, rows_of_waits: Int64) -> None:
+    def _limit_sums_of_waits(self, rows_of_waits: Int64) -> None:
         """Let each place have at most MOST_PASSAGES, so that the last ones count most.
 
-        Where the robot has just waited, in the rows `rows_of_waits` (W,) of `places`,
-        it has passed at least once.
+        Sums of passages and of waited seconds shrink alike. In the rows `rows_of_waits`
+        (W,) of `places` the robot has just waited: it has passed there at least once.
         """
         places = self.places
         places.passages[rows_of_waits] = np.maximum(places.passages[rows_of_waits], 1)
@@ -232,7 +233,7 @@ class Evidence:
         self.places.append(predicted, new_position)
         return rows
 
-    def _add_error(self, visits: Visits) -> None:
+    def _add_error_of_expected_time(self, visits: Visits) -> None:
         """Append to `errors` by how much a drive's time differs from the expected time.
 
         `visits` are the V visits and the waits of the drive. The error is the logarithm

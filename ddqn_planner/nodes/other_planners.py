@@ -67,7 +67,7 @@ def action_name(prefix: str, action: str) -> str:
     return f"{prefix.rstrip('/')}/{action}"
 
 
-def check_prefix(node: BaseNode, prefix: str) -> None:
+def check_action_prefix(node: BaseNode, prefix: str) -> None:
     """Raise a ValueError if the parameter ``other_planners`` is no prefix to use.
 
     That is so if no action can have a name with the prefix, or if its actions would be

@@ -29,7 +29,7 @@ from ddqn_planner.nodes.model_source import ModelSource, read_model
 from ddqn_planner.nodes.nav2 import NavigationServer, serve_nav2
 from ddqn_planner.nodes.other_planners import (
     GoalAnswer,
-    check_prefix,
+    check_action_prefix,
 )
 from ddqn_planner.nodes.outcome import (
     NO_REQUEST,
@@ -41,7 +41,7 @@ from ddqn_planner.nodes.outcome import (
 )
 from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS, PlannerSettings
 from ddqn_planner.nodes.path_validity import PathCheck, check_path
-from ddqn_planner.nodes.poses import Poses, check_source
+from ddqn_planner.nodes.poses import Poses, check_tf_is_installed
 from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.nodes.requests import Requests, path_poses
 from ddqn_planner.nodes.spinning import spin_until_shutdown
@@ -232,8 +232,8 @@ class PlannerNode(ManagedNode):
         """
         super().check_parameters(new)
         source = new.get("start_source", "")
-        check_source("start_source", source, "'initialpose' or 'odometry'")
-        check_prefix(self, new.get("other_planners", ""))
+        check_tf_is_installed("start_source", source, "'initialpose' or 'odometry'")
+        check_action_prefix(self, new.get("other_planners", ""))
         if self._checks_first_parameters:
             return  # workers load the first files
         if "model" in new:

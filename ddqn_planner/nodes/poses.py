@@ -56,7 +56,7 @@ def has_tf() -> bool:
     return importlib.util.find_spec("tf2_ros") is not None
 
 
-def check_source(parameter: str, value: str, other_values: str) -> None:
+def check_tf_is_installed(parameter: str, value: str, other_values: str) -> None:
     """Raise a RuntimeError if a parameter has the value `tf` without tf2_ros.
 
     The error names the parameter, and other values that it may have, in words.

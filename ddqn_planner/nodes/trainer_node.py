@@ -26,7 +26,7 @@ from ddqn_planner.nodes.learning_node import (
     MapInFrame,
 )
 from ddqn_planner.nodes.parameters import MOVE_RULES, OF_MAPS
-from ddqn_planner.nodes.poses import check_source
+from ddqn_planner.nodes.poses import check_tf_is_installed
 from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.nodes.simulation import (
     HYPER_PARAMETERS,
@@ -109,7 +109,7 @@ class TrainerNode(LearningNode):
         Some hyper-parameters limit others.
         """
         super().check_parameters(new)
-        check_source("pose_source", new.get("pose_source", ""), "'odometry'")
+        check_tf_is_installed("pose_source", new.get("pose_source", ""), "'odometry'")
         if "output_folder" in new:
             as_path(new["output_folder"], "output_folder")
         if new.get("experience") and self._is_complete:

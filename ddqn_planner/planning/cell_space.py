@@ -701,8 +701,9 @@ def write_q(distance: Any, q: Any, costs: Any) -> None:
     """Write Q: minus the cost of the cheapest path that begins with each action.
 
     `q` (8, C) is by action and cell of the padded map, and stays where no path leads to
-    a goal. `distance` (C,) is the cost from each cell to a goal, 0 without a path.
-    `costs` are `StepCosts`.
+    a goal. `distance` (C,) is the cost from each cell to a goal: the smallest positive
+    number, AT_GOAL, at a goal, and 0 without a path. `costs` are `StepCosts`; a move
+    that is not possible costs infinity.
     """
     for action in range(8):
         for cell in range(costs.width + 1, distance.size - costs.width - 1):

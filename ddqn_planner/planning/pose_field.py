@@ -338,8 +338,8 @@ class PoseField(Field[Search]):
     def _repaired(self, search: Search, changed: NDArray[np.int64]) -> Search:
         """Return a search from before cells changed, repaired for this field's map.
 
-        Where too much would be lost, return the goals alone, with the look at the map
-        if that still holds.
+        Where too much would be lost, return the goals alone, and the lower bounds by
+        which the search was guided, if they still hold.
 
         Parameters
         ----------
@@ -355,12 +355,15 @@ class PoseField(Field[Search]):
         occupied = self.grid.uninflated
         has_free_cell = not occupied[changed[:, 1], changed[:, 0]].all()
         # 1. The aim and the queue. A path through a changed cell that is free may be
-        # cheaper than before: lower bounds do not hold any more. Else they hold, and
-        # the states in the queue stay in order.
+        # cheaper than before: the lower bounds, which the aim holds, do not hold any
+        # more. Else they hold, and the states in the queue stay in order. A search
+        # with an empty queue lists its open states anew when it begins: its marks tell
+        # which these are.
         if has_free_cell:
             search = search._replace(aim=NOWHERE, heap=make_heap(most_opened))
         elif search.heap.size[0] + most_opened > search.heap.keys.size:
-            aim = search.aim._replace(start_number=NO_STATE)  # so a new round begins
+            # The aim has no start any more: the search begins anew toward the next.
+            aim = search.aim._replace(start_number=NO_STATE)
             search = search._replace(aim=aim, heap=make_heap(most_opened))
         # 2. Costs that are too low. All costs below the least unsupported one hold.
         unsupported_cost = pose_space.least_unsupported(search, near_tiles)
