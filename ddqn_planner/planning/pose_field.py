@@ -163,7 +163,8 @@ class PoseField(Field[Search]):
         if number == aim.start_number:
             return
         x, y, _ = start
-        # Lower bounds from a look at the map hold for all headings of the start's cell.
+        # An aim holds lower bounds from a look at the map, if there was one. They are
+        # those toward one cell, for all headings.
         if (x, y) != (aim.start_x, aim.start_y):
             aim = NOWHERE
         self.visits = 0

@@ -457,9 +457,11 @@ def evaluate(
 ) -> None:
     """Write Q (B, 8) of B states into ``network.q``.
 
-    State n is a robot in cell[n] on map scenario[n]; both arrays are (B,). The common
-    windows must have been evaluated since the weights changed. The changed windows of
-    the states, and their convolutions, are written into `windows`.
+    State n is a robot in cell[n] on map scenario[n]; both arrays are (B,). Most 3x3
+    windows of a state are the common windows, those of most maps without a robot. Their
+    output must have been computed since the weights changed. It is corrected for each
+    window of the state that is changed, as it shows the robot or another map. The
+    changed windows, and their convolutions, are written into `windows`.
     """
     collect_changed_windows(windows, scenario, cell)
     changed_count = windows.first_changed[cell.size]

@@ -319,14 +319,20 @@ class RobotTrainer:
         self._weight_UV[:, -1] = 0  # of obstacles outside the view
 
     def _view(self, scenario: Integers, pose: Integers) -> tuple[Integers, Integers]:
-        """Return what decides on the success of robots in poses (B,) on maps (B,).
+        """Return what decides on the success of B robots in poses on maps.
 
-        `scenario` has the number of each robot's map.
+        A unit of the network learns one primitive, and all that are this one turned by
+        quarter turns. So the robot's view is turned back by its quarter turns, too.
+
+        Parameters
+        ----------
+        scenario, pose : (B,) int64
+            The number of each robot's map and of its pose, cell * HEADINGS + heading.
 
         Returns
         -------
         (B, K) int64
-            The number of the unit of each action.
+            The number, 0 to U - 1, of the unit of each of the K actions in this pose.
         (B,) int64
             The place in the robot's view where the map's obstacle lies: 0 to V - 1.
         """
