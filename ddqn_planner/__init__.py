@@ -3,6 +3,8 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from ddqn_planner.gymnasium_registration import register_environment
+
 if TYPE_CHECKING:
     from ddqn_planner.experience import Experience
     from ddqn_planner.grid import GridMap, MoveRule, inflate, load_map
@@ -52,3 +54,6 @@ def __getattr__(name: str) -> Any:
 def __dir__() -> list[str]:
     """List the public names, too, before they are imported."""
     return sorted([*globals(), *__all__])
+
+
+register_environment()

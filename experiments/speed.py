@@ -31,7 +31,8 @@ from ddqn_planner import GridMap, MoveRule, Plan, Planner, QField
 from ddqn_planner.grid import Cell, inflate, shortest_distances
 from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.noise import random_costs, random_requests
-from ddqn_planner.training.environment import GridEnvironment, paper_scenario
+from ddqn_planner.training.environment import paper_scenario
+from ddqn_planner.training.gymnasium_environments import GridEnvironment
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.trainer import Trainer
 

@@ -1,14 +1,11 @@
-"""The grid environment: N robots in NumPy, and one robot with Gymnasium's interface."""
+"""The grid environment: N robots in NumPy."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from numbers import Integral
+from dataclasses import dataclass
 from types import EllipsisType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import gymnasium
 import numpy as np
-from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, neighbours, read_map_file
@@ -16,8 +13,6 @@ from ddqn_planner.grid.arguments import as_cell, numbers
 from ddqn_planner.grid.grid_map import check_grid
 from ddqn_planner.model.networks import (
     FREE,
-    GOAL,
-    OBSTACLE,
     ROBOT,
     observation_background,
 )
@@ -224,6 +219,15 @@ class GridVectorEnvironment:
             self.random,
         )
         self.scenario[mask] = scenario
+        self.begin(cell, mask)
+
+    def begin(
+        self, cell: NDArray[np.int64], mask: NDArray[np.bool_] | EllipsisType = ...
+    ) -> None:
+        """Start new episodes in cells (M,), of the M robots where `mask` (N,) is True.
+
+        Their scenarios stay.
+        """
         self.cell[mask] = cell
         self.visited[mask, 0] = cell
         self.steps[mask] = 0
@@ -234,14 +238,14 @@ class GridVectorEnvironment:
     def move(self, actions: NDArray[np.int64]) -> Outcome:
         """Move each robot by its action (N,), 0 to 7; a robot that collides stays.
 
-        A ResetNeeded error if an episode has ended. The next move overwrites
+        A RuntimeError if an episode has ended. The next move overwrites
         `terminated` and `truncated` of the result.
         """
         actions = numbers(
             "the actions", actions, self.cell.shape, "iu", (0, len(MOVES) - 1)
         )
         if (self.terminated | self.truncated).any():
-            raise ResetNeeded("an episode has ended; call reset before the next step")
+            raise RuntimeError("an episode has ended; call reset before the next step")
         # Shapes: (N,).
         legal = self.legal[self.scenario, actions, self.cell]
         reward = self.rewards[self.scenario, actions, self.cell]
@@ -266,94 +270,3 @@ class GridVectorEnvironment:
         observations = self.background[scenario]
         observations[np.arange(len(cell)), cell] = ROBOT
         return observations.reshape(-1, *self.shape)
-
-
-class GridEnvironment(gymnasium.Env[Observations, np.int64]):
-    """One robot, by default on the paper's map.
-
-    Its name for `gymnasium.make` is
-    ``ddqn_planner.training.environment:ddqn_planner/Grid-v0``.
-    """
-
-    metadata = {"render_modes": []}  # noqa: RUF012
-
-    def __init__(
-        self,
-        scenario: Scenario | None = None,
-        parameters: HyperParameters | None = None,
-    ) -> None:
-        """Make an environment of one robot on a map.
-
-        By default it has the paper's scenario and hyper-parameters; of the parameters,
-        `environments` does not count.
-        """
-        if parameters is None:
-            parameters = HyperParameters()
-        if isinstance(parameters, HyperParameters):  # else the vector environment errs
-            parameters = replace(parameters, environments=1)
-        scenario = paper_scenario() if scenario is None else scenario
-        self.vector = GridVectorEnvironment([scenario], parameters)
-        self._is_begun = False
-        self.action_space = gymnasium.spaces.Discrete(len(MOVES))
-        self.observation_space = gymnasium.spaces.Box(
-            OBSTACLE, max(GOAL, ROBOT), self.vector.shape, np.float32
-        )
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode: with probability p_r in a random cell, or at the start."""
-        super().reset(seed=seed)
-        self.vector.random = self.np_random
-        self.vector.reset()
-        self._is_begun = True
-        return self._observe(), {}
-
-    def step(
-        self, action: np.int64
-    ) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
-        """Move the robot once by an action, 0 to 7.
-
-        Returns
-        -------
-        The observation (H, W) after the move, the reward, whether the episode has ended
-        at the goal or by a collision, whether it has ended for lack of steps, and an
-        empty dictionary.
-
-        Raises
-        ------
-        ValueError
-            If the action is no whole number from 0 to 7.
-        gymnasium.error.ResetNeeded
-            Before the first `reset`, and after an episode has ended.
-        """
-        is_whole = isinstance(action, Integral) and not isinstance(action, bool)
-        is_array = (
-            isinstance(action, np.ndarray)
-            and action.shape == ()
-            and action.dtype.kind in "iu"
-        )
-        if not (is_whole or is_array) or not 0 <= action < len(MOVES):
-            raise ValueError(
-                f"the action is {action!r}; give a whole number, 0 to {len(MOVES) - 1}"
-            )
-        if not self._is_begun:
-            raise ResetNeeded("no episode has begun; call reset before the first step")
-        outcome = self.vector.move(np.array([int(action)]))
-        return (
-            self._observe(),
-            float(outcome.reward[0]),
-            bool(outcome.terminated[0]),
-            bool(outcome.truncated[0]),
-            {},
-        )
-
-    def _observe(self) -> Observations:
-        """Return the observation (H, W) of the robot."""
-        observation: Observations = self.vector.observe(
-            self.vector.scenario, self.vector.cell
-        )[0]
-        return observation
-
-
-gymnasium.register("ddqn_planner/Grid-v0", f"{__name__}:GridEnvironment")

@@ -1,19 +1,13 @@
-import math
-import warnings
 from dataclasses import replace
 from math import dist, hypot
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
-from gymnasium.utils.seeding import np_random
 
 from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.model.networks import ROBOT, observation_background
 from ddqn_planner.training.environment import (
-    GridEnvironment,
     GridVectorEnvironment,
     Scenario,
 )
@@ -90,26 +84,6 @@ def test_a_batch_moves_as_by_hand(
         np.testing.assert_array_equal(batch.cell[goes_on], moved[goes_on])
 
 
-def test_the_scalar_environment_is_a_batch_of_one(paper: Scenario) -> None:
-    batch = GridVectorEnvironment([paper], PARAMETERS)
-    # How many environments a batch has does not matter here.
-    scalar = GridEnvironment(paper, replace(PARAMETERS, environments=7))
-    actions = np.random.default_rng(0)
-    for seed in range(30):
-        observation, info = scalar.reset(seed=seed)
-        batch.random = np_random(seed)[0]
-        batch.reset()
-        ended = False
-        while not ended:
-            assert (batch.observe(batch.scenario, batch.cell)[0] == observation).all()
-            action = actions.integers(8)
-            expected = batch.move(np.array([action]))
-            observation, *found, info = scalar.step(action)
-            assert (found, info) == ([values[0] for values in expected], {})
-            assert [type(value) for value in found] == [float, bool, bool]
-            ended = found[1] or found[2]
-
-
 @pytest.mark.parametrize("p_r", [0.0, 0.5, 1.0])
 def test_an_episode_starts_with_probability_p_r_in_any_cell(
     paper: Scenario, p_r: float
@@ -137,13 +111,17 @@ def test_an_episode_starts_with_probability_p_r_in_any_cell(
             assert counts[[*free - {start}]].max() < 3 * p_r * len(cells) / len(free)
 
 
-def test_gymnasium_accepts_the_environment() -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        environment = gymnasium.make(
-            "ddqn_planner.training.environment:ddqn_planner/Grid-v0"
-        )
-        check_env(environment.unwrapped, skip_render_check=True)
+def test_a_batch_makes_no_step_after_the_end_of_an_episode(small: Scenario) -> None:
+    batch = GridVectorEnvironment([small], replace(PARAMETERS, max_episode_steps=1))
+    batch.reset()
+    batch.move(np.array([0]))
+    with pytest.raises(RuntimeError, match="ended; call reset"):
+        batch.move(np.array([0]))
+    batch.begin(np.array([6]))
+    batch.move(np.array([0]))
+    assert batch.visited.tolist() == [[6, 7]]
+    with pytest.raises(ValueError, match="the actions"):
+        GridVectorEnvironment([small], PARAMETERS).move(np.array([-1]))
 
 
 def test_a_scenario_needs_two_free_cells(small: Scenario) -> None:
@@ -171,52 +149,6 @@ def test_a_move_that_succeeds_is_rewarded_for_the_goal_only_beside_it(
     # The goal (4, 0) is at the end of its row: the first cells of the next one are far
     # from it.
     assert rewarded == {(3, 0), (3, 1), (4, 1)}
-
-
-@pytest.mark.parametrize(
-    "action", [-1, 8, 2.5, 2.0, math.nan, None, "2", True, [2], np.array([2])]
-)
-def test_what_is_no_action_is_refused_and_changes_nothing(
-    paper: Scenario, action: Any
-) -> None:
-    environment, other = (GridEnvironment(paper, PARAMETERS) for _ in range(2))
-    for each in (environment, other):
-        each.reset(seed=0)
-    with pytest.raises(
-        ValueError, match=r"the action is .*; give a whole number, 0 to 7"
-    ):
-        environment.step(action)
-    observation, *outcome = environment.step(2)
-    expected, *expected_outcome = other.step(2)
-    np.testing.assert_array_equal(observation, expected)
-    assert outcome == expected_outcome
-    with pytest.raises(ValueError, match="the actions"):
-        environment.vector.move(np.array([-1]))
-
-
-@pytest.mark.parametrize("kind", [int, np.int64, np.uint8, np.array])
-def test_each_integer_type_is_an_action(paper: Scenario, kind: Any) -> None:
-    results = []
-    for action in (3, kind(3)):
-        environment = GridEnvironment(paper, PARAMETERS)
-        environment.reset(seed=1)
-        results.append(environment.step(action))
-    np.testing.assert_array_equal(results[0][0], results[1][0])
-    assert results[0][1:] == results[1][1:]
-
-
-def test_no_step_is_made_before_a_reset_or_after_the_end(paper: Scenario) -> None:
-    environment = GridEnvironment(paper, replace(PARAMETERS, max_episode_steps=1))
-    with pytest.raises(
-        gymnasium.error.ResetNeeded, match="call reset before the first step"
-    ):
-        environment.step(0)
-    for _ in range(2):
-        environment.reset(seed=0)
-        *_, terminated, truncated, _ = environment.step(0)
-        assert terminated or truncated
-        with pytest.raises(gymnasium.error.ResetNeeded, match="ended; call reset"):
-            environment.step(0)
 
 
 @pytest.mark.parametrize(
@@ -273,4 +205,4 @@ def test_only_scenarios_and_parameters_make_an_environment(paper: Scenario) -> N
         with pytest.raises(ValueError, match="give at least one Scenario"):
             GridVectorEnvironment(scenarios, PARAMETERS)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="give HyperParameters"):
-        GridEnvironment(paper, 5)  # type: ignore[arg-type]
+        GridVectorEnvironment([paper], 5)  # type: ignore[arg-type]
