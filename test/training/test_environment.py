@@ -117,9 +117,9 @@ def test_a_batch_makes_no_step_after_the_end_of_an_episode(small: Scenario) -> N
     batch.move(np.array([0]))
     with pytest.raises(RuntimeError, match="ended; call reset"):
         batch.move(np.array([0]))
-    batch.begin(np.array([6]))
+    batch.begin(np.array([5]))
     batch.move(np.array([0]))
-    assert batch.visited.tolist() == [[6, 7]]
+    assert batch.visited.tolist() == [[5, 6]]
     with pytest.raises(ValueError, match="the actions"):
         GridVectorEnvironment([small], PARAMETERS).move(np.array([-1]))
 
