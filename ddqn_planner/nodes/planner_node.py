@@ -339,7 +339,8 @@ class PlannerNode(ManagedNode):
     async def _plan_for_active_goal(self) -> None:
         """Plan for the active goal, publish a path that is news, and log the outcome.
 
-        Nothing is published or logged if the goal needs no new plan.
+        Nothing is published or logged if the goal needs no new plan, or if the node is
+        not active.
         """
         active = self._active_goal
         goals = active.poses

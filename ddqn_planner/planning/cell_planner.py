@@ -134,7 +134,8 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
         Both maps assume that cells which were seldom driven through are quicker than
         expected, the bold map more so. The path on the bold map is taken if its
         expected cost is at most (1 + `exploration.share`) times the least expected
-        cost. The cost of the plan is the expected one, in seconds.
+        cost. The cost of the plan is the expected one, in seconds. `clock` measures the
+        time of the request, without its pauses.
         """
         grid = request.grid  # the map of expected times
         rule = request.move_rule
@@ -201,7 +202,8 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
         """Return the plan by a kept field that is known as far as the start.
 
         Return None if the start is occupied, if there is no such field, or if its
-        greedy steps find no path: then `task.failed_rollout` is set.
+        greedy steps find no path: then their plan, which has no path, is kept as
+        `task.failed_rollout`.
         """
         request = task.request
         if not request.grid.is_free(request.start):

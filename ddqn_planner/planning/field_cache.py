@@ -185,7 +185,8 @@ class FieldCache(Generic[AnyField]):
         # of the fields before them are hardly more like this map.
         older_fields = [older for older in self.kept[::-1] if older.key == field.key]
         for older in older_fields[:ALWAYS_KEPT]:
-            changed = self.changed_cells(older.grid, field.grid)  # (N, 2) or None
+            # (N, 2); None for another place, and after too many changes.
+            changed = self.changed_cells(older.grid, field.grid)
             if field.take_over(older, changed, start):
                 return older
         return None

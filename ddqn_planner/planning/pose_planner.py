@@ -493,7 +493,8 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
             is_for_goals = goals == request.goals and tolerance == request.tolerance
             if path is None or not is_for_goals:
                 continue
-            changed = self._differences(field.grid, request.grid)  # (N, 2) or None
+            # (N, 2); None for another place, and after too many changes.
+            changed = self._differences(field.grid, request.grid)
             if changed is None or len(changed):
                 continue
             # The number of the pose at the start; -1 if no pose is near.

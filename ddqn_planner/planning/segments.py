@@ -34,7 +34,7 @@ SAME_COST: Final = 1 + 1e-9
 # Cells by which a segment is first made longer. Half of it is 1, so that some cells are
 # passed over: with corners at the very last cells that are seen, a path is longer.
 FIRST_STEP: Final = 3
-LEGAL: Final = True  # segments must be legal, see `segment_cost`
+MUST_BE_LEGAL: Final = True  # segments must be legal, see `segment_cost`
 
 
 def simplify(
@@ -373,7 +373,12 @@ def _cost_between(
     begin = last if is_backward else first
     end = first if is_backward else last
     return segment_cost(
-        path[begin, 0], path[begin, 1], path[end, 0], path[end, 1], LEGAL, layers
+        path[begin, 0],
+        path[begin, 1],
+        path[end, 0],
+        path[end, 1],
+        MUST_BE_LEGAL,
+        layers,
     )
 
 
@@ -537,7 +542,7 @@ def _move_to_next(path: CellArray, costs: Float64, corner: int, layers: Layers) 
         return False
     if not _is_free(next_x, next_y, layers):  # paths may end in occupied cells
         return False
-    cost = segment_cost(x, y, next_x, next_y, LEGAL, layers)
+    cost = segment_cost(x, y, next_x, next_y, MUST_BE_LEGAL, layers)
     if cost >= highest_cost:
         return False
     path[corner, 0] = next_x
@@ -600,10 +605,10 @@ def _move(
             continue
         if not _is_free(new_x, new_y, layers):
             continue
-        second_cost = segment_cost(new_x, new_y, next_x, next_y, LEGAL, layers)
+        second_cost = segment_cost(new_x, new_y, next_x, next_y, MUST_BE_LEGAL, layers)
         if first_cost + second_cost >= lowest_cost:
             continue
-        first_cost = segment_cost(x, y, new_x, new_y, LEGAL, layers)
+        first_cost = segment_cost(x, y, new_x, new_y, MUST_BE_LEGAL, layers)
         if first_cost + second_cost >= lowest_cost:
             continue
         lowest_cost = first_cost + second_cost

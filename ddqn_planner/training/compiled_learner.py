@@ -410,6 +410,12 @@ def output_count(network: Network) -> int:
     return len(network.eight) or network.common_output.size
 
 
+@inlined
+def has_hidden_layer(network: Network) -> bool:
+    """Return whether a network has a hidden layer; the compiler knows it."""
+    return len(network.eight) == 0
+
+
 @inner_in_place
 def evaluate_common_windows(network: Network, windows: Windows) -> None:
     """Compute `common_feature` and `common_output` by the network's present weights.
@@ -476,8 +482,7 @@ def evaluate(
         copy_into(network.output[n], network.common_output)
         for row in range(windows.first_changed[n], windows.first_changed[n + 1]):
             correct_output(network, windows, n, row)
-        has_hidden_layer = len(network.eight) == 0
-        if has_hidden_layer:  # otherwise ``network.output`` is ``network.q``
+        if has_hidden_layer(network):  # otherwise ``network.output`` is ``network.q``
             apply_last_layer(network, n)
 
 
@@ -836,8 +841,7 @@ def differentiate(
     # network has the features after ReLU in this place.
     gradient.common_feature[:] = 0
     for n in range(states):
-        has_hidden_layer = len(network.eight) == 0
-        if has_hidden_layer:
+        if has_hidden_layer(network):
             differentiate_last_layer(network, gradient, n)
         add_to(gradient.common_output, gradient.output[n])
         for row in range(windows.first_changed[n], windows.first_changed[n + 1]):

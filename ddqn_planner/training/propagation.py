@@ -144,6 +144,7 @@ class PropagationLearner:
         evaluation = self._evaluate(scenario, cell)
         q_BA, online_next_BA = np.split(evaluation.q.numpy(), 2)
         target_next_BA = self._q_SCA[batch.scenario, batch.next_cell]
+        # Q of the next states, (B, 8) each: one selects the action, one evaluates it.
         next_q = self._next_q_of(online_next_BA, target_next_BA)
         by_q_BA = torch.from_numpy(double_dqn_gradient(batch, q_BA, next_q))
         # The first half of the evaluation: that of the states.
