@@ -130,7 +130,7 @@ model: $(VENV)/train
 	cp runs/any_map/model.safetensors models/any_map.safetensors
 
 model-dilemma: $(VENV)/train
-	$(BIN)/ddqn-planner train dilemma --learning-rate 0.001 --seed 1 --out runs/dilemma
+	$(BIN)/ddqn-planner train dilemma --seed 1 --out runs/dilemma
 	cp runs/dilemma/model.safetensors models/dilemma.safetensors
 
 ROBOT := $(BIN)/ddqn-planner train-robot --resolution 0.05 --seed 0

@@ -55,7 +55,7 @@ def main(arguments: Sequence[str]) -> int:
     """Train, print how well, and save the film."""
     steps = int(arguments[0]) if arguments else HyperParameters().steps
     scenario = paper_scenario()
-    parameters = HyperParameters(learning_rate=0.001, steps=steps)
+    parameters = HyperParameters(steps=steps)
     trainer = Trainer([scenario], parameters, seed=0)
     interval = max(1, steps // FRAMES)
     curve: list[tuple[int, float]] = []

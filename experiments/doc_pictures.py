@@ -59,7 +59,7 @@ def draw_ends(axes: Any, start: Cell, goal: Cell) -> None:
 def training() -> Any:
     """Draw which starts reach the goal after three numbers of steps."""
     scenario = paper_scenario()
-    parameters = HyperParameters(learning_rate=0.001, steps=TRAINING_STEPS[-1])
+    parameters = HyperParameters(steps=TRAINING_STEPS[-1])
     trainer = Trainer([scenario], parameters, seed=0)
     figure, panels = plt.subplots(1, 3, figsize=(9.6, 3.5), layout="constrained")
     for axes, steps in zip(panels, TRAINING_STEPS, strict=True):
