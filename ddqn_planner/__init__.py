@@ -1,59 +1,86 @@
 """Plans robot paths on grid maps with a Double DQN."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ddqn_planner.gymnasium_registration import register_environment
+from ddqn_planner.public_names import imported_at_first_use
 
 if TYPE_CHECKING:
-    from ddqn_planner.experience import Experience
-    from ddqn_planner.grid import GridMap, MoveRule, inflate, load_map
+    from ddqn_planner.experience import Experience, ExperienceFileError
+    from ddqn_planner.files import FileWriteError
+    from ddqn_planner.grid import (
+        GridMap,
+        MapDataError,
+        MapFileError,
+        MapMetadataError,
+        MapNotFoundError,
+        MoveRule,
+        inflate,
+        load_map,
+    )
+    from ddqn_planner.model import ModelFileError
     from ddqn_planner.planning import (
         Plan,
         PlanMethod,
         Planner,
         PlanStatus,
+        PosePlan,
         QField,
         simplify,
     )
+    from ddqn_planner.training.checkpoint import CheckpointError
+    from ddqn_planner.training.one_map import train
+    from ddqn_planner.version import __version__
 
 __all__ = [
+    "CheckpointError",
     "Experience",
+    "ExperienceFileError",
+    "FileWriteError",
     "GridMap",
+    "MapDataError",
+    "MapFileError",
+    "MapMetadataError",
+    "MapNotFoundError",
+    "ModelFileError",
     "MoveRule",
     "Plan",
     "PlanMethod",
     "PlanStatus",
     "Planner",
+    "PosePlan",
     "QField",
+    "__version__",
     "inflate",
     "load_map",
     "simplify",
+    "train",
 ]
 
-# The packages of the public names; all others are in `planning`.
-_PACKAGES = {
+_MODULES = {
+    "CheckpointError": "training.checkpoint",
     "Experience": "experience",
+    "ExperienceFileError": "experience",
+    "FileWriteError": "files",
     "GridMap": "grid",
+    "MapDataError": "grid",
+    "MapFileError": "grid",
+    "MapMetadataError": "grid",
+    "MapNotFoundError": "grid",
+    "ModelFileError": "model",
     "MoveRule": "grid",
+    "Plan": "planning",
+    "PlanMethod": "planning",
+    "PlanStatus": "planning",
+    "Planner": "planning",
+    "PosePlan": "planning",
+    "QField": "planning",
+    "__version__": "version",
     "inflate": "grid",
     "load_map": "grid",
+    "simplify": "planning",
+    "train": "training.one_map",
 }
-
-
-def __getattr__(name: str) -> Any:
-    """Import a public name at its first use, so that a program loads what it uses."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    package = import_module(f"{__name__}.{_PACKAGES.get(name, 'planning')}")
-    value = getattr(package, name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    """List the public names, too, before they are imported."""
-    return sorted([*globals(), *__all__])
-
+__getattr__, __dir__ = imported_at_first_use(__name__, _MODULES)
 
 register_environment()

@@ -61,8 +61,8 @@ def main(arguments: Sequence[str]) -> int:
     curve: list[tuple[int, float]] = []
     frames: list[Image.Image] = []
     episodes: list[Sequence[Cell]] = []
-    for ended in trainer.run(steps, interval):
-        for episode in ended:
+    for progress in trainer.run(every=interval):
+        for episode in progress.episodes:
             # What it does from the given start, in the dead end.
             if episode.cells[0] == scenario.start:
                 episodes.append(episode.cells)

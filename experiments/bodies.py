@@ -30,10 +30,11 @@ from tables import table
 from ddqn_planner import GridMap, Planner, load_map
 from ddqn_planner.commands.options import file_of
 from ddqn_planner.grid import MOVES, Cell, MoveRule
-from ddqn_planner.model import ModelMetadata, RobotNetwork, package_version
+from ddqn_planner.model import ModelMetadata, RobotNetwork
 from ddqn_planner.planning.plan import PosePlan
 from ddqn_planner.robot.footprint import read_footprint
 from ddqn_planner.robot.motions import HEADINGS, Motion, Motions, make_motions
+from ddqn_planner.version import __version__
 from ddqn_planner.warm_up import warm_up
 
 CELL: Final = 0.05  # metres
@@ -79,7 +80,7 @@ def robot(footprint: str, motion: Motion | str) -> Planner:
         map_fingerprint="",
         steps=0,
         seed=0,
-        package_version=package_version(),
+        package_version=__version__,
     )
     return Planner(network, metadata)
 

@@ -68,9 +68,9 @@ def run_training(
             run.callback(signal.signal, number, earlier_handler)
         # disable=None: no bar if the output is not a terminal.
         with tqdm(total=parameters.steps, initial=trainer.steps, disable=None) as bar:
-            for episodes in run.steps():
-                bar.update(trainer.steps - bar.n)
-                for episode in episodes:
+            for progress in run.steps():
+                bar.update(progress.step - bar.n)
+                for episode in progress.episodes:
                     figures = {
                         "episode": episode.number,
                         "average reward": episode.average_reward,

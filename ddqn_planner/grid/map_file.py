@@ -60,7 +60,7 @@ class MapFileError(ValueError):
     """A map file cannot be read."""
 
 
-class MapNotFoundError(MapFileError):
+class MapNotFoundError(MapFileError, FileNotFoundError):
     """There is no such map file (result 1 of ``nav_msgs/LoadMap``)."""
 
 

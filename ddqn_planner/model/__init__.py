@@ -8,7 +8,6 @@ from ddqn_planner.model.model_file import (
     load_model,
     model_bytes,
     model_of,
-    package_version,
     save_model,
 )
 from ddqn_planner.model.networks import (

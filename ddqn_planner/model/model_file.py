@@ -62,16 +62,6 @@ TYPES: Final[dict[str, tuple[type, ...]]] = {
 }
 
 
-def package_version() -> str:
-    """Return the version of the installed package; "unknown" in a bare source tree."""
-    from importlib import metadata  # slow to import, and planning does not need it
-
-    try:
-        return metadata.version(PACKAGE)
-    except metadata.PackageNotFoundError:
-        return "unknown"
-
-
 def find_model(name: str | Path) -> Path:
     """Return the file of a model, given by its path or by a shipped model's name.
 

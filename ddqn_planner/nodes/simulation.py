@@ -156,9 +156,7 @@ class Simulation:
             raise ValueError(f"the start or the goal is unknown; {remedy}")
         start = self._cell("start", self._poses["start"], map_in_frame)
         goal = self._cell("goal", self._poses["goal"], map_in_frame)
-        # These import gymnasium and torch.
-        from ddqn_planner.training.environment import Scenario
-        from ddqn_planner.training.run import TrainingRun
+        from ddqn_planner.training import Scenario, TrainingRun  # they need torch
 
         node = self._node
         move_rule = MoveRule(node.value("move_rule"))
@@ -192,8 +190,8 @@ class Simulation:
         executor = node.executor
         assert executor is not None
         try:
-            for episodes in run.steps():
-                for episode in episodes:
+            for progress in run.steps():
+                for episode in progress.episodes:
                     self._rewards.publish(Float32(data=episode.average_reward))
                     if episode.number % node.value("episode_interval") == 0:
                         positions = centres(episode.cells, map_in_frame.grid)

@@ -1,1 +1,64 @@
 """The paper's contribution: environment, exploring starts, reward and Double DQN."""
+
+from typing import TYPE_CHECKING
+
+from ddqn_planner.public_names import imported_at_first_use
+
+if TYPE_CHECKING:
+    from ddqn_planner.training.any_map import ANY_MAP, random_scenarios
+    from ddqn_planner.training.checkpoint import CheckpointError
+    from ddqn_planner.training.environment import GridVectorEnvironment
+    from ddqn_planner.training.episodes import Episode, EpisodeEnd, Progress
+    from ddqn_planner.training.evaluation import Evaluation, evaluate, length_ratios
+    from ddqn_planner.training.gymnasium_environments import (
+        BatchedGridEnvironment,
+        GridEnvironment,
+    )
+    from ddqn_planner.training.hyper_parameters import HyperParameters
+    from ddqn_planner.training.one_map import train
+    from ddqn_planner.training.run import TrainingRun
+    from ddqn_planner.training.scenario import Scenario, paper_scenario
+    from ddqn_planner.training.trainer import Trainer
+
+__all__ = [
+    "ANY_MAP",
+    "BatchedGridEnvironment",
+    "CheckpointError",
+    "Episode",
+    "EpisodeEnd",
+    "Evaluation",
+    "GridEnvironment",
+    "GridVectorEnvironment",
+    "HyperParameters",
+    "Progress",
+    "Scenario",
+    "Trainer",
+    "TrainingRun",
+    "evaluate",
+    "length_ratios",
+    "paper_scenario",
+    "random_scenarios",
+    "train",
+]
+
+_MODULES = {
+    "ANY_MAP": "any_map",
+    "BatchedGridEnvironment": "gymnasium_environments",
+    "CheckpointError": "checkpoint",
+    "Episode": "episodes",
+    "EpisodeEnd": "episodes",
+    "Evaluation": "evaluation",
+    "GridEnvironment": "gymnasium_environments",
+    "GridVectorEnvironment": "environment",
+    "HyperParameters": "hyper_parameters",
+    "Progress": "episodes",
+    "Scenario": "scenario",
+    "Trainer": "trainer",
+    "TrainingRun": "run",
+    "evaluate": "evaluation",
+    "length_ratios": "evaluation",
+    "paper_scenario": "scenario",
+    "random_scenarios": "any_map",
+    "train": "one_map",
+}
+__getattr__, __dir__ = imported_at_first_use(__name__, _MODULES)

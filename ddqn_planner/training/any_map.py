@@ -8,8 +8,8 @@ from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import as_seed
 from ddqn_planner.grid.noise import random_costs, random_requests, unknown_costs
 from ddqn_planner.model.certificate import MOVE_RULES
-from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.scenario import Scenario
 
 # Unlike the paper, every episode starts at a random free cell, a collision costs more
 # than any rollout on these maps, and the agent keeps exploring moves that it believes

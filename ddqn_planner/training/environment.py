@@ -1,78 +1,26 @@
 """The grid environment: N robots in NumPy."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from types import EllipsisType
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.grid import MOVES, Cell, GridMap, MoveRule, neighbours, read_map_file
-from ddqn_planner.grid.arguments import as_cell, numbers
-from ddqn_planner.grid.grid_map import check_grid
+from ddqn_planner.grid import MOVES, neighbours
+from ddqn_planner.grid.arguments import numbers
 from ddqn_planner.model.networks import (
     FREE,
     ROBOT,
     observation_background,
 )
-from ddqn_planner.resources import find_resource
 from ddqn_planner.training.exploring_starts import initial_cells
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.reward import move_reward
+from ddqn_planner.training.scenario import Scenario, check_scenarios
+from ddqn_planner.training.scenario import paper_scenario as paper_scenario
 
 Observations = NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class Scenario:
-    """A map with a start and a goal; a ValueError unless a path joins them."""
-
-    grid: GridMap
-    start: Cell
-    goal: Cell
-    move_rule: MoveRule = MoveRule.CORNER_CUTTING  # the paper's, likely
-
-    def __post_init__(self) -> None:
-        """Check the fields, and that a path leads from the start to the goal."""
-        check_grid(self.grid)
-        start = as_cell(self.start, "the start")
-        goal = as_cell(self.goal, "the goal")
-        # The dataclass is frozen.
-        object.__setattr__(self, "start", start)
-        object.__setattr__(self, "goal", goal)
-        object.__setattr__(self, "move_rule", MoveRule(self.move_rule))
-        for name, cell in (("start", start), ("goal", goal)):
-            if not self.grid.is_free(cell):
-                raise ValueError(
-                    f"the {name} {cell} is not a free cell of the map; give another"
-                )
-        if start == goal:
-            raise ValueError(
-                f"start and goal are both {start}; give two different cells"
-            )
-        if not self._leads_to_goal(self.move_rule):
-            rules = [rule.value for rule in MoveRule if self._leads_to_goal(rule)]
-            remedy = f"give the move rule {rules[0]}" if rules else "open the map"
-            raise ValueError(
-                f"no path leads from the start {start} to the goal {goal} under the "
-                f"move rule {self.move_rule.value}; give other cells, or {remedy}"
-            )
-
-    def _leads_to_goal(self, move_rule: MoveRule) -> bool:
-        """Return whether a path of legal moves leads from the start to the goal."""
-        reached = self.grid.reachable([self.start], move_rule)
-        return bool(reached[self.goal[1], self.goal[0]])
-
-
-def paper_scenario() -> Scenario:
-    """Return the paper's map with its start and goal."""
-    map_file = read_map_file(find_resource("maps", "dilemma.yaml"))
-    if map_file.start is None or map_file.goal is None:
-        raise ValueError(
-            "maps/dilemma.yaml names no start and goal; restore the shipped file"
-        )
-    return Scenario(map_file.grid(), map_file.start, map_file.goal)
 
 
 class Outcome(NamedTuple):
@@ -81,17 +29,6 @@ class Outcome(NamedTuple):
     reward: NDArray[np.float32]
     terminated: NDArray[np.bool_]  # the robot arrived at its goal, or collided
     truncated: NDArray[np.bool_]  # the robot has made its last step, elsewhere
-
-
-def _check_scenarios(scenarios: Sequence[Scenario]) -> None:
-    """Raise a ValueError unless there are scenarios, all with maps of one size."""
-    if not scenarios or not all(isinstance(item, Scenario) for item in scenarios):
-        raise ValueError(f"the scenarios are {scenarios!r}; give at least one Scenario")
-    shapes = {scenario.grid.occupancy.shape for scenario in scenarios}
-    if len(shapes) != 1:
-        raise ValueError(
-            f"the maps have the sizes {sorted(shapes)}; give maps of one size"
-        )
 
 
 class GridVectorEnvironment:
@@ -142,7 +79,7 @@ class GridVectorEnvironment:
         random : Generator, optional
             Draws the scenario and the first cell of each episode.
         """
-        _check_scenarios(scenarios)
+        check_scenarios(scenarios)
         if not isinstance(parameters, HyperParameters):
             raise ValueError(f"the parameters are {parameters!r}; give HyperParameters")
         self.shape = scenarios[0].grid.occupancy.shape

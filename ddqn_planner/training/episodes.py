@@ -41,6 +41,16 @@ class Episode(NamedTuple):
         return self.total_reward / self.moves
 
 
+class Progress(NamedTuple):
+    """The state of a training between two steps."""
+
+    step: int  # environment steps since the training began
+    updates: int  # of the network
+    episodes: tuple[Episode, ...]  # that have ended since the last progress
+    epsilon: float  # ε, the probability of a random action
+    learning_rate: float
+
+
 def open_record(path: Path, episodes: int) -> Appender:
     """Open the ``episodes.csv`` at `path` to append to it; a missing file is made.
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.grid import GridMap, MoveRule
 from ddqn_planner.grid.arguments import as_seed, as_whole
-from ddqn_planner.model import ModelMetadata, RobotNetwork, package_version
+from ddqn_planner.model import ModelMetadata, RobotNetwork
 from ddqn_planner.robot.body_certificate import BodyCertificate
 from ddqn_planner.robot.footprint import read_footprint
 from ddqn_planner.robot.motions import (
@@ -29,6 +29,7 @@ from ddqn_planner.training.double_dqn import (
 from ddqn_planner.training.exploring_starts import initial_cells
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.propagation import value_iteration
+from ddqn_planner.version import __version__
 
 Floats: TypeAlias = NDArray[np.float32]
 Integers: TypeAlias = NDArray[np.int64]
@@ -237,7 +238,7 @@ class RobotTrainer:
             map_fingerprint=GridMap(occupancy).fingerprint,
             steps=self.steps,
             seed=self.seed,
-            package_version=package_version(),
+            package_version=__version__,
         )
 
     def _step(self, robots: int) -> None:

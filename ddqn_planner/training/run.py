@@ -5,9 +5,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ddqn_planner.files import WorkFolder, write_atomically
-from ddqn_planner.training.environment import Scenario
-from ddqn_planner.training.episodes import Episode, open_record, record
+from ddqn_planner.training.episodes import Progress, open_record, record
 from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.scenario import Scenario
 from ddqn_planner.training.trainer import Trainer
 
 SAVE_INTERVAL = 5_000  # environment steps between two checkpoints
@@ -69,28 +69,35 @@ class TrainingRun(WorkFolder):
             f"training in {self.folder} from step {self.saved_at} to {parameters.steps}"
         )
 
-    def steps(self, every: int = SAVE_INTERVAL) -> Iterator[list[Episode]]:
+    def steps(self, every: int | None = None) -> Iterator[Progress]:
         """Train to the last step or until `requests` has "stop"; save at intervals.
 
-        A generator: it yields the episodes that ended, as `Trainer.run` does, and the
-        caller may add to `requests` meanwhile. It yields at each multiple of `every`
-        steps at least.
+        A generator: it yields the progress as `Trainer.run` does, and also at each
+        multiple of SAVE_INTERVAL steps. The caller may add to `requests` meanwhile.
         """
         last_step = self.trainer.parameters.steps
         with _memory_with_remedy():
-            for episodes in self.trainer.run(last_step, every):
-                for episode in episodes:
+            for progress in self._progress(every):
+                for episode in progress.episodes:
                     self._record.append(record(episode))
-                intervals = self.trainer.steps // SAVE_INTERVAL
+                intervals = progress.step // SAVE_INTERVAL
                 is_due = intervals != self.saved_at // SAVE_INTERVAL
-                is_last = self.trainer.steps >= last_step  # saved below
+                is_last = progress.step >= last_step  # saved below
                 if (is_due or "save" in self.requests) and not is_last:
                     self.requests.discard("save")
                     self.try_to_save()
-                yield episodes
+                yield progress
                 if "stop" in self.requests:
                     break
             self.try_to_save()
+
+    def _progress(self, every: int | None) -> Iterator[Progress]:
+        """Yield the progress as `Trainer.run` does, and at each save interval."""
+        trainer = self.trainer
+        last_step = trainer.parameters.steps
+        while trainer.steps < last_step:
+            next_save = (trainer.steps // SAVE_INTERVAL + 1) * SAVE_INTERVAL
+            yield from trainer.run(min(next_save, last_step), every)
 
     def try_to_save(self) -> None:
         """Write the model, the checkpoint and the episodes.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,16 +17,22 @@ from safetensors import safe_open
 
 from ddqn_planner.files import as_path, differences, open_regular, write_atomically
 from ddqn_planner.grid import MOVES
-from ddqn_planner.grid.arguments import as_seed, listed
+from ddqn_planner.grid.arguments import as_seed, as_whole, listed
+from ddqn_planner.interrupts import interrupts_wait
 from ddqn_planner.model import (
     NETWORKS,
     ModelMetadata,
     PropagationQNetwork,
     QNetwork,
     model_bytes,
-    package_version,
 )
 from ddqn_planner.planning import Planner
+from ddqn_planner.training.checkpoint import (
+    CHECKPOINT_KEY,
+    DIGEST_KEY,
+    CheckpointError,
+    digest_of,
+)
 from ddqn_planner.training.compiled_learner import Counters, play, training_of
 from ddqn_planner.training.double_dqn import (
     NextQ,
@@ -36,17 +41,14 @@ from ddqn_planner.training.double_dqn import (
     Transitions,
     next_q,
 )
-from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
-from ddqn_planner.training.episodes import Episode, EpisodeEnd
+from ddqn_planner.training.environment import GridVectorEnvironment
+from ddqn_planner.training.episodes import Episode, EpisodeEnd, Progress
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.propagation import PropagationLearner
+from ddqn_planner.training.scenario import Scenario
+from ddqn_planner.version import __version__
 
-CHECKPOINT_KEY = "ddqn_planner_checkpoint"
-DIGEST_KEY = "sha256"
-
-
-class CheckpointError(ValueError):
-    """A checkpoint cannot be resumed; the message says why and what to do."""
+MOST_STEPS = 10**12  # of a training
 
 
 class Learned(NamedTuple):
@@ -80,7 +82,10 @@ class Trainer:
     """
 
     def __init__(
-        self, scenarios: Sequence[Scenario], parameters: HyperParameters, seed: int
+        self,
+        scenarios: Sequence[Scenario],
+        parameters: HyperParameters | None = None,
+        seed: int = 0,
     ) -> None:
         """Make a network of random weights, and put all robots at their first cells.
 
@@ -88,16 +93,22 @@ class Trainer:
         ----------
         scenarios : sequence of Scenario
             The maps to train on, all of one size, with their starts and goals.
-        parameters : HyperParameters
+        parameters : HyperParameters, optional
+            By default the paper's.
         seed : int
             Of all random draws: 0 to 2^63 - 1.
         """
-        self.scenarios = tuple(listed(scenarios, "the scenarios"))
+        self.scenarios = tuple(
+            listed(scenarios, "the scenarios", "give a list of Scenario")
+        )
+        if parameters is None:
+            parameters = HyperParameters()
         self.parameters = parameters
         self.seed = as_seed(seed)
         self.steps = 0
         self.updates = 0
         self.episodes = 0
+        self._new_episodes: list[Episode] = []  # that no progress has reported yet
 
         weight_seed, *generator_seeds = np.random.SeedSequence(self.seed).spawn(4)
         # They draw initial cells, actions, and batches.
@@ -152,20 +163,77 @@ class Trainer:
         fraction = min(self.steps / p.epsilon_steps, 1.0)
         return p.epsilon_start + fraction * (p.epsilon_end - p.epsilon_start)
 
-    def run(self, until: int, every: int = 10**9) -> Iterator[list[Episode]]:
-        """Train until step `until`: a generator.
+    @property
+    def learning_rate(self) -> float:
+        """Present learning rate of the updates."""
+        return self.parameters.learning_rate_at(self.steps)
 
-        After some steps, and at each multiple of `every` steps, it yields the episodes
-        that have ended since the last time: an empty list if none has. Steps count from
-        the beginning of the training.
+    @property
+    def has_diverged(self) -> bool:
+        """Whether a weight of the network is not finite."""
+        tensors = self.network.tensors.values()
+        return not all(np.isfinite(tensor).all() for tensor in tensors)
+
+    def run(
+        self, until: int | None = None, every: int | None = None
+    ) -> Iterator[Progress]:
+        """Train, and yield the progress again and again: a generator.
+
+        A training stops when nobody asks for more progress, and a later call continues
+        it. After Ctrl-C in the loop, too, nothing is lost.
+
+        Parameters
+        ----------
+        until : int, optional
+            The last step, counted from the beginning of the training; by default
+            `steps` of the hyper-parameters.
+        every : int, optional
+            Yield at each multiple of so many steps, and at the last step. By default
+            yield each time that an episode ends, and within some milliseconds.
+
+        Yields
+        ------
+        Progress
+            With the episodes that have ended since the last progress.
         """
-        while self.steps < until:
-            next_multiple = (self.steps // every + 1) * every
-            if self.learner is None:
-                self._play(min(until, next_multiple))
-            else:
-                self._step(self.learner)
-            yield self._end_episodes()
+        if until is None:
+            until = self.parameters.steps
+        last_step = as_whole("until", until, 0, MOST_STEPS)
+        if every is not None:
+            every = as_whole("every", every, 1, MOST_STEPS)
+        return self._run(last_step, every)
+
+    def _run(self, last_step: int, every: int | None) -> Iterator[Progress]:
+        """Yield what `run` yields; the arguments are checked."""
+        while self.steps < last_step:
+            next_stop = last_step
+            if every is not None:
+                next_multiple = (self.steps // every + 1) * every
+                next_stop = min(last_step, next_multiple)
+            with interrupts_wait():
+                self._advance(next_stop)
+            if every is None or self.steps >= next_stop:
+                yield self._progress()
+
+    def _advance(self, last_step: int) -> None:
+        """Make some steps, up to `last_step`, until an episode ends at the latest."""
+        if self.learner is None:
+            self._play(last_step)
+        else:
+            self._step(self.learner)
+        self._new_episodes += self._end_episodes()
+
+    def _progress(self) -> Progress:
+        """Return the present progress, with the new episodes."""
+        episodes = tuple(self._new_episodes)
+        self._new_episodes.clear()
+        return Progress(
+            step=self.steps,
+            updates=self.updates,
+            episodes=episodes,
+            epsilon=self.epsilon,
+            learning_rate=self.learning_rate,
+        )
 
     def _play(self, last_step: int) -> None:
         """Make some steps in compiled code, and the updates that fall due.
@@ -210,8 +278,7 @@ class Trainer:
             for _ in range(updates_due):
                 self.updates += 1
                 batch = self.replay.sample(p.batch_size, self._sampling)
-                rate = p.learning_rate_at(self.steps)
-                learner.update(batch, self.updates, rate)
+                learner.update(batch, self.updates, self.learning_rate)
 
     def _end_episodes(self) -> list[Episode]:
         """Return the episodes that have ended, and start new ones in their place."""
@@ -260,7 +327,7 @@ class Trainer:
             map_fingerprint=scenario.grid.fingerprint,
             steps=self.steps,
             seed=self.seed,
-            package_version=package_version(),
+            package_version=__version__,
         )
         weights = self.average or network.tensors
         tensors = {name: tensor.copy() for name, tensor in weights.items()}
@@ -271,15 +338,32 @@ class Trainer:
 
         A ValueError if the training diverged: a weight is not finite.
         """
-        if not all(
-            np.isfinite(tensor).all() for tensor in self.network.tensors.values()
-        ):
+        if self.has_diverged:
             remedy = "train into another folder with a smaller learning_rate"
             raise ValueError(
                 f"the training diverged, and nothing more is saved; {remedy}"
             )
         planner = self.planner()
         return model_bytes(planner.network, planner.metadata)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how a copy is made: a new trainer takes over this one's state.
+
+        Compiled code shares memory with the arrays, which copies of them would not.
+        """
+        arrays = {name: tensor.copy() for name, tensor in self.arrays().items()}
+        state = self._description(), arrays
+        return type(self), (self.scenarios, self.parameters, self.seed), state
+
+    def __setstate__(
+        self, state: tuple[dict[str, Any], dict[str, NDArray[Any]]]
+    ) -> None:
+        """Take over the description and the arrays of another trainer."""
+        description, arrays = state
+        self._restore_counters(description)
+        for name, tensor in self.arrays().items():
+            tensor[...] = arrays[name]
+        self._restore_episodes(description)
 
     def _description(self) -> dict[str, Any]:
         """Return all of a checkpoint but its arrays, see `arrays`, as a JSON object.
@@ -315,7 +399,7 @@ class Trainer:
             for name, tensor in self.arrays().items()
         }
         text = json.dumps(self._description())
-        metadata = {CHECKPOINT_KEY: text, DIGEST_KEY: _digest(text, tensors)}
+        metadata = {CHECKPOINT_KEY: text, DIGEST_KEY: digest_of(text, tensors)}
         write_atomically(as_path(path), safetensors.numpy.save(tensors, metadata))
 
     def restore(self, path: Path) -> None:
@@ -336,12 +420,12 @@ class Trainer:
                 metadata = file.metadata()
                 description = json.loads(metadata[CHECKPOINT_KEY])
                 self._check_training(description)
-                self._restore_arrays(file, description["counters"])
-            if metadata[DIGEST_KEY] != _digest(metadata[CHECKPOINT_KEY], self.arrays()):
+                self._restore_counters(description)
+                self._restore_arrays(file)
+            digest = digest_of(metadata[CHECKPOINT_KEY], self.arrays())
+            if metadata[DIGEST_KEY] != digest:
                 raise ValueError("its digest is another")
             self._restore_episodes(description)
-            if self.learner is not None:
-                self.learner.settle()
         except CheckpointError as error:
             raise CheckpointError(
                 f"{path}: {error}, or train into another folder"
@@ -375,14 +459,19 @@ class Trainer:
         if changed:
             raise CheckpointError(f"was made with {changed}; give those values")
 
-    def _restore_arrays(self, file: Any, counters: list[int]) -> None:
-        """Set the counters of a checkpoint, and read the arrays of its open file.
+    def _restore_counters(self, saved: dict[str, Any]) -> None:
+        """Set the counters of a saved `_description`.
 
-        `file` is an open safetensors file, and `counters` are those of `_description`.
+        They come first, as they tell which arrays there are, and of which sizes.
+        """
+        counters = saved["counters"]
+        self.steps, self.updates, self.episodes, self.replay.added = counters
+
+    def _restore_arrays(self, file: Any) -> None:
+        """Read the arrays of a checkpoint, an open safetensors file.
+
         The arrays are read into the memory of this trainer.
         """
-        # First the counters, as they tell how many transitions there are.
-        self.steps, self.updates, self.episodes, self.replay.added = counters
         tensors = self.arrays()
         shapes = {name: [*tensor.shape] for name, tensor in tensors.items()}
         # Before any is read: a small sparse file can claim tensors of any size.
@@ -398,7 +487,7 @@ class Trainer:
     def _restore_episodes(self, saved: dict[str, Any]) -> None:
         """Restore the cells of unfinished episodes, and the random generators.
 
-        `saved` is the `_description` of a checkpoint.
+        `saved` is a `_description`. The arrays were restored before.
         """
         paths = zip(self.environment.visited, saved["walked"], strict=True)
         for visited, cells in paths:
@@ -406,6 +495,8 @@ class Trainer:
         states = zip(self._generators, saved["generators"], strict=True)
         for generator, state in states:
             generator.bit_generator.state = state
+        if self.learner is not None:
+            self.learner.settle()
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the arrays of a checkpoint; they share the trainer's memory."""
@@ -457,12 +548,3 @@ def _initial_tensors(
             tensor[:] = 1
         tensors[name] = tensor
     return tensors
-
-
-def _digest(text: str, tensors: Mapping[str, NDArray[Any]]) -> str:
-    """Return SHA-256 of a checkpoint's description and arrays, in hexadecimal."""
-    digest = hashlib.sha256(text.encode())
-    for name in sorted(tensors):
-        digest.update(name.encode())
-        digest.update(tensors[name].ravel().data)
-    return digest.hexdigest()

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from ddqn_planner import GridMap, MoveRule
 from ddqn_planner.grid import path_length
 from ddqn_planner.model import load_model
-from ddqn_planner.training.environment import Scenario
+from ddqn_planner.training.checkpoint import CheckpointError
 from ddqn_planner.training.episodes import Episode, read_cells
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.run import SAVE_INTERVAL, TrainingRun
-from ddqn_planner.training.trainer import CheckpointError
+from ddqn_planner.training.scenario import Scenario
 
 PARAMETERS = HyperParameters(steps=400, filters=4, learning_starts=50)
 
@@ -30,7 +30,7 @@ def open_run(folder: Path, scenario: Scenario, **changes: object) -> TrainingRun
 
 
 def finish(run: TrainingRun) -> list[Episode]:
-    episodes = [episode for finished in run.steps() for episode in finished]
+    episodes = [episode for progress in run.steps() for episode in progress.episodes]
     run.close()
     return episodes
 

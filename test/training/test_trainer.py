@@ -36,7 +36,7 @@ def make(
 
 
 def train(trainer: Trainer, until: int) -> list[Episode]:
-    return [episode for finished in trainer.run(until) for episode in finished]
+    return [episode for progress in trainer.run(until) for episode in progress.episodes]
 
 
 def same_weights(a: dict[str, Any], b: dict[str, Any]) -> bool:

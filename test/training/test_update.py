@@ -143,7 +143,8 @@ def test_compiled_training_is_that_of_torch(
         part(trainer)
     TorchLearner(of_torch)
     one, other = (
-        [e for ended in t.run(90) for e in ended] for t in (compiled, of_torch)
+        [e for progress in t.run(90) for e in progress.episodes]
+        for t in (compiled, of_torch)
     )
     assert one == other
     assert compiled.updates == of_torch.updates > 60
@@ -152,7 +153,8 @@ def test_compiled_training_is_that_of_torch(
     compiled = trainer_class(scenarios, parameters, seed=2)
     compiled.restore(tmp_path / "checkpoint")
     one, other = (
-        [e for ended in t.run(180) for e in ended] for t in (compiled, of_torch)
+        [e for progress in t.run(180) for e in progress.episodes]
+        for t in (compiled, of_torch)
     )
     assert one == other
     check_same(compiled, of_torch)
