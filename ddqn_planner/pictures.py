@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,6 +16,7 @@ from ddqn_planner.robot.footprint import placed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from PIL.Image import Image as PillowImage
 
 Array = NDArray[np.float64]
 
@@ -26,6 +27,8 @@ DIRECTION_COLOUR = "#6c757d"
 # colours, too.
 VALUE_COLOURS = ("#f4f1de", "#cfe8dc", "#93cfc8", "#4fa3b5")
 
+# Of films, by the endings of their files, as Pillow names them.
+FILM_FORMATS = {".gif": "GIF", ".webp": "WEBP", ".png": "PNG"}
 # The signs of cells in a text. One for several cells is the last of their signs here.
 SIGNS = ".>^<v#*SG"
 MAX_TEXT_WIDTH = 64  # signs in a row, two characters for each
@@ -154,6 +157,61 @@ def picture_format(path: Path, option: str = "the picture") -> str:
             f"{option} is {path}, which {problem}; give one of .{', .'.join(formats)}"
         )
     return ending
+
+
+def film_format(path: Path, option: str = "the film") -> str:
+    """Return the format in which Pillow writes a film, by the ending of its file.
+
+    A ValueError lists the endings; it names the file by `option`.
+    """
+    from PIL import Image
+
+    Image.init()
+    formats = {
+        ending: name for ending, name in FILM_FORMATS.items() if name in Image.SAVE_ALL
+    }
+    ending = path.suffix.lower()
+    if ending not in formats:
+        problem = f"ends in {path.suffix!r}" if ending else "has no ending"
+        raise ValueError(
+            f"{option} is {path}, which {problem}; give one of {', '.join(formats)}"
+        )
+    return formats[ending]
+
+
+def save_film(
+    path: str | Path,
+    frames: Iterable[PillowImage],
+    milliseconds: int,
+    last_milliseconds: int | None = None,
+) -> None:
+    """Save a film that repeats, as its ending says: .gif, .webp or animated .png.
+
+    Parameters
+    ----------
+    path
+        The file. An old one stays complete after an error.
+    frames
+        At least one, all of one size.
+    milliseconds, last_milliseconds
+        For how long each frame is shown, and the last one; by default as the others.
+    """
+    file = as_path(path)
+    name = film_format(file)
+    # A GIF has 256 colours. With its own palette of 64, each frame is small.
+    images = [frame.quantize(64) if name == "GIF" else frame for frame in frames]
+    durations = [milliseconds] * len(images)
+    durations[-1] = last_milliseconds or milliseconds
+    content = io.BytesIO()
+    images[0].save(
+        content,
+        name,
+        save_all=True,
+        append_images=images[1:],
+        duration=durations,
+        loop=0,
+    )
+    write_atomically(file, content.getvalue())
 
 
 def _draw_value(axes: Axes, value: NDArray[np.float32], label: str) -> None:

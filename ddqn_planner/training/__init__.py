@@ -19,11 +19,17 @@ if TYPE_CHECKING:
     from ddqn_planner.training.run import TrainingRun
     from ddqn_planner.training.scenario import Scenario, paper_scenario
     from ddqn_planner.training.trainer import Trainer
+    from ddqn_planner.training.training_record import (
+        CurvePoint,
+        Snapshot,
+        TrainingRecord,
+    )
 
 __all__ = [
     "ANY_MAP",
     "BatchedGridEnvironment",
     "CheckpointError",
+    "CurvePoint",
     "Episode",
     "EpisodeEnd",
     "Evaluation",
@@ -32,7 +38,9 @@ __all__ = [
     "HyperParameters",
     "Progress",
     "Scenario",
+    "Snapshot",
     "Trainer",
+    "TrainingRecord",
     "TrainingRun",
     "evaluate",
     "length_ratios",
@@ -45,6 +53,7 @@ _MODULES = {
     "ANY_MAP": "any_map",
     "BatchedGridEnvironment": "gymnasium_environments",
     "CheckpointError": "checkpoint",
+    "CurvePoint": "training_record",
     "Episode": "episodes",
     "EpisodeEnd": "episodes",
     "Evaluation": "evaluation",
@@ -53,7 +62,9 @@ _MODULES = {
     "HyperParameters": "hyper_parameters",
     "Progress": "episodes",
     "Scenario": "scenario",
+    "Snapshot": "training_record",
     "Trainer": "trainer",
+    "TrainingRecord": "training_record",
     "TrainingRun": "run",
     "evaluate": "evaluation",
     "length_ratios": "evaluation",
