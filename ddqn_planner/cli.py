@@ -76,6 +76,12 @@ def _run_command(arguments: Sequence[str]) -> int:
             name, help=first_sentence, description=description
         )
     if not arguments or arguments[0] not in COMMANDS:
+        from ddqn_planner.version import __version__
+
+        version = f"ddqn-planner {__version__}"
+        parser.add_argument(
+            "--version", action="version", version=version, help="print the version"
+        )
         parser.parse_args(arguments)  # exits after it printed the help, or an error
     name, *options = arguments
     command = import_module(f"ddqn_planner.commands.{name.replace('-', '_')}")

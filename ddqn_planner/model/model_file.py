@@ -46,7 +46,7 @@ class ModelMetadata:
     map_fingerprint: str  # of the first map on which it was trained
     steps: int  # of its training
     seed: int
-    package_version: str
+    package_version: str  # that wrote the file
 
 
 # The types of the entries of `ModelMetadata` in JSON.
