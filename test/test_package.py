@@ -1,6 +1,7 @@
 import ast
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,10 +13,14 @@ from zipfile import ZipFile
 import pytest
 from limits import files_no_longer_than
 
+import ddqn_planner
+from ddqn_planner.cli import main
 from ddqn_planner.files import WorkFolder, write_atomically
+from ddqn_planner.model import load_model
 from ddqn_planner.resources import find_map
 
 ROOT = Path(__file__).resolve().parent.parent
+VERSION = ElementTree.parse(ROOT / "package.xml").findtext("version")
 ROOMS = ["grid", "robot", "model", "planning", "experience", "training", "nodes"]
 TRAINING = {"torch", "gymnasium"}
 PIP = [sys.executable, "-m", "pip", "--quiet"]
@@ -64,10 +69,54 @@ def test_the_wheel_asks_for_torch_only_to_train(wheel: Path) -> None:
     assert of_training == {(library, '; extra == "train"') for library in TRAINING}
 
 
-def test_the_newest_release_of_the_changelog_is_of_the_packages_version() -> None:
-    version = ElementTree.parse(ROOT / "package.xml").findtext("version")
+@pytest.mark.slow
+def test_the_wheel_has_the_version_of_the_source(wheel: Path) -> None:
+    assert wheel.name.split("-")[:2] == ["ddqn_planner", VERSION]
+
+
+def test_one_version_everywhere(capsys: pytest.CaptureFixture[str]) -> None:
     changes = (ROOT / "CHANGELOG.md").read_text()
-    assert re.findall(r"^## (\S+) \(\d{4}-\d\d-\d\d\)$", changes, re.M)[0] == version
+    release = r"^## \[(.+)\] - (\d{4}-\d\d-\d\d)$"
+    newest, date = re.findall(release, changes, re.M)[0]
+    assert newest == VERSION
+    assert f"/v{VERSION}\n" in changes  # the address of its tag
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert f"\nversion: {VERSION}\ndate-released: {date}\n" in citation
+    assert ddqn_planner.__version__ == VERSION
+    with pytest.raises(SystemExit, match="0"):
+        main(["--version"])
+    assert capsys.readouterr().out == f"ddqn-planner {VERSION}\n"
+    for path in (ROOT / "models").iterdir():
+        assert load_model(path)[1].package_version == VERSION, path
+
+
+PRINT_VERSION = "import ddqn_planner; print(ddqn_planner.__version__)"
+
+
+def test_the_version_is_that_of_the_source_else_of_the_installation(
+    tmp_path: Path,
+) -> None:
+    package = tmp_path / "ddqn_planner"
+    package.symlink_to(ROOT / "ddqn_planner")
+
+    def version_in(folder: Path) -> str:
+        # Isolated from the environment's installation.
+        script = f"import sys; sys.path.insert(0, {str(folder)!r}); {PRINT_VERSION}"
+        command = [sys.executable, "-S", "-c", script]
+        return subprocess.check_output(command, text=True).strip()
+
+    assert version_in(tmp_path) == VERSION
+    # A copy, as installed: the package.xml beside it is of another package.
+    package.unlink()
+    package.mkdir()
+    for name in ("__init__.py", "resources.py", "files.py"):
+        shutil.copy(ROOT / "ddqn_planner" / name, package)
+    (tmp_path / "package.xml").write_text("<package><name>other</name></package>")
+    assert version_in(tmp_path) == "unknown"
+    metadata = tmp_path / "ddqn_planner-1.2.3.dist-info" / "METADATA"
+    metadata.parent.mkdir()
+    metadata.write_text("Metadata-Version: 2.1\nName: ddqn_planner\nVersion: 1.2.3\n")
+    assert version_in(tmp_path) == "1.2.3"
 
 
 WHERE = """
