@@ -1,3 +1,5 @@
+import re
+import sys
 from glob import glob
 from pathlib import Path
 from xml.etree import ElementTree
@@ -8,30 +10,81 @@ PACKAGE = "ddqn_planner"
 # `colcon build --symlink-install` runs a link to this file, in a folder without the
 # others.
 ROOT = Path(__file__).resolve().parent
+MANIFEST = ElementTree.parse(ROOT / "package.xml")
+VERSION = MANIFEST.findtext("version")
+REPOSITORY = MANIFEST.findtext("url[@type='repository']")
+MAINTAINER = MANIFEST.find("maintainer")
+
+
+def readme_for_pypi():
+    """Return README with full addresses: PyPI shows it without the repository."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    text = text.replace("<this repository>", REPOSITORY)
+    address = rf"\1{REPOSITORY}/%s/v{VERSION}/"
+    relative = r"\]\()(?!https?://|#)"
+    text = re.sub(rf"(!\[[^]]*{relative}", address % "raw", text)
+    return re.sub(rf"((?<!!)\[[^]]*{relative}", address % "blob", text)
+
+
+data_files = [
+    ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+    (f"share/{PACKAGE}", ["package.xml"]),
+    (f"share/{PACKAGE}/rviz", glob("rviz/*")),
+    (f"share/{PACKAGE}/launch", glob("launch/*.launch.py")),
+    # The examples look for their helpers where these lie in the repository.
+    (f"share/{PACKAGE}/examples", glob("examples/*.py")),
+    (f"share/{PACKAGE}/experiments", glob("experiments/*.py")),
+]
+# The package reads the maps and models beside its code. A workspace has copies for
+# ROS's tools; a wheel has none.
+if "bdist_wheel" not in sys.argv:
+    data_files += [
+        (f"share/{PACKAGE}/maps", glob("maps/*")),
+        (f"share/{PACKAGE}/models", glob("models/*")),
+    ]
 
 setup(
     name=PACKAGE,
-    version=ElementTree.parse(ROOT / "package.xml").findtext("version"),
+    version=VERSION,
     description="Plans robot paths on grid maps with a Double DQN, as ROS 2 nodes",
-    long_description=(ROOT / "README.md").read_text(encoding="utf-8"),
+    long_description=readme_for_pypi(),
     long_description_content_type="text/markdown",
     license="Apache-2.0",
-    maintainer="ddqn_planner maintainers",
-    maintainer_email="maintainers@ddqn-planner.example",
+    maintainer=MAINTAINER.text,
+    maintainer_email=MAINTAINER.get("email"),
+    url=REPOSITORY,
+    project_urls={
+        "Documentation": f"{REPOSITORY}/tree/v{VERSION}/docs",
+        "Changelog": f"{REPOSITORY}/blob/v{VERSION}/CHANGELOG.md",
+        "Issues": f"{REPOSITORY}/issues",
+        "Paper": "https://arxiv.org/abs/2107.11245",
+    },
+    keywords=[
+        "path planning",
+        "robotics",
+        "ROS 2",
+        "Nav2",
+        "grid map",
+        "Double DQN",
+        "reinforcement learning",
+        "Gymnasium",
+    ],
+    classifiers=[
+        "Development Status :: 4 - Beta",
+        "Intended Audience :: Developers",
+        "Intended Audience :: Education",
+        "Intended Audience :: Science/Research",
+        "License :: OSI Approved :: Apache Software License",
+        "Operating System :: POSIX :: Linux",
+        "Programming Language :: Python :: 3",
+        *(f"Programming Language :: Python :: 3.{minor}" for minor in range(10, 15)),
+        "Topic :: Scientific/Engineering :: Artificial Intelligence",
+        "Typing :: Typed",
+    ],
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
     # Links in the source tree, files in what is built from it.
     package_data={PACKAGE: ["py.typed", "maps/*", "models/*"]},
-    data_files=[
-        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
-        (f"share/{PACKAGE}", ["package.xml"]),
-        (f"share/{PACKAGE}/maps", glob("maps/*")),
-        (f"share/{PACKAGE}/models", glob("models/*")),
-        (f"share/{PACKAGE}/rviz", glob("rviz/*")),
-        (f"share/{PACKAGE}/launch", glob("launch/*.launch.py")),
-        # The examples look for their helpers where these lie in the repository.
-        (f"share/{PACKAGE}/examples", glob("examples/*.py")),
-        (f"share/{PACKAGE}/experiments", glob("experiments/*.py")),
-    ],
+    data_files=data_files,
     zip_safe=False,
     python_requires=">=3.10",
     install_requires=[

@@ -1,4 +1,5 @@
 import ast
+import datetime
 import os
 import re
 import shutil
@@ -10,17 +11,21 @@ from pathlib import Path
 from xml.etree import ElementTree
 from zipfile import ZipFile
 
+import numpy as np
 import pytest
+import safetensors.numpy
 from limits import files_no_longer_than
 
 import ddqn_planner
 from ddqn_planner.cli import main
 from ddqn_planner.files import WorkFolder, write_atomically
-from ddqn_planner.model import load_model
+from ddqn_planner.model import load_model, model_of
 from ddqn_planner.resources import find_map
 
 ROOT = Path(__file__).resolve().parent.parent
-VERSION = ElementTree.parse(ROOT / "package.xml").findtext("version")
+MANIFEST = ElementTree.parse(ROOT / "package.xml")
+VERSION = MANIFEST.findtext("version", "")
+REPOSITORY = MANIFEST.findtext("url[@type='repository']", "")
 ROOMS = ["grid", "robot", "model", "planning", "experience", "training", "nodes"]
 TRAINING = {"torch", "gymnasium"}
 PIP = [sys.executable, "-m", "pip", "--quiet"]
@@ -69,9 +74,50 @@ def test_the_wheel_asks_for_torch_only_to_train(wheel: Path) -> None:
     assert of_training == {(library, '; extra == "train"') for library in TRAINING}
 
 
+def test_a_release_gives_its_version_to_all(source_copy: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "ddqn_planner"
+    shutil.copytree(source_copy, copy, symlinks=True)
+    changes = (copy / "CHANGELOG.md").read_text()
+    newest = f"## [{VERSION}]"
+    changes = changes.replace(newest, f"## [Unreleased]\n\n- It flies.\n\n{newest}", 1)
+    (copy / "CHANGELOG.md").write_text(changes)
+    environment = {**os.environ, "PYTHONPATH": str(copy)}
+
+    command = [sys.executable, "tools/release.py", "12.0.3"]
+    subprocess.run(command, cwd=copy, env=environment, check=True)
+
+    today = datetime.date.today().isoformat()
+    assert "<version>12.0.3</version>" in (copy / "package.xml").read_text()
+    citation = (copy / "CITATION.cff").read_text()
+    assert f"\nversion: 12.0.3\ndate-released: {today}\n" in citation
+    changes = (copy / "CHANGELOG.md").read_text()
+    assert f"## [12.0.3] - {today}\n\n- It flies.\n\n{newest}" in changes
+    assert f"\n[12.0.3]: {REPOSITORY}/compare/v{VERSION}...v12.0.3\n" in changes
+    for path in (ROOT / "models").iterdir():
+        model = (copy / "models" / path.name).read_bytes()
+        assert model_of(model)[1].package_version == "12.0.3"
+        tensors = safetensors.numpy.load(path.read_bytes())
+        same = safetensors.numpy.load(model)
+        assert same.keys() == tensors.keys()
+        assert all(np.array_equal(same[name], tensors[name]) for name in tensors)
+
+
 @pytest.mark.slow
-def test_the_wheel_has_the_version_of_the_source(wheel: Path) -> None:
-    assert wheel.name.split("-")[:2] == ["ddqn_planner", VERSION]
+def test_the_page_on_pypi_has_full_addresses(wheel: Path) -> None:
+    with ZipFile(wheel) as archive:
+        (name,) = (name for name in archive.namelist() if name.endswith("/METADATA"))
+        text = archive.read(name).decode()
+    assert f"\nVersion: {VERSION}\n" in text
+    assert "<this repository>" not in text
+    targets = re.findall(r"\]\(([^)\s]+)|\b(?:src|href)=\"([^\"]+)", text)
+    for address in (markdown or html for markdown, html in targets):
+        assert address.startswith("https://"), address
+        if address.startswith(REPOSITORY):
+            kind = "raw" if address.endswith((".gif", ".png", ".svg")) else "blob"
+            root = f"{REPOSITORY}/{kind}/v{VERSION}/"
+            assert address.startswith(root), address
+            path = address.removeprefix(root).partition("#")[0]
+            assert (ROOT / path).is_file(), address
 
 
 def test_one_version_everywhere(capsys: pytest.CaptureFixture[str]) -> None:
@@ -186,8 +232,9 @@ def test_maps_and_models_come_everywhere(
         assert Path(helper.strip()).parent == share / "experiments"
     for name in ("maps", "models"):
         shipped = {path.name: path.read_bytes() for path in (ROOT / name).iterdir()}
-        for copy in (package.parent / name, share / name):
-            assert {path.name: path.read_bytes() for path in copy.iterdir()} == shipped
+        copy = package.parent / name
+        assert {path.name: path.read_bytes() for path in copy.iterdir()} == shipped
+        assert not (share / name).exists()  # a wheel has them once
 
 
 def test_a_map_is_shipped_or_of_a_package(
