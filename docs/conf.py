@@ -12,7 +12,9 @@ sys.path.insert(0, str(DOCS.parent))
 project = "ddqn_planner"
 author = "ddqn_planner maintainers"
 copyright = "ddqn_planner maintainers, Apache-2.0"
-release = ElementTree.parse(DOCS.parent / "package.xml").findtext("version")
+manifest = ElementTree.parse(DOCS.parent / "package.xml")
+release = manifest.findtext("version")
+repository = manifest.findtext("url[@type='repository']", "")
 
 extensions = [
     "myst_parser",
@@ -22,6 +24,12 @@ extensions = [
 ]
 exclude_patterns = ["_build"]
 html_theme = "furo"
+# Links to the sources of a page. They show nothing before the repository is public.
+if ".example" not in repository:
+    html_theme_options = {
+        "source_edit_link": f"{repository}/edit/main/docs/{{filename}}",
+        "source_view_link": f"{repository}/blob/main/docs/{{filename}}",
+    }
 html_title = f"ddqn_planner {release}"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
