@@ -2,6 +2,7 @@ import ast
 import datetime
 import os
 import re
+import runpy
 import shutil
 import signal
 import subprocess
@@ -74,17 +75,18 @@ def test_the_wheel_asks_for_torch_only_to_train(wheel: Path) -> None:
     assert of_training == {(library, '; extra == "train"') for library in TRAINING}
 
 
-def test_a_release_gives_its_version_to_all(source_copy: Path, tmp_path: Path) -> None:
+def test_a_release_gives_its_version_to_all(tmp_path: Path) -> None:
     copy = tmp_path / "ddqn_planner"
-    shutil.copytree(source_copy, copy, symlinks=True)
-    changes = (copy / "CHANGELOG.md").read_text()
+    for folder in ("models", "tools"):
+        shutil.copytree(ROOT / folder, copy / folder)
+    for name in ("package.xml", "CITATION.cff"):
+        shutil.copy(ROOT / name, copy)
+    changes = (ROOT / "CHANGELOG.md").read_text()
     newest = f"## [{VERSION}]"
     changes = changes.replace(newest, f"## [Unreleased]\n\n- It flies.\n\n{newest}", 1)
     (copy / "CHANGELOG.md").write_text(changes)
-    environment = {**os.environ, "PYTHONPATH": str(copy)}
 
-    command = [sys.executable, "tools/release.py", "12.0.3"]
-    subprocess.run(command, cwd=copy, env=environment, check=True)
+    runpy.run_path(str(copy / "tools/release.py"))["main"](["12.0.3"])
 
     today = datetime.date.today().isoformat()
     assert "<version>12.0.3</version>" in (copy / "package.xml").read_text()
@@ -155,8 +157,8 @@ def test_the_version_is_that_of_the_source_else_of_the_installation(
     # A copy, as installed: the package.xml beside it is of another package.
     package.unlink()
     package.mkdir()
-    for name in ("__init__.py", "resources.py", "files.py"):
-        shutil.copy(ROOT / "ddqn_planner" / name, package)
+    for path in (ROOT / "ddqn_planner").glob("*.py"):
+        shutil.copy(path, package)
     (tmp_path / "package.xml").write_text("<package><name>other</name></package>")
     assert version_in(tmp_path) == "unknown"
     metadata = tmp_path / "ddqn_planner-1.2.3.dist-info" / "METADATA"

@@ -7,6 +7,7 @@ import argparse
 import datetime
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -19,11 +20,11 @@ ROOT: Final = Path(__file__).resolve().parent.parent
 UNRELEASED: Final = "## [Unreleased]\n"
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Write the version to the manifest, the changelog, the citation and the models."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("version", help="such as 0.6.0")
-    version = parser.parse_args().version
+    version = parser.parse_args(arguments).version
     if not re.fullmatch(r"\d+\.\d+\.\d+", version):
         parser.error(f"the version is {version!r}; give three numbers, such as 0.6.0")
     changes = (ROOT / "CHANGELOG.md").read_text()
