@@ -14,13 +14,13 @@ ROS: Final = (
 
 # The packages to install with pip, by the module that is missing.
 PACKAGES: Final = {
-    "gymnasium": "torch gymnasium",
+    "gymnasium": "gymnasium",
     "matplotlib": "matplotlib",
     "mcap": "mcap-ros2-support",
     "mcap_ros2": "mcap-ros2-support",
     "numba": "numba",
     "safetensors": "safetensors",
-    "torch": "torch gymnasium",
+    "torch": "torch",
 }
 
 

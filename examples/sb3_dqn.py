@@ -16,8 +16,7 @@ import torch
 from stable_baselines3 import DQN
 from stable_baselines3.common.callbacks import BaseCallback
 
-from ddqn_planner.training.environment import Scenario, paper_scenario
-from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training import HyperParameters, Scenario, paper_scenario
 
 PLAIN = HyperParameters(p_r=0, alpha=0, beta=0)
 IMPROVED = HyperParameters()

@@ -20,9 +20,12 @@ import numpy as np
 import torch
 from torch import nn
 
-from ddqn_planner.training.environment import Scenario, paper_scenario
-from ddqn_planner.training.episodes import EpisodeEnd
-from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training import (
+    EpisodeEnd,
+    HyperParameters,
+    Scenario,
+    paper_scenario,
+)
 
 ACTIONS = 8
 MAX_EPISODE_STEPS = 200

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import scipy.ndimage
 from figures import draw_map, draw_path, plt
@@ -15,8 +16,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ddqn_planner import GridMap, MoveRule, Planner, inflate, load_map
-from ddqn_planner.grid import Cell, MapFile, read_map_file
+from ddqn_planner.grid import MOVES, Cell, MapFile, read_map_file
 from ddqn_planner.grid.inflation import INSCRIBED, grid_from_costmap
+from ddqn_planner.gymnasium_registration import ENVIRONMENT
 from ddqn_planner.pictures import draw_obstacles
 from ddqn_planner.resources import find_map
 from ddqn_planner.training.environment import paper_scenario
@@ -218,12 +220,36 @@ def nav2() -> Any:
     return figure
 
 
+def gymnasium_frames() -> Any:
+    """Draw what the environment renders: at the start, on the way, and at the goal."""
+    scenario = paper_scenario()
+    plan = Planner.load("dilemma").plan(scenario.grid, scenario.start, scenario.goal)
+    moves = np.diff(plan.cells, axis=0)  # (M, 2)
+    actions = (moves[:, None] == MOVES).all(axis=2).argmax(axis=1)
+    environment = gymnasium.make(
+        ENVIRONMENT, scenario=scenario, render_mode="rgb_array"
+    )
+    environment.reset(options={"start": scenario.start})
+    frames: list[Any] = [environment.render()]
+    for action in actions:
+        environment.step(action)
+        frames.append(environment.render())
+    figure, all_axes = plt.subplots(1, 3, figsize=(9, 3.1), layout="constrained")
+    steps = (0, len(actions) // 2, len(actions))
+    for axes, step in zip(all_axes, steps, strict=True):
+        axes.imshow(frames[step], interpolation="nearest")
+        axes.set_title(f"after {step} steps", fontsize=10)
+        axes.axis("off")
+    return figure
+
+
 PICTURES: Mapping[str, Callable[[], Any]] = {
     "training": training,
     "tuning": tuning,
     "warehouse": warehouse,
     "costmap": costmap,
     "nav2": nav2,
+    "gymnasium": gymnasium_frames,
 }
 
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ddqn_planner.training.hyper_parameters import HyperParameters
     from ddqn_planner.training.one_map import train
     from ddqn_planner.training.run import TrainingRun
-    from ddqn_planner.training.scenario import Scenario, paper_scenario
+    from ddqn_planner.training.scenario import Scenario, map_scenario, paper_scenario
     from ddqn_planner.training.trainer import Trainer
     from ddqn_planner.training.training_record import (
         CurvePoint,
@@ -44,6 +44,7 @@ __all__ = [
     "TrainingRun",
     "evaluate",
     "length_ratios",
+    "map_scenario",
     "paper_scenario",
     "random_scenarios",
     "train",
@@ -68,6 +69,7 @@ _MODULES = {
     "TrainingRun": "run",
     "evaluate": "evaluation",
     "length_ratios": "evaluation",
+    "map_scenario": "scenario",
     "paper_scenario": "scenario",
     "random_scenarios": "any_map",
     "train": "one_map",

@@ -12,18 +12,14 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from ddqn_planner.grid import MOVES, Cell, read_map_file
+from ddqn_planner.grid import MOVES, Cell
 from ddqn_planner.grid.arguments import cell_inside
 from ddqn_planner.model.networks import GOAL, OBSTACLE, ROBOT
-from ddqn_planner.resources import find_map
-from ddqn_planner.training.environment import (
-    GridVectorEnvironment,
-    Observations,
-    Scenario,
-)
+from ddqn_planner.training.environment import GridVectorEnvironment, Observations
 from ddqn_planner.training.episodes import EpisodeEnd
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.rendering import draw_pixels, draw_signs
+from ddqn_planner.training.scenario import Scenario, map_scenario, paper_scenario
 
 RENDER_MODES = ("rgb_array", "ansi")
 Frame: TypeAlias = NDArray[np.uint8] | str
@@ -43,23 +39,16 @@ class RewardFunction(Protocol):
 
 
 def _as_scenario(scenario: Scenario | str | None) -> Scenario:
-    """Return a scenario, that of a map by its name, or by default the paper's.
-
-    A ValueError if the map's file names no start and goal.
-    """
-    if isinstance(scenario, Scenario):
-        return scenario
-    if scenario is not None and not isinstance(scenario, str):
+    """Return a scenario, that of a map by its name, or by default the paper's."""
+    if scenario is None:
+        return paper_scenario()
+    if isinstance(scenario, str):
+        return map_scenario(scenario)
+    if not isinstance(scenario, Scenario):
         raise ValueError(
             f"the scenario is {scenario!r}; give a Scenario or the name of a map"
         )
-    name = "dilemma" if scenario is None else scenario
-    map_file = read_map_file(find_map(name))
-    if map_file.start is None or map_file.goal is None:
-        raise ValueError(
-            f"the map {name} names no start and goal; give Scenario(grid, start, goal)"
-        )
-    return Scenario(map_file.grid(), map_file.start, map_file.goal)
+    return scenario
 
 
 def _as_parameters(

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell
-from ddqn_planner.training.environment import Scenario
+from ddqn_planner.training.scenario import Scenario
 
 # Red, green and blue, 0 to 255.
 FREE_COLOUR: Final = (255, 255, 255)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from ddqn_planner.grid import Cell, GridMap, MoveRule, read_map_file
 from ddqn_planner.grid.arguments import as_cell
 from ddqn_planner.grid.grid_map import check_grid
-from ddqn_planner.resources import find_resource
+from ddqn_planner.resources import find_map
 
 
 @dataclass(frozen=True)
@@ -52,10 +52,19 @@ class Scenario:
 
 def paper_scenario() -> Scenario:
     """Return the paper's map with its start and goal."""
-    map_file = read_map_file(find_resource("maps", "dilemma.yaml"))
+    return map_scenario("dilemma")
+
+
+def map_scenario(name: str) -> Scenario:
+    """Return a map with the start and the goal that its file names.
+
+    `name` is a shipped map's, or a path, as of `load_map`. A ValueError if the file
+    names no start or no goal.
+    """
+    map_file = read_map_file(find_map(name))
     if map_file.start is None or map_file.goal is None:
         raise ValueError(
-            "maps/dilemma.yaml names no start and goal; restore the shipped file"
+            f"the map {name} names no start and goal; give Scenario(grid, start, goal)"
         )
     return Scenario(map_file.grid(), map_file.start, map_file.goal)
 

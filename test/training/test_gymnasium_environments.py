@@ -19,7 +19,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from ddqn_planner.grid import Cell
 from ddqn_planner.gymnasium_registration import ENVIRONMENT
-from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
+from ddqn_planner.training import GridVectorEnvironment, Scenario
 from ddqn_planner.training.episodes import EpisodeEnd
 from ddqn_planner.training.gymnasium_environments import (
     BatchedGridEnvironment,
