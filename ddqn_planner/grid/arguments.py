@@ -34,7 +34,9 @@ class _ByHash(EnumMeta):
     """
 
     def __call__(cls, value: Any, *args: Any, **options: Any) -> Any:
-        """Return the member of a value."""
+        """Return the member of a value, which may be the member itself."""
+        if type(value) is cls:
+            return value
         if not isinstance(value, Hashable):
             return cls._missing_(value)  # type: ignore[attr-defined]
         return super().__call__(value, *args, **options)
@@ -120,6 +122,8 @@ def real(value: object) -> float:
 
     So a comparison with a range refuses it, as no range contains NaN.
     """
+    if type(value) is float:  # at once, as most numbers are
+        return value
     if not isinstance(value, Real) or is_flag(value):
         return math.nan
     try:

@@ -520,7 +520,9 @@ class GridMap:
     def is_free(self, cell: Cell) -> bool:
         """Return whether a cell lies inside the map and is not occupied."""
         x, y = arguments.as_cell(cell)
-        return self.contains((x, y)) and not self.occupancy[y, x]
+        height, width = self.occupancy.shape
+        is_inside = 0 <= x < width and 0 <= y < height
+        return is_inside and not self.occupancy[y, x]
 
     def is_obstacle(self, cell: Cell) -> bool:
         """Return whether a cell is an obstacle, and not only too near to one.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping
 from typing import Any, Generic, TypeAlias, TypeVar
 
 import numpy as np
@@ -37,8 +37,8 @@ class Field(Generic[Known]):
     costs: MoveCosts | None = None
     key: Any = None
     """The goals and whatever else a request must have in common to use the field."""
-    map_arrays: Sequence[tuple[int, int]] = ()
-    """Id and bytes of each array of its map and costs, which fields may share."""
+    map_arrays: Mapping[int, int] = {}
+    """Bytes of each array of its map and costs, which fields may share, by its id."""
 
     def __init__(self) -> None:
         self._lock = threading.RLock()
@@ -197,15 +197,12 @@ class FieldCache(Generic[AnyField]):
         With their maps, they may take `max_bytes` of memory, and at most `MOST_KEPT`
         are kept; but `ALWAYS_KEPT` of them are kept in any case.
         """
-        used_bytes = 0  # by the fields up to this one
-        counted_ids = set[int]()  # of the arrays that count in it
+        field_bytes = 0  # of the fields up to this one
+        map_arrays: dict[int, int] = {}  # theirs; fields of one map share its arrays
         for fields_before, field in enumerate(reversed(fields)):
-            used_bytes += OBJECTS + field.nbytes
-            # Fields of one map share its arrays, which count once.
-            for array_id, array_bytes in field.map_arrays:
-                if array_id not in counted_ids:
-                    counted_ids.add(array_id)
-                    used_bytes += array_bytes
+            field_bytes += OBJECTS + field.nbytes
+            map_arrays.update(field.map_arrays)
+            used_bytes = field_bytes + sum(map_arrays.values())
             is_too_much = used_bytes > self.max_bytes or fields_before >= MOST_KEPT
             if is_too_much and fields_before >= ALWAYS_KEPT:
                 return fields_before
@@ -213,10 +210,7 @@ class FieldCache(Generic[AnyField]):
 
 
 def _put_on(field: Field[Any], grid: GridMap) -> None:
-    """Set the map of a field, and list the arrays of the map and of its costs.
-
-    Other fields may share these arrays: the list has the id and the bytes of each.
-    """
+    """Set the map of a field, and its `map_arrays`: those of the map and its costs."""
     field.grid = grid
     maps = [grid]
     exploration = grid.exploration
@@ -227,7 +221,7 @@ def _put_on(field: Field[Any], grid: GridMap) -> None:
         # A copy, as other threads may add to the map what they compute of it.
         values += vars(map_).copy().values()
     arrays = [memory_of(value) for value in values if isinstance(value, np.ndarray)]
-    field.map_arrays = [(id(array), array.nbytes) for array in arrays]
+    field.map_arrays = {id(array): array.nbytes for array in arrays}
 
 
 def memory_of(array: NDArray[Any]) -> NDArray[Any]:

@@ -39,6 +39,12 @@ class PlanMethod(Choice):
     """By greedy steps; where these are trapped, by a search in the Q field's order."""
 
 
+# Fields of a `Plan`, and the type of each.
+CHOICES: tuple[tuple[str, type[Choice]], ...] = (
+    ("status", PlanStatus),
+    ("method", PlanMethod),
+    ("move_rule", MoveRule),
+)
 Pose: TypeAlias = tuple[float, float, float]  # metres, metres, radians; map frame
 Place = TypeVar("Place", Cell, Pose)
 Number = TypeVar("Number", bound=np.generic)
@@ -179,12 +185,7 @@ class Plan:
         path.flags.writeable = False
         object.__setattr__(self, "path", path)
         # A name stands for the member of a `Choice`: "greedy" for PlanMethod.GREEDY.
-        choices: dict[str, type[Choice]] = {
-            "status": PlanStatus,
-            "method": PlanMethod,
-            "move_rule": MoveRule,
-        }
-        for name, choice in choices.items():
+        for name, choice in CHOICES:
             value = getattr(self, name)
             if type(value) is not choice:
                 object.__setattr__(self, name, choice(value))
