@@ -44,8 +44,8 @@ class _Task:
     """The free goals of the request, or those that a path can reach, once known."""
     costs: MoveCosts | None = None
     """The costs of the map's moves, once they are known."""
-    failed_rollout: Plan | None = None
-    """The last rollout; it found no path."""
+    failure: PlanStatus | None = None
+    """Why the greedy steps of the last rollout found no path."""
     escape_path: tuple[Cell, ...] = ()
     """From the start to its first free cell: the start alone if that is free."""
     field: QField | None = None
@@ -177,8 +177,13 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
             plan = yield from attempt(task)
             if plan is not None:
                 return plan
-        assert task.failed_rollout is not None
-        return replace(task.failed_rollout, goal=task.goals[0], field_ms=clock.field_ms)
+        assert task.failure is not None
+        return Plan(
+            task.failure,
+            move_rule=request.move_rule,
+            goal=task.goals[0],
+            field_ms=clock.field_ms,
+        )
 
     def _refusal(self, request: PlanRequest, free_goals: Goals) -> PlanStatus | None:
         """Return why there is no path if start and goals alone tell that, else None.
@@ -202,8 +207,7 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
         """Return the plan by a kept field that is known as far as the start.
 
         Return None if the start is occupied, if there is no such field, or if its
-        greedy steps find no path: then their plan, which has no path, is kept as
-        `task.failed_rollout`.
+        greedy steps find no path: then `task.failure` tells why.
         """
         request = task.request
         if not request.grid.is_free(request.start):
@@ -218,11 +222,11 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
 
         Return None where another attempt has to find the path: if the start or all
         goals are occupied, if the greedy steps of the field find no path (then
-        `task.failed_rollout` is set), or if the network gives no costs of moves. With
-        costs, `task.costs` is set. Without them, fields have one goal: of several goals
-        only the nearest stays in `task.goals`.
+        `task.failure` is set), or if the network gives no costs of moves. With costs,
+        `task.costs` is set. Without them, fields have one goal: of several goals only
+        the nearest stays in `task.goals`.
         """
-        if task.failed_rollout is not None:  # by a kept field, which is as good
+        if task.failure is not None:  # by a kept field, which is as good
             return None
         yield  # a pause: a slow step follows
         request = task.request
@@ -251,7 +255,7 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
         plan says why. Return None if greedy steps from that cell find no path.
         """
         request = task.request
-        if task.failed_rollout is not None and request.reach >= 1:
+        if task.failure is not None and request.reach >= 1:
             yield  # a pause: a slow step follows
         outcome = way_and_ends(request, task.goals)
         if isinstance(outcome, PlanStatus):  # there is no path
@@ -307,21 +311,21 @@ def _roll_out(task: _Task, field: QField) -> Plan | None:
     """Return the plan by greedy steps in a field.
 
     The steps begin at the end of the task's escape path, or at the start without one.
-    If they find no path, but another attempt may find one, set `failed_rollout` of the
-    task and return None.
+    If they find no path, but another attempt may find one, set `failure` of the task
+    and return None.
     """
     request = task.request
     task.clock.end_field()  # the time from here on is that of the rollout
     start = task.escape_path[-1] if task.escape_path else request.start
-    rollout = field.rollout(start, request.simplified)
-    if rollout.path.size:
-        return _finished(task, rollout.path, rollout.method)
+    outcome = field.greedy_path(start, request.simplified)
+    if not isinstance(outcome, PlanStatus):
+        return _finished(task, outcome, PlanMethod.GREEDY)
     # The field has looked at the whole map: no path leads from a free start to these
     # goals. With a tolerance, a path to another goal may do.
-    is_cut_off = rollout.status is PlanStatus.NO_PATH and request.reach < 1
+    is_cut_off = outcome is PlanStatus.NO_PATH and request.reach < 1
     if is_cut_off and not task.escape_path:
-        return replace(rollout, field_ms=task.clock.field_ms)
-    task.failed_rollout = rollout
+        return Plan(outcome, move_rule=request.move_rule, field_ms=task.clock.field_ms)
+    task.failure = outcome
     return None
 
 

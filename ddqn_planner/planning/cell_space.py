@@ -5,7 +5,7 @@
 # passed in, and empty arrays stand for missing ones.
 
 import math
-from functools import partial
+from functools import cache, partial
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -42,6 +42,9 @@ COUNTED: Final = 4  # a mark of open cells while they are counted, beside OPEN
 # is as good as 0 in every sum.
 AT_GOAL: Final = 5e-324
 CAPACITY = 4.0  # cells of a bucket, at first, per cell of a square map's side
+# Fewer buckets than this share the room that so many would have: in few buckets, many
+# cells have the same key, as on an open map without costs.
+FEW_BUCKETS = 64
 BUCKETS: Final = 2  # per unit of cost; with more, fewer needless cells are visited
 SAME: Final = 1 + 1e-12  # paths cost the same up to this factor: sums are rounded
 # Cells that cost as much as the start, up to this factor, are closed too: so a rollout
@@ -73,6 +76,9 @@ class Known(NamedTuple):
     opened: NDArray[np.int32]  # (K,): all cells that are open, and some others
     # Whether closed cells have the least distances: after a repair, some are too great.
     closed_is_final: bool = True
+    # The last start toward which cells were closed since the last repair, until its
+    # distance was the least: so it is known although other closed cells are not.
+    settled_start: int | None = None
 
 
 class StepCosts(NamedTuple):
@@ -290,7 +296,8 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
     # most. The ring needs a bucket for each of these keys, rounded up to a power of 2.
     highest_step = (costs.highest + space.bound.diagonal) * buckets_per_unit
     ring_size = 1 << int(highest_step + 2).bit_length()
-    capacity = 9 + int(CAPACITY * math.sqrt(known.distance.size))  # cells of a bucket
+    cells_per_side = CAPACITY * max(1, FEW_BUCKETS / ring_size)
+    capacity = 9 + int(cells_per_side * math.sqrt(known.distance.size))  # of a bucket
     opened = known.opened
     visits_left = limit + 1
     while True:
@@ -308,7 +315,10 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
             break
         capacity *= 4  # of each bucket
     is_known = progress.reason == DONE or not opened.size
-    grown = Known(known.distance, known.mark, opened, known.closed_is_final)
+    settled_start = start if is_known else known.settled_start
+    grown = Known(
+        known.distance, known.mark, opened, known.closed_is_final, settled_start
+    )
     return grown, is_known
 
 
@@ -326,9 +336,17 @@ def _space_toward(start: int, costs: MoveCosts) -> CellSpace:
         straight=costs.cheapest_straight * multiplier,
         diagonal=costs.cheapest_diagonal * multiplier,
     )
-    # (8,): what each action adds to a cell's number.
-    offset = (MOVE_Y * costs.width + MOVE_X).astype(np.uint64)
-    return CellSpace(step_costs(costs), bound, offset)
+    return CellSpace(step_costs(costs), bound, _offsets(costs.width))
+
+
+@cache
+def _offsets(width: int) -> NDArray[np.uint64]:
+    """Return what each action adds to a cell's number: (8,).
+
+    The padded map has `width` columns.
+    """
+    offsets: NDArray[np.uint64] = (MOVE_Y * width + MOVE_X).astype(np.uint64)
+    return offsets
 
 
 def _queue_of(

@@ -17,6 +17,7 @@ from ddqn_planner.planning import cell_space, wavefront
 from ddqn_planner.planning.cell_space import Known, step_costs
 from ddqn_planner.planning.field_cache import Field, memory_of
 from ddqn_planner.planning.plan import Plan, PlanStatus
+from ddqn_planner.planning.segments import Path
 
 # Different free cells, sorted: a path may end in any of them.
 Goals: TypeAlias = tuple[Cell, ...]
@@ -87,10 +88,11 @@ class QField(Field[Known]):
     def nbytes(self) -> int:
         """Memory in bytes of its arrays, as far as they were computed."""
         state = vars(self)  # to which other threads add what they compute
-        arrays = [
-            state[name] for name in ("q", "legal", "value", "policy") if name in state
-        ]
-        return sum(memory_of(array).nbytes for array in arrays)
+        total = 0
+        for name in ("q", "legal", "value", "policy"):
+            if name in state:
+                total += memory_of(state[name]).nbytes
+        return total
 
     def unmasked(self) -> QField:
         """Return the field without action masking: an illegal move traps a rollout.
@@ -108,11 +110,22 @@ class QField(Field[Known]):
         return True
 
     def rollout(self, start: Cell, straight: bool = False) -> Plan:
-        """Return the plan of greedy steps from a free cell, (x, y), to the goal.
+        """Return the plan of greedy steps from a free cell, (x, y), to a goal.
 
-        It is ROLLOUT_TRAPPED if a step enters a cell again, as the steps would then
-        repeat, or if a cell has no legal step. A start that is no cell of the map is a
-        ValueError. `straight` is not used here, see `DistanceField.rollout`.
+        Its path, or its status without one, is that of `greedy_path`.
+        """
+        outcome = self.greedy_path(start, straight)
+        if isinstance(outcome, PlanStatus):
+            return Plan(outcome, move_rule=self.move_rule)
+        return Plan(PlanStatus.SUCCEEDED, outcome, move_rule=self.move_rule)
+
+    def greedy_path(self, start: Cell, straight: bool = False) -> Path | PlanStatus:
+        """Return the cells (N, 2) of greedy steps from a free cell (x, y) to the goal.
+
+        Without a path, return why: ROLLOUT_TRAPPED if a step enters a cell again, as
+        the steps would then repeat, or if a cell has no legal step. A start that is no
+        cell of the map is a ValueError. `straight` is not used here, see
+        `DistanceField.greedy_path`.
         """
         policy = self.policy  # (H, W): an action, or -1
         cell = cell_inside(start, policy.shape, "the start")
@@ -124,10 +137,10 @@ class QField(Field[Known]):
             dx, dy = MOVES[action].tolist()
             cell = (x + dx, y + dy)
             if action < 0 or cell in visited:
-                return Plan(PlanStatus.ROLLOUT_TRAPPED, move_rule=self.move_rule)
+                return PlanStatus.ROLLOUT_TRAPPED
             visited.add(cell)
             cells.append(cell)
-        return Plan(PlanStatus.SUCCEEDED, np.array(cells), move_rule=self.move_rule)
+        return np.array(cells, np.int32)
 
 
 class DistanceField(QField):
@@ -199,13 +212,13 @@ class DistanceField(QField):
         known = self._known  # None while another thread computes it
         return known is not None and _is_final(known, self._number(*start))
 
-    def rollout(self, start: Cell, straight: bool = False) -> Plan:
-        """Return the plan of greedy steps from a start, (x, y), to a goal.
+    def greedy_path(self, start: Cell, straight: bool = False) -> Path | PlanStatus:
+        """Return the cells (N, 2) of greedy steps from a start, (x, y), to a goal.
 
-        The field grows as far as the start. The plan is NO_PATH only if no path leads
-        to a goal. Of steps on paths of the same cost, a rollout takes those that stay
-        nearest to the straight line from the start to the goal if `straight`, else the
-        first one in the order of actions.
+        The field grows as far as the start. The result is NO_PATH only if no path leads
+        to a goal. Of steps on paths of the same cost, those are taken that stay nearest
+        to the straight line from the start to the goal if `straight`, else the first
+        one in the order of actions.
         """
         start = cell_inside(start, self.grid.occupancy.shape, "the start")
         number = self._number(*start)
@@ -215,7 +228,7 @@ class DistanceField(QField):
             self.grow(start)
             known = self.known
             if known.mark[number] != wavefront.CLOSED:
-                return Plan(PlanStatus.NO_PATH, move_rule=self.move_rule)
+                return PlanStatus.NO_PATH
             # No move costs less than 1, but sums of costs are rounded.
             most_cells = 2 + int(1.01 * known.distance[number])
             path = np.empty((min(most_cells, known.distance.size), 2), np.int32)
@@ -227,7 +240,7 @@ class DistanceField(QField):
                 toward_y,
                 step_costs(self.costs),
             )
-        return Plan(PlanStatus.SUCCEEDED, path[:length], move_rule=self.move_rule)
+        return path[:length]
 
     def take_over(
         self,
@@ -351,9 +364,10 @@ def _is_final(known: Known, number: int) -> bool:
     `number` is the cell's on the padded map. A cell without a path counts, too, once
     the field has grown over all of the map.
     """
-    is_closed = known.mark[number] == wavefront.CLOSED
+    if known.closed_is_final and known.mark[number] == wavefront.CLOSED:
+        return True
     is_whole = known.opened.size == 0
-    return bool(is_whole or (known.closed_is_final and is_closed))
+    return is_whole or number == known.settled_start
 
 
 def network_field(

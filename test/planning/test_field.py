@@ -342,6 +342,24 @@ def test_a_changed_map_uses_what_is_known_of_the_one_before() -> None:
     assert older.rollout(start).cells == before.cells  # and begins anew
 
 
+def test_after_a_repair_the_start_of_a_plan_is_known_until_the_next() -> None:
+    grid, planner = GridMap(np.zeros((60, 60))), new_planner()
+    start, goal = (0, 30), (59, 30)
+    planner.plan(grid, start, goal)
+    changed = grid.with_patch([[True]], 30, 30)
+    assert planner.plan(changed, start, goal).cells
+    older = planner.q_field(changed, goal)
+    assert isinstance(older, DistanceField)
+    assert not older.known.closed_is_final
+    assert older.is_known(start)
+    assert not older.is_known((30, 0))
+    again = changed.with_patch([[True]], 29, 30)
+    field = fresh_field(again, goal, MoveRule.ROBOT_SAFE)
+    assert field.take_over(older, map_changes.changed_cells(changed, again), start)
+    assert not field.known.closed_is_final
+    assert not field.is_known(start)
+
+
 @given(GRIDS, RULES)
 def test_no_move_costs_more_than_the_highest_or_less_than_the_least(
     place: Place, rule: MoveRule
