@@ -631,12 +631,13 @@ class History(NamedTuple):
         """
         if self.lineage is not older.lineage:
             return None
-        identities = [version.identity for version in self.versions]
         older_identity = older.versions[-1].identity
-        if older_identity not in identities:
-            return None
-        newer_versions = self.versions[identities.index(older_identity) + 1 :]
-        return [version.box for version in newer_versions]
+        newer_boxes: list[Box] = []  # the last one first: most maps have few
+        for version in reversed(self.versions):
+            if version.identity is older_identity:
+                return newer_boxes[::-1]
+            newer_boxes.append(version.box)
+        return None
 
 
 class Exploration(NamedTuple):
