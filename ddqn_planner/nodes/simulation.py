@@ -12,10 +12,17 @@ from typing import TYPE_CHECKING, Any, Final
 
 from geometry_msgs.msg import PoseStamped
 from std_msgs.msg import Float32, Header
+from visualization_msgs.msg import MarkerArray
 
 from ddqn_planner.grid import Cell, GridMap, MapFile, MoveRule
 from ddqn_planner.nodes.conversions import cell_from_pose, centres, check_pose
 from ddqn_planner.nodes.declared import Declared
+from ddqn_planner.nodes.followed_training import (
+    SHOWN_EPISODES,
+    Pacer,
+    episode_markers,
+    steps_between_pauses,
+)
 from ddqn_planner.nodes.learning_node import (
     NO_MAP,
     Answer,
@@ -24,7 +31,7 @@ from ddqn_planner.nodes.learning_node import (
     Recording,
 )
 from ddqn_planner.nodes.poses import listen
-from ddqn_planner.training.episodes import read_cells
+from ddqn_planner.training.episodes import Episode, read_cells
 from ddqn_planner.training.hyper_parameters import HyperParameters
 
 if TYPE_CHECKING:
@@ -70,6 +77,9 @@ class Simulation:
         self._map_of_run: MapInFrame | None = None
         self._first_step = 0  # the step with which that training began
         self._rewards = node.create_publisher(Float32, "~/average_reward", 100)
+        self._markers = node.create_publisher(
+            MarkerArray, "~/episode_markers", SHOWN_EPISODES
+        )
         for name, topic in (("start", "initialpose"), ("goal", "goal_pose")):
             listen(node, topic, 10, node.diagnostics, partial(self._on_pose, name))
         # The worker imports, so that the node answers meanwhile; ~/start waits for it.
@@ -185,17 +195,14 @@ class Simulation:
         published; the node's state tells how the training ended.
         """
         node = self._node
-        # Episodes are drawn in the executor's thread, in which replays begin: no
-        # episode comes between the steps of a replay.
-        executor = node.executor
-        assert executor is not None
+        pacer = Pacer(run.trainer.steps)
         try:
-            for progress in run.steps():
+            for progress in run.steps(steps_between_pauses(node.value("pace"))):
                 for episode in progress.episodes:
-                    self._rewards.publish(Float32(data=episode.average_reward))
-                    if episode.number % node.value("episode_interval") == 0:
-                        positions = centres(episode.cells, map_in_frame.grid)
-                        executor.create_task(node.draw, map_in_frame.frame, positions)
+                    self._publish(episode, map_in_frame)
+                pacer.wait(
+                    progress.step, node.value("pace"), lambda: bool(run.requests)
+                )
             end = "stopped" if "stop" in run.requests else "finished"
         except Exception as error:  # the node must survive any error
             end = "failed"
@@ -206,6 +213,27 @@ class Simulation:
             run.close()
         node.state = end
         node.get_logger().info(f"the training {end}")
+
+    def _publish(self, episode: Episode, map_in_frame: MapInFrame) -> None:
+        """Publish the reward of an episode, and each n-th episode to be shown.
+
+        The worker's thread calls this for an episode on the map `map_in_frame`.
+        """
+        node = self._node
+        self._rewards.publish(Float32(data=episode.average_reward))
+        if episode.number % node.value("episode_interval") != 0:
+            return
+        grid = map_in_frame.grid
+        positions = centres(episode.cells, grid)
+        if self._markers.get_subscription_count():
+            header = node.header(map_in_frame.frame)
+            markers = episode_markers(episode, positions, grid.resolution, header)
+            self._markers.publish(markers)
+        # Episodes are drawn in the executor's thread, in which replays begin: no
+        # episode comes between the steps of a replay.
+        executor = node.executor
+        assert executor is not None
+        executor.create_task(node.draw, map_in_frame.frame, positions)
 
     def _tell_saved(self, run: TrainingRun) -> None:
         """Publish the model and where it was saved, or why that failed.
