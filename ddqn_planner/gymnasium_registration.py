@@ -4,38 +4,67 @@ Gymnasium 1 asks no installed package for its environments: a program that uses 
 imports the package. It may do so before or after it imports Gymnasium.
 """
 
+from __future__ import annotations
+
 import sys
+from collections.abc import Sequence
 from importlib.machinery import ModuleSpec
-from importlib.util import find_spec
 from types import ModuleType
-from typing import Final
+from typing import TYPE_CHECKING, Final, cast
+
+if TYPE_CHECKING:  # it loads a dozen other modules
+    from importlib.abc import Loader
 
 GYMNASIUM: Final = "gymnasium"
 ENVIRONMENT: Final = "ddqn_planner/Grid-v0"
 _MODULE: Final = "ddqn_planner.training.gymnasium_environments"
 
 
+class _RegisteringLoader:
+    """Loads Gymnasium as its own loader does, and registers the environment."""
+
+    def __init__(self, loader: Loader, finder: _GymnasiumFinder) -> None:
+        """Make a loader in place of `loader`; `finder` has then done its work."""
+        self._loader = loader
+        self._finder = finder
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType | None:
+        """Return what Gymnasium's own loader creates."""
+        return self._loader.create_module(spec)
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Run Gymnasium, and then register the environment."""
+        # Whoever asks later for the module's loader gets its own.
+        module.__loader__ = self._loader
+        if module.__spec__ is not None:
+            module.__spec__.loader = self._loader
+        self._loader.exec_module(module)
+        if self._finder in sys.meta_path:
+            sys.meta_path.remove(self._finder)
+            _register()
+
+
 class _GymnasiumFinder:
     """A finder of the import system: the environment follows when Gymnasium loads."""
 
     def find_spec(
-        self, name: str, path: object = None, target: object = None
+        self,
+        fullname: str,
+        path: Sequence[str] | None,
+        target: ModuleType | None = None,
     ) -> ModuleSpec | None:
-        """Return how to load Gymnasium; None for any other module."""
-        if name != GYMNASIUM:
+        """Return how to load Gymnasium, by another finder; None for other modules."""
+        if fullname != GYMNASIUM:
             return None
-        sys.meta_path.remove(self)
-        spec = find_spec(name)  # of the other finders
-        if spec is None or spec.loader is None:
-            return spec
-        load = spec.loader.exec_module
-
-        def load_and_register(module: ModuleType) -> None:
-            load(module)
-            _register()
-
-        spec.loader.exec_module = load_and_register  # type: ignore[method-assign]
-        return spec
+        for finder in sys.meta_path:
+            if finder is self:
+                continue
+            spec = finder.find_spec(fullname, path, target)
+            if spec is not None and spec.loader is not None:
+                spec.loader = cast("Loader", _RegisteringLoader(spec.loader, self))
+            if spec is not None:
+                return spec
+        return None
 
 
 def _register() -> None:

@@ -103,8 +103,14 @@ def test_gymnasium_accepts_the_environment(render_mode: str | None) -> None:
 def test_the_environment_has_a_name_and_costs_nothing(imports: str, name: str) -> None:
     code = f"""
 import sys, warnings
+from importlib import util
 warnings.simplefilter("error")
+import {imports.partition(",")[0]}
+# To ask whether there is a Gymnasium does not load it.
+assert util.find_spec("gymnasium").name == "gymnasium"
 import {imports}
+assert gymnasium.__loader__ is gymnasium.__spec__.loader
+assert "ddqn_planner" not in type(gymnasium.__loader__).__module__
 from gymnasium.envs.registration import _find_spec
 assert _find_spec({name!r}).id == {ENVIRONMENT!r}
 assert not {{"torch", "numba", "ddqn_planner.training"}} & sys.modules.keys()
