@@ -110,6 +110,7 @@ setup(
             "ros-kilted-test-msgs>=2.3,<3",
         ],
         "figures": ["matplotlib>=3.6"],
+        "tensorboard": ["tensorboard>=2.10"],
         "experiments": ["joblib>=1.3", "matplotlib>=3.6"],
         "bags": ["mcap-ros2-support>=0.5"],
         "docs": ["furo", "myst-parser>=3.0", "sphinx>=7.3"],

@@ -2,9 +2,15 @@
 
 from argparse import ArgumentParser
 from collections.abc import Sequence
+from functools import partial
 
 from ddqn_planner.commands.options import Option, add_options
-from ddqn_planner.commands.training_options import add_training_options, run_training
+from ddqn_planner.commands.training_options import (
+    add_training_options,
+    opened_training,
+    reward_figures,
+    train_with_bar,
+)
 from ddqn_planner.training.any_map import ANY_MAP, MAPS, random_scenarios
 
 
@@ -15,5 +21,12 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
     options = parser.parse_args(arguments)
     if options.maps < 1:
         raise ValueError(f"--maps is {options.maps}; give at least 1")
-    run_training(options, lambda: random_scenarios(options.seed, options.maps))
+    scenarios = partial(random_scenarios, options.seed, options.maps)
+    with opened_training(options, scenarios) as run:
+        print(run.description)
+        train_with_bar(run, reward_figures)
+    trainer = run.trainer
+    if run.requests:
+        print(f"stopped at step {trainer.steps}; run the same command to resume")
+    print(f"{trainer.steps} steps, {trainer.episodes} episodes, saved {run.model_path}")
     return 0

@@ -2,7 +2,8 @@
 
 import signal
 from argparse import ArgumentParser, Namespace
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,8 +11,9 @@ from typing import TYPE_CHECKING
 from ddqn_planner.commands.options import Option, add_options
 from ddqn_planner.files import check_writable
 from ddqn_planner.grid.arguments import as_seed
-from ddqn_planner.training.environment import Scenario
+from ddqn_planner.training.episodes import Progress
 from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.scenario import Scenario
 
 if TYPE_CHECKING:
     from ddqn_planner.training.run import TrainingRun
@@ -36,49 +38,72 @@ def add_training_options(
         add_options(parser, Option(name, kind, default, field.metadata["source"]))
 
 
-def run_training(
+@contextmanager
+def opened_training(
     options: Namespace, make_scenarios: Callable[[], Sequence[Scenario]]
-) -> "TrainingRun":
-    """Train into the folder ``--out`` until step ``--steps`` or a signal to stop.
+) -> Iterator["TrainingRun"]:
+    """Open the run in the folder ``--out``, for a block that trains.
 
-    `make_scenarios` returns the scenarios to train on. It is called after the options
-    were checked, as it may take seconds. Returns the run, which is closed.
+    Within the block, SIGINT and SIGTERM request the run to stop. After it, an error
+    tells if the last save failed.
+
+    Parameters
+    ----------
+    options
+        Those of `add_training_options`.
+    make_scenarios
+        Returns the scenarios to train on. It is called after the options were checked,
+        as it may take seconds.
     """
     as_seed(options.seed)
     check_writable(options.out / "model.safetensors", "--out")
     # Not for the help, and not for options that are refused.
     import torch
-    from tqdm import tqdm
 
     from ddqn_planner.training.run import TrainingRun
 
     # As fast as two for such small networks, and always the same result.
     torch.set_num_threads(1)
-    values = {
-        field.name: getattr(options, field.name) for field in fields(HyperParameters)
-    }
-    parameters = HyperParameters(**values)
+    parameters = hyper_parameters_of(options)
     with TrainingRun(options.out, make_scenarios(), parameters, options.seed) as run:
-        trainer = run.trainer
-        print(run.description)
         # Python's own handler would raise an exception within a step. The run looks at
         # its requests between two steps.
         for number in (signal.SIGINT, signal.SIGTERM):
             earlier_handler = signal.signal(number, lambda *_: run.requests.add("stop"))
             run.callback(signal.signal, number, earlier_handler)
-        # disable=None: no bar if the output is not a terminal.
-        with tqdm(total=parameters.steps, initial=trainer.steps, disable=None) as bar:
-            for progress in run.steps():
-                bar.update(progress.step - bar.n)
-                for episode in progress.episodes:
-                    figures = {
-                        "episode": episode.number,
-                        "average reward": episode.average_reward,
-                    }
-                    bar.set_postfix(figures, refresh=False)
-        if run.requests:
-            print(f"stopped at step {trainer.steps}; run the same command to resume")
+        yield run
     if run.save_error:
         raise OSError(run.save_error)
-    print(f"{trainer.steps} steps, {trainer.episodes} episodes, saved {run.model_path}")
-    return run
+
+
+def hyper_parameters_of(options: Namespace) -> HyperParameters:
+    """Return the hyper-parameters among the options; a ValueError if they are wrong."""
+    values = {
+        field.name: getattr(options, field.name) for field in fields(HyperParameters)
+    }
+    return HyperParameters(**values)
+
+
+def train_with_bar(
+    run: "TrainingRun", figures_of: Callable[[Progress], Mapping[str, object]]
+) -> None:
+    """Train to the last step or until a signal to stop; show a bar on a terminal.
+
+    `figures_of` is called with each progress. It returns what stands beside the bar.
+    """
+    from tqdm import tqdm
+
+    total = run.trainer.parameters.steps
+    # disable=None: no bar if the output is not a terminal.
+    with tqdm(total=total, initial=run.trainer.steps, disable=None) as bar:
+        for progress in run.steps():
+            bar.update(progress.step - bar.n)
+            bar.set_postfix(figures_of(progress), refresh=False)
+
+
+def reward_figures(progress: Progress) -> dict[str, object]:
+    """Return the number and the average reward of the last episode, if one ended."""
+    if not progress.episodes:
+        return {}
+    episode = progress.episodes[-1]
+    return {"episode": episode.number, "average reward": episode.average_reward}

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from ddqn_planner.training.run import TrainingRun
     from ddqn_planner.training.scenario import Scenario, map_scenario, paper_scenario
     from ddqn_planner.training.trainer import Trainer
+    from ddqn_planner.training.training_estimate import Estimate, estimate
     from ddqn_planner.training.training_record import (
         CurvePoint,
         Snapshot,
@@ -32,6 +33,7 @@ __all__ = [
     "CurvePoint",
     "Episode",
     "EpisodeEnd",
+    "Estimate",
     "Evaluation",
     "GridEnvironment",
     "GridVectorEnvironment",
@@ -42,6 +44,7 @@ __all__ = [
     "Trainer",
     "TrainingRecord",
     "TrainingRun",
+    "estimate",
     "evaluate",
     "length_ratios",
     "map_scenario",
@@ -57,6 +60,7 @@ _MODULES = {
     "CurvePoint": "training_record",
     "Episode": "episodes",
     "EpisodeEnd": "episodes",
+    "Estimate": "training_estimate",
     "Evaluation": "evaluation",
     "GridEnvironment": "gymnasium_environments",
     "GridVectorEnvironment": "environment",
@@ -67,6 +71,7 @@ _MODULES = {
     "Trainer": "trainer",
     "TrainingRecord": "training_record",
     "TrainingRun": "run",
+    "estimate": "training_estimate",
     "evaluate": "evaluation",
     "length_ratios": "evaluation",
     "map_scenario": "scenario",

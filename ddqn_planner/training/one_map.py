@@ -1,6 +1,7 @@
 """The training on one map, in one call."""
 
 import difflib
+import warnings
 from dataclasses import fields
 from typing import Any
 
@@ -8,6 +9,7 @@ from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.planning import Planner
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.scenario import Scenario
+from ddqn_planner.training.training_estimate import estimate
 
 
 def train(
@@ -22,7 +24,8 @@ def train(
     """Train the paper's network on a map, and return a planner with this network.
 
     It learns to reach this goal on this map; `Planner.save` saves it. The same
-    arguments give the same network.
+    arguments give the same network. A UserWarning tells that a map is too large for the
+    paper's network, see `estimate`.
 
     Parameters
     ----------
@@ -58,6 +61,9 @@ def train(
     _check_names(hyper_parameters)
     scenario = Scenario(grid, start, goal, MoveRule(move_rule))
     parameters = HyperParameters(**hyper_parameters)
+    warning = estimate([scenario], parameters).warning
+    if warning:
+        warnings.warn(warning, stacklevel=2)
     from ddqn_planner.training import Trainer  # needs torch
 
     trainer = Trainer([scenario], parameters, seed)
