@@ -129,7 +129,7 @@ def test_a_trained_model_plans(console: Any, small_map: str, tmp_path: Path) -> 
         "train --network propagation --steps 1000 --learning-rate 0.003 "
         "--target-interval 50"
     )
-    assert "of 16 starts" in console(train, small_map, "--out", tmp_path / "run").out
+    assert " of 16\n" in console(train, small_map, "--out", tmp_path / "run").out
     model = tmp_path / "run" / "model.safetensors"
     assert "length" in console("plan", small_map, "--model", model).out
 

@@ -2,6 +2,7 @@ import json
 import os
 import re
 import signal
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -112,8 +113,8 @@ def test_tensorboard_gets_the_curve(
     folder = tmp_path / "events"
     words = f"{TRAIN} --steps 60 {small_map} --tensorboard {folder} --out"
     try:
-        from tensorboard.backend.event_processing.event_accumulator import (
-            EventAccumulator,
+        reader: Any = import_module(
+            "tensorboard.backend.event_processing.event_accumulator"
         )
     except ImportError:
         refused = console(words, tmp_path / "run", status=2).err
@@ -121,7 +122,7 @@ def test_tensorboard_gets_the_curve(
         assert not (tmp_path / "run").exists()
         return
     console(words, tmp_path / "run")
-    events: Any = EventAccumulator(str(folder))
+    events = reader.EventAccumulator(str(folder))
     events.Reload()
     shares = events.Scalars("starts/solved_share")
     assert shares[0].step == 0
