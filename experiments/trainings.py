@@ -41,10 +41,8 @@ BACKENDS: Final = (
     "dask",
     "sequential",
 )  # of joblib: this machine, or a cluster
-HIDDEN_UNITS: Final = (
-    0,
-    128,
-)  # of the paper's network for goal iii; 0 for no hidden layer
+# Of the paper's network for goal iii; 0 for no hidden layer, as we read its text.
+HIDDEN_UNITS: Final = (0,)
 # How far from the path new obstacles lie, in cells, by two readings of section 5.3: the
 # "free positions that make up the optimal path", or their eight neighbours too.
 NOISE: Final = {"on_path": 0, "near_path": 1}

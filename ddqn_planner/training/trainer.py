@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 import safetensors.numpy
@@ -81,6 +81,8 @@ class Trainer:
     The same arguments give the same network, bit for bit.
     """
 
+    environment_class: ClassVar[type[GridVectorEnvironment]] = GridVectorEnvironment
+
     def __init__(
         self,
         scenarios: Sequence[Scenario],
@@ -114,7 +116,7 @@ class Trainer:
         # They draw initial cells, actions, and batches.
         self._generators = [np.random.default_rng(seed) for seed in generator_seeds]
         initial, self._exploration, self._sampling = self._generators
-        self.environment = GridVectorEnvironment(self.scenarios, parameters, initial)
+        self.environment = self.environment_class(self.scenarios, parameters, initial)
         self.network = self._initial_network(int(weight_seed.generate_state(1)[0]))
         tensors = self.network.tensors
         self.learned = Learned(

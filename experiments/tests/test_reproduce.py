@@ -11,15 +11,17 @@ import any_map
 import numpy as np
 import pytest
 import trainings
+from blind_robot import BlindTrainer
 from goal_1 import convergence_row
 from goal_2 import STARTS, trained_field
-from goal_3 import best_moves, fixed_path, noisy_maps, train_supervised
+from goal_3 import PAPER, fixed_path, noisy_maps
+from goal_3 import trainings as trainings_of_goal_3
 from networks import random_network
 from PIL import Image
 from reproduce import EXPERIMENTS, main
 from tables import mean_and_worst, median_and_range
 
-from ddqn_planner.grid import MOVES, path_length, shortest_distances, shortest_path
+from ddqn_planner.grid import MOVES, path_length, shortest_path
 from ddqn_planner.model import ModelMetadata, load_model
 from ddqn_planner.planning import Planner
 from ddqn_planner.training.environment import GridVectorEnvironment, Scenario
@@ -66,6 +68,7 @@ def test_every_experiment_writes_its_report_and_trains_what_is_new(
             assert min(image.size) > 300
             assert len(image.convert("RGB").getcolors(image.width * image.height)) > 20
     assert "| on_path | paper, 3 hidden units |" in report
+    assert "| on_path | paper, 3 hidden units, blind |" in report
     assert "near_path" not in report
     before, _, results = page.read_text().partition(
         "<!-- Goal ii: from every free cell -->\n"
@@ -77,7 +80,7 @@ def test_every_experiment_writes_its_report_and_trains_what_is_new(
     trained = {
         path: path.stat().st_mtime_ns for path in tmp_path.rglob("evaluations.csv")
     }
-    assert len(trained) == 8 + 2 + 2
+    assert len(trained) == 8 + 2 + 3
     # Only the second seed of both profiles is new.
     assert main([*command, "--experiment", "goal-2", "--seeds", "2"]) == 0
     assert trained == {path: path.stat().st_mtime_ns for path in trained}
@@ -177,26 +180,30 @@ def test_the_optimal_value_is_what_the_best_policy_earns(
             assert value[y * 5 + x] == pytest.approx(max(returns), abs=0.02)
 
 
-def test_a_supervised_network_learns_the_best_moves(
-    small: Scenario, tmp_path: Path
-) -> None:
-    best = best_moves(small).reshape(4, 5, 8)
-    distance = shortest_distances(small.grid, small.goal, trainings.MOVE_RULE)
-    assert not best[small.grid.occupancy].any()
-    assert not best[small.goal[::-1]].any()
-    for y, x, action in np.argwhere(best):
-        dx, dy = MOVES[action]
-        assert distance[y, x] - distance[y + dy, x + dx] == pytest.approx(
-            np.hypot(dx, dy)
-        )
-    training = trainings.Training(tmp_path, replace(QUICK, steps=300), (small,), 0, 300)
-    train_supervised(training)
-    planner = Planner.load(tmp_path / "model.safetensors")
-    plan = planner.plan(small.grid, small.start, small.goal)
-    assert plan.length == pytest.approx(distance[small.start[::-1]])
-    (tmp_path / "model.safetensors").write_text("kept")
-    train_supervised(training)
-    assert (tmp_path / "model.safetensors").read_text() == "kept"
+def test_the_blind_robot_observes_the_papers_map_and_acts_on_its_own() -> None:
+    noisy, _ = noisy_maps(3, 0, "near_path")
+    trainer = BlindTrainer(noisy, PAPER, seed=0)
+    sighted = Trainer([trainings.SCENARIO, *noisy], PAPER, seed=0).environment
+    maps = np.arange(3)
+    cell = trainer.environment.start
+    observed = trainer.environment.observe(maps, cell)
+    np.testing.assert_array_equal(observed, sighted.observe(0 * maps, cell))
+    assert (observed != sighted.observe(1 + maps, cell)).any(axis=(1, 2)).all()
+    np.testing.assert_array_equal(trainer.environment.rewards, sighted.rewards[1:])
+
+
+def test_the_profile_of_goal_iii_reaches_the_trainer(tmp_path: Path) -> None:
+    jobs = trainings_of_goal_3(trainings.Settings(tmp_path, 1, noise=("near_path",)))
+    blind = {
+        job.trainer_class is BlindTrainer: job.parameters
+        for job in jobs
+        if job.parameters.network == "paper"
+    }
+    assert blind[True] == blind[False] == PAPER
+    trainer = Trainer([trainings.SCENARIO], PAPER, seed=0)
+    settings = trainer.environment.parameters
+    assert settings.priority * settings.weight_decay > 0
+    assert trainer.planner().network.tensors.keys() == trainer.average.keys()
 
 
 def evaluations(length: list[float]) -> np.ndarray:
