@@ -81,6 +81,7 @@ class Trainer:
     The same arguments give the same network, bit for bit.
     """
 
+    # What moves the robots, and shows them their maps.
     environment_class: ClassVar[type[GridVectorEnvironment]] = GridVectorEnvironment
 
     def __init__(
