@@ -111,6 +111,24 @@ def user(shared_user: Trainee, tmp_path: FilePath) -> Iterator[Trainee]:
     shared_user.stop()
 
 
+def test_a_paced_training_can_be_followed_and_stopped(
+    user: Trainee, tmp_path: FilePath
+) -> None:
+    markers = user.client.subscribe(MarkerArray, "trainer/episode_markers", 20)
+    user.configure(
+        tmp_path / "run", steps=10**9, filters=4, pace=100.0, episode_interval=1
+    )
+    user.call("start")
+    begin = time.monotonic()
+    marker = markers.wait().markers[0]
+    assert (marker.ns, marker.type) == ("episodes", Marker.LINE_STRIP)
+    assert len(marker.points) > 1
+    wait_for("200 steps", lambda: int(user.state()["steps"].split()[0]) >= 200)
+    assert time.monotonic() - begin > 1.9  # without a pace, 200 steps take milliseconds
+    user.configure(tmp_path / "run", pace=0.001)
+    user.stop()  # at once, although the next step is due in a quarter of an hour
+
+
 def test_a_training_is_seen_saved_resumed_and_replayed(
     user: Trainee, tmp_path: FilePath
 ) -> None:
@@ -386,21 +404,3 @@ def test_a_signal_saves_a_checkpoint_that_a_new_process_continues(
         folder.symlink_to("nowhere/else")  # nobody can write there, not even root
         assert node.stop(signal.SIGTERM) == 0
     assert node.log.count("cannot save") == 1
-
-
-def test_a_paced_training_can_be_followed_and_stopped(
-    user: Trainee, tmp_path: FilePath
-) -> None:
-    markers = user.client.subscribe(MarkerArray, "trainer/episode_markers", 20)
-    user.configure(
-        tmp_path / "run", steps=10**9, filters=4, pace=100.0, episode_interval=1
-    )
-    user.call("start")
-    begin = time.monotonic()
-    marker = markers.wait().markers[0]
-    assert (marker.ns, marker.type) == ("episodes", Marker.LINE_STRIP)
-    assert len(marker.points) > 1
-    wait_for("200 steps", lambda: int(user.state()["steps"].split()[0]) >= 200)
-    assert time.monotonic() - begin > 1.9  # without a pace, 200 steps take milliseconds
-    user.configure(tmp_path / "run", pace=0.001)
-    user.stop()  # at once, although the next step is due in a quarter of an hour
