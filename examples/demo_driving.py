@@ -22,12 +22,13 @@ from ddqn_planner.experience.drives import ARRIVAL_DISTANCE
 from ddqn_planner.grid import Cell
 from ddqn_planner.nodes.driving import SLOWEST
 from ddqn_planner.nodes.quality import LATCHED
+from ddqn_planner.pictures import save_film
 from ddqn_planner.planning import Planner
 
 sys.path.insert(0, str(FilePath(__file__).resolve().parents[1] / "experiments"))
 from client import Client, Recorder, cells_of, pose, wait_for
 from driving_worlds import RULE, Float64, Routes, World, generated_world, path_seconds
-from figures import ROUTE_STYLES, draw_slowness, draw_times, frame_of, save_film
+from figures import ROUTE_STYLES, draw_slowness, draw_times, frame_of
 from map_files import save_map
 from processes import claim_ros_domain, run_script, running, running_node
 from simulated_robot import SEED, WORLD

@@ -49,12 +49,6 @@ def frame_of(figure: Any) -> Image.Image:
     return image
 
 
-def save_film(path: str, frames: Sequence[Image.Image], milliseconds: int) -> None:
-    """Save a GIF that shows each frame for so long, and repeats."""
-    first, *others = (frame.quantize(64) for frame in frames)
-    first.save(path, save_all=True, append_images=others, duration=milliseconds, loop=0)
-
-
 def draw_curves(
     axes: Any, x: Array, curves: Mapping[str, Sequence[Array]], xlabel: str, ylabel: str
 ) -> None:

@@ -188,8 +188,7 @@ IMPORT_EXAMPLE = """
 import sys
 sys.path.insert(0, sys.argv[1])
 import demo_training
-import figures
-print(figures.__file__)
+print(demo_training.__file__)
 """
 
 
@@ -239,8 +238,8 @@ def test_maps_and_models_come_everywhere(
     assert (share / "examples" / "demo_training.py").is_file()
     assert (share / "experiments" / "figures.py").is_file()
     if option is None:
-        helper = run("-c", IMPORT_EXAMPLE, share / "examples")
-        assert Path(helper.strip()).parent == share / "experiments"
+        example = run("-c", IMPORT_EXAMPLE, share / "examples")
+        assert Path(example.strip()).parent == share / "examples"
     for name in ("maps", "models"):
         shipped = {path.name: path.read_bytes() for path in (ROOT / name).iterdir()}
         copy = package.parent / name
