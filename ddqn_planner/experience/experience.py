@@ -388,7 +388,7 @@ class Experience:
         """
         slowness = posterior.paint(name, optimism, fastest)
         seconds = grid.resolution / self.nominal_speed * math.exp(fastest)
-        return grid.with_layers(slowness=slowness, seconds_per_cell=seconds)
+        return grid.with_times(slowness, seconds)
 
     def slowness(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: seconds, with waits, over those at nominal speed."""

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import math
+import reprlib
 import sys
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import NamedTuple, TypeVar, cast
+from pathlib import Path
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -47,7 +49,7 @@ MAX_YAW = 1e6  # radians, of an origin
 MAX_PATCHES = 512  # the last patches of a map that are remembered
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False, repr=False)
 class GridMap:
     """A map of free and occupied cells, which keeps read-only copies of the arrays.
 
@@ -65,9 +67,9 @@ class GridMap:
         ``nav_msgs/MapMetaData``: x and y in metres, at most 2^40 cells, and yaw in
         radians, counter-clockwise.
     cost : (H, W) array of whole numbers, optional
-        Cost of each free cell: 0..99, or -1 for an unknown cell; see `cost_multiplier`.
-        Values of occupied cells are ignored and become 0. By default all free cells
-        cost the same.
+        Cost of each free cell: 0..99, or -1 for an unknown cell. It stands for a
+        factor: 1 + 0.04 * cost, and 5 for -1. Values of occupied cells are ignored and
+        become 0. By default all free cells cost the same.
     obstacles : (H, W) bool, optional
         Which occupied cells are obstacles, by default all. The others are only too near
         to an obstacle for the robot's body, and a robot that starts there may leave;
@@ -80,7 +82,7 @@ class GridMap:
         toward greater x only. Patches keep directions.
     slowness : (H, W) float32, optional
         The expected time in each cell over that at nominal speed, 1 to 100; it
-        multiplies the cost.
+        multiplies the cost. `Experience.apply` sets it.
     seconds_per_cell : float, optional
         The time for the length of a cell at nominal speed: with it, `Plan.cost` is in
         seconds.
@@ -90,6 +92,22 @@ class GridMap:
         so.
     body_radius : float
         Metres: cells nearer than this to an obstacle are occupied, too; see `inflate`.
+    cost_multiplier : (H, W) array of numbers, optional
+        Costs of free cells as factors, 1 to 100: a path through a cell of 2.5 costs 2.5
+        times its length. They multiply the other costs, and all factors of a cell give
+        100 at most, its `cost` apart. Values of occupied cells are ignored. The map's
+        attribute `cost_multiplier` has the product of all costs.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ddqn_planner import GridMap
+    >>> occupancy = np.zeros((20, 30), bool)
+    >>> occupancy[5:15, 10] = True
+    >>> mud = np.ones((20, 30))
+    >>> mud[:5] = 2.5  # a path through mud costs 2.5 times its length
+    >>> GridMap(occupancy, resolution=0.05, cost_multiplier=mud)
+    GridMap(30 x 20 cells of 0.05 m, origin (0, 0, 0), 590 free, with slowness)
     """
 
     occupancy: Occupancy
@@ -103,37 +121,93 @@ class GridMap:
     unknown: Occupancy | None = None
     body_radius: float = 0.0
 
-    def __post_init__(self) -> None:
-        """Check all fields, and replace the arrays by read-only copies."""
-        occupancy = arguments.as_mask("occupancy", self.occupancy)
-        shape = occupancy.shape
-        resolution = as_number(
-            "resolution", self.resolution, *RESOLUTIONS, METRES_PER_CELL
-        )
-        origin = arguments.as_pose("origin", self.origin)
-        _check_place(origin, resolution, shape)
-        self._set(occupancy=occupancy, resolution=resolution, origin=origin)
-        if self.cost is not None:
-            self._set(cost=_costs(self.cost, occupancy))
-        if self.obstacles is not None:
-            obstacles = arguments.as_mask("obstacles", self.obstacles, shape)
-            _check_occupied(obstacles, occupancy, "obstacles lie on free cells")
-            self._set(obstacles=obstacles)
-        if self.forbidden is not None:
-            self._set(forbidden=_forbidden(self.forbidden, shape))
-        if self.slowness is not None:
-            self._set(slowness=_slowness(self.slowness, shape))
-        if self.seconds_per_cell is not None:
+    def __init__(  # noqa: PLR0913
+        self,
+        occupancy: ArrayLike,
+        resolution: float = 1.0,
+        origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        cost: ArrayLike | None = None,
+        obstacles: ArrayLike | None = None,
+        forbidden: ArrayLike | None = None,
+        slowness: ArrayLike | None = None,
+        seconds_per_cell: float | None = None,
+        unknown: ArrayLike | None = None,
+        body_radius: float = 0.0,
+        *,
+        cost_multiplier: ArrayLike | None = None,
+    ) -> None:
+        """Check all arguments, and keep read-only copies of the arrays."""
+        cells = arguments.as_mask("occupancy", occupancy)
+        metres = as_number("resolution", resolution, *RESOLUTIONS, METRES_PER_CELL)
+        corner = arguments.as_pose("origin", origin)
+        _check_place(corner, metres, cells.shape)
+        limits = 0, sys.float_info.max, "metres, finite and 0 or more"
+        radius = as_number("body_radius", body_radius, *limits)
+        self._set(occupancy=cells, resolution=metres, origin=corner, body_radius=radius)
+        if cost is not None:
+            self._set(cost=_costs(cost, cells))
+        if obstacles is not None:
+            mask = arguments.as_mask("obstacles", obstacles, cells.shape)
+            _check_occupied(mask, cells, "obstacles lie on free cells")
+            self._set(obstacles=mask)
+        if forbidden is not None:
+            self._set(forbidden=_forbidden(forbidden, cells.shape))
+        if unknown is not None:
+            mask = arguments.as_mask("unknown", unknown, cells.shape)
+            _check_occupied(mask, cells, "unknown cells are free")
+            self._set(unknown=mask if mask.any() else None)
+        self._set_multipliers(slowness, seconds_per_cell, cost_multiplier)
+
+    def _set_multipliers(
+        self,
+        slowness: ArrayLike | None,
+        seconds_per_cell: float | None,
+        cost_multiplier: ArrayLike | None,
+    ) -> None:
+        """Check these arguments of `__init__`, and set them."""
+        if slowness is not None:
+            times = _factors("slowness", slowness, self.occupancy.shape)
+            self._set(slowness=times)
+        if seconds_per_cell is not None:
             seconds = as_number(
-                "seconds_per_cell", self.seconds_per_cell, *POSITIVE, "more than 0"
+                "seconds_per_cell", seconds_per_cell, *POSITIVE, "more than 0"
             )
             self._set(seconds_per_cell=seconds)
-        if self.unknown is not None:
-            unknown = arguments.as_mask("unknown", self.unknown, shape)
-            _check_occupied(unknown, occupancy, "unknown cells are free")
-            self._set(unknown=unknown if unknown.any() else None)
-        limits = 0, sys.float_info.max, "metres, finite and 0 or more"
-        self._set(body_radius=as_number("body_radius", self.body_radius, *limits))
+        if cost_multiplier is not None:
+            shape = self.occupancy.shape
+            array = arguments.numbers("cost_multiplier", cost_multiplier, shape)
+            of_free = np.where(self.occupancy, 1, array)
+            factors = _factors("cost_multiplier", of_free, shape)
+            self._set(_factors=factors)
+            self._set(slowness=self._multiplied(self.slowness))
+
+    @cached_property
+    def _factors(self) -> NDArray[np.float32] | None:
+        """The argument `cost_multiplier`; `slowness` has these factors, too."""
+        return None  # unless `__init__` or `with_layers` has set the attribute
+
+    def _multiplied(
+        self, slowness: NDArray[np.float32] | None
+    ) -> NDArray[np.float32] | None:
+        """Return a slowness (H, W) times the argument `cost_multiplier`."""
+        if self._factors is None or slowness is None:
+            return slowness if self._factors is None else self._factors
+        product: NDArray[np.float32] = slowness * self._factors
+        return product.clip(max=arguments.MAX_SLOWNESS)
+
+    def __repr__(self) -> str:
+        """Return the size, the place, the free cells and the layers in one line."""
+        origin = ", ".join(f"{number:g}" for number in self.origin)
+        parts = [
+            f"{self.width} x {self.height} cells of {self.resolution:g} m",
+            f"origin ({origin})",
+            f"{np.count_nonzero(~self.occupancy)} free",
+        ]
+        optional = (*OPTIONAL_LAYERS, "obstacles", "unknown")
+        layers = [name for name in optional if getattr(self, name) is not None]
+        if layers:
+            parts.append(f"with {', '.join(layers)}")
+        return f"GridMap({', '.join(parts)})"
 
     def _set(self, **values: object) -> None:
         """Set attributes of this frozen map by name, and make their arrays read-only.
@@ -198,7 +272,7 @@ class GridMap:
             resolution,
             origin,
             cost,
-            forbidden=cast("NDArray[np.uint8] | None", forbidden),  # checked there
+            forbidden=forbidden,
             unknown=unknown,
         )
 
@@ -329,6 +403,18 @@ class GridMap:
             return None
         return self._history.patches_since(older._history)
 
+    def with_times(
+        self, slowness: NDArray[np.float32], seconds_per_cell: float
+    ) -> GridMap:
+        """Return the map with expected times, which its own factors multiply.
+
+        The slowness (H, W) and the seconds per cell are as for `GridMap`, but not
+        checked.
+        """
+        return self.with_layers(
+            slowness=self._multiplied(slowness), seconds_per_cell=seconds_per_cell
+        )
+
     def with_times_of(self, other: GridMap) -> GridMap:
         """Return the same map with the expected and the optimistic times of another."""
         exploration = other.exploration
@@ -352,6 +438,7 @@ class GridMap:
         `patches_since`.
         """
         values = {field.name: getattr(self, field.name) for field in fields(self)}
+        values["_factors"] = self._factors
         if layers.keys().isdisjoint(PATCHED):
             values["_history"] = self._history
         values.update(layers)
@@ -662,8 +749,15 @@ def _sum_of_words(layer: Occupancy | NDArray[np.int8]) -> int:
 
 def check_grid(grid: object, name: str = "grid") -> None:
     """Raise a ValueError for anything else than a map."""
-    if not isinstance(grid, GridMap):
-        raise ValueError(f"{name} is {grid!r}; give a GridMap")
+    if isinstance(grid, GridMap):
+        return
+    if isinstance(grid, np.ndarray):
+        problem = f"an array of shape {grid.shape}"
+        raise ValueError(f"{name} is {problem}; give a map: GridMap(array)")
+    if isinstance(grid, (str, Path)):
+        remedy = f"load_map({str(grid)!r})"
+        raise ValueError(f"{name} is {str(grid)!r}; give a map: {remedy}")
+    raise ValueError(f"{name} is {reprlib.repr(grid)}; give a GridMap")
 
 
 def _check_place(
@@ -702,11 +796,13 @@ def _forbidden(
     return bits.astype(np.uint8, order="C") if bits.any() else None
 
 
-def _slowness(slowness: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return a checked copy of the slowness of cells (H, W)."""
+def _factors(
+    name: str, factors: ArrayLike, shape: tuple[int, ...]
+) -> NDArray[np.float32]:
+    """Return a checked copy of factors of cells (H, W), which errors call `name`."""
     limits = 1, arguments.MAX_SLOWNESS
-    times = arguments.numbers("slowness", slowness, shape, "iuf", limits, whole=False)
-    return times.astype(np.float32, order="C")
+    array = arguments.numbers(name, factors, shape, "iuf", limits, whole=False)
+    return array.astype(np.float32, order="C")
 
 
 def _costs(cost: ArrayLike, occupancy: Occupancy) -> NDArray[np.int8]:

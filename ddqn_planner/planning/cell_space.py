@@ -688,6 +688,66 @@ def roll_out(
 
 
 @in_place
+def follow(
+    policy: Any,
+    is_goal: Any,
+    starts: Any,
+    first: int,
+    entered_by: Any,
+    paths: Any,
+    end: Any,
+) -> int:
+    """Write the paths that a policy takes from many starts to a goal.
+
+    Return the number of the start after the last one whose path was written: the number
+    of starts, or less when the paths of more starts might not fit.
+
+    Parameters
+    ----------
+    policy : (H, W) int8
+        The action in each cell; -1 for none.
+    is_goal : (H, W) bool
+    starts : (N, 2)
+        The x and y of cells on the map.
+    first : int
+        The number of the start whose path is written first.
+    entered_by : (H, W) int64
+        The number of the start, plus 1, whose path entered each cell last.
+    paths : (M, 2)
+        Where the cells of the paths are written, one path after another; M is more than
+        the number of cells on the map.
+    end : (N,)
+        For each path, the row of `paths` after its last cell is written here. A path
+        that reaches no goal has no rows.
+    """
+    height, width = policy.shape
+    row = 0
+    number = first
+    while number < starts.shape[0] and row + policy.size < paths.shape[0]:
+        begin = row
+        x = starts[number, 0]
+        y = starts[number, 1]
+        # A path ends where its step leads off the map, or into a cell that it entered
+        # before. Without an action, that is the cell itself.
+        while 0 <= x < width and 0 <= y < height and entered_by[y, x] != number + 1:
+            entered_by[y, x] = number + 1
+            paths[row, 0] = x
+            paths[row, 1] = y
+            row += 1
+            if is_goal[y, x]:
+                break
+            action = policy[y, x]
+            if action >= 0:
+                x += MOVE_X[action]
+                y += MOVE_Y[action]
+        if row == begin or not is_goal[paths[row - 1, 1], paths[row - 1, 0]]:
+            row = begin
+        end[number] = row
+        number += 1
+    return number
+
+
+@in_place
 def write_value(distance: Any, value: Any, _: Any) -> None:
     """Write the value of each reached cell but the goals: minus its distance.
 

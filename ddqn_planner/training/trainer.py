@@ -79,6 +79,17 @@ class Trainer:
     """Trains a Q-network by Double DQN.
 
     The same arguments give the same network, bit for bit.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ddqn_planner import GridMap
+    >>> from ddqn_planner.training import HyperParameters, Scenario, Trainer
+    >>> scenario = Scenario(GridMap(np.zeros((4, 5))), (0, 0), (4, 3))
+    >>> trainer = Trainer([scenario], HyperParameters(steps=200), seed=0)
+    >>> [progress.step for progress in trainer.run(every=100)]
+    [100, 200]
+    >>> planner = trainer.planner()
     """
 
     # What moves the robots, and shows them their maps.
