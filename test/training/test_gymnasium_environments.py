@@ -7,6 +7,7 @@ import sys
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -231,10 +232,17 @@ def test_a_function_gives_the_reward(small: Scenario) -> None:
     goal, collision, steps = (1000.0 * end for end in (1, 2, 3))
     assert rewards == [10, collision, goal + 10, 201, steps + 12]
     # Of N robots, the one that begins an episode gets none.
-    batch = BatchedGridEnvironment(2, small, parameters, moved_goalwards)
+    moves = []
+
+    def recorded(*move: Any) -> float:
+        moves.append(move)
+        return moved_goalwards(*move)
+
+    batch = BatchedGridEnvironment(2, small, parameters, recorded)
     batch.reset(options={"start": [(1, 0), (0, 3)]})
     assert batch.step(np.array([EAST, EAST]))[1].tolist() == [collision, 13]
     assert batch.step(np.array([EAST, EAST]))[1].tolist() == [0, steps + 13]
+    assert [move[0] for move in moves] == [(1, 0), (0, 3), (1, 3)]
 
 
 def test_a_reward_has_a_name(small: Scenario) -> None:
@@ -350,3 +358,13 @@ def test_information_of_a_vector_environment_is_in_arrays(small: Scenario) -> No
     frames: Any = environment.render()
     assert re.findall(r"R . #", frames[2]) == ["R . #"]
     assert frames[0].endswith("* R # . G")
+
+
+def test_the_programs_of_the_page_run() -> None:
+    page = Path(__file__).parents[2] / "docs" / "gymnasium.md"
+    names: dict[str, Any] = {}
+    for program in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL):
+        exec(program, names)
+    assert names["picture"].shape == (480, 480, 3)
+    assert names["infos"]["cell"].shape == (64, 2)
+    assert names["env"].reset()[0].shape == (20, 20)
