@@ -3,15 +3,19 @@
 import copy
 import doctest
 import pickle
+import re
 import signal
 import sys
 from contextlib import suppress
 from dataclasses import replace
 from importlib import import_module
+from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import ddqn_planner
 from ddqn_planner import Experience, GridMap, Planner, load_map, train, training
@@ -199,3 +203,21 @@ def test_a_map_describes_itself_in_one_line() -> None:
     assert repr(grid) == (
         "GridMap(3 x 3 cells of 0.05 m, origin (1, -2.5, 0), 6 free, with cost)"
     )
+
+
+def test_the_film_of_the_docs_is_made_as_they_say(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = Path(__file__).resolve().parents[1] / "docs" / "python_api.md"
+    blocks = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.M | re.S)
+    (example,) = [block for block in blocks if "save_film" in block]
+    brief = example.replace("steps=10_000", "steps=500, filters=4")
+    assert brief != example
+    monkeypatch.chdir(tmp_path)
+    scope: dict[str, Any] = {}
+    exec(brief, scope)
+    assert scope["progress"].step == 500
+    with Image.open("training.gif") as film:
+        assert film.n_frames >= 3
+    with Image.open("training.png") as picture:
+        assert picture.size > (500, 300)
