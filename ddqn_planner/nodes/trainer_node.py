@@ -55,7 +55,7 @@ PARAMETERS: Final = {
     "seed": Declared(0, "Seed of the training", (0, 2**31 - 1)),
     **OF_MAPS,
     "episode_interval": Declared(10, "Publish each n-th episode", (1, 10**6)),
-    "pace": Declared(0.0, "Training: steps per second; 0: no limit", (0.0, 1e6)),
+    "pace": Declared(0.0, "Training: steps per second; 0: no limit", (0.0, 1e5)),
     "replay_period": Declared(0.05, "Seconds per step of ~/replay", (1e-3, 10.0)),
     "pose_source": Declared(
         "odometry", "Driving: odom, or a transform", ["odometry", "tf"], read_only=True
