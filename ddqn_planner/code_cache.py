@@ -4,7 +4,8 @@ import hashlib
 import logging
 import pickle
 from pathlib import Path
-from typing import Any
+from types import FunctionType
+from typing import Any, Protocol
 
 import numba
 from numba.core.caching import FunctionCache
@@ -21,7 +22,7 @@ CHECKSUM_BYTES = hashlib.sha256().digest_size
 
 def write_checked(path: Path, value: object) -> None:
     """Write a pickled value behind its checksum, and wait until the disk has it."""
-    pickled = dumps(value)  # type: ignore[no-untyped-call]
+    pickled: bytes = dumps(value)  # type: ignore[no-untyped-call]
     write_atomically(path, hashlib.sha256(pickled).digest() + pickled)
 
 
@@ -60,24 +61,26 @@ class CodeFiles:
         self._state = (numba.__version__, source_stamp)
         self.last_read = folder  # the path of the file that was read last
 
-    def load(self, key: object) -> Any:
+    def load(self, key: object) -> object:
         """Return the data that was saved for a key, or None without any.
 
         A key is a signature of the function. An error is raised if a file is damaged.
         """
         self.last_read = self._path(key)
         try:
-            state, pickled = read_checked(self.last_read)
+            saved: tuple[object, bytes] = read_checked(self.last_read)
         except FileNotFoundError:
             return None
+        state, pickled = saved
         if state != self._state:
             return None  # of another numba or an older source: to be overwritten
-        saved_key, data = pickle.loads(pickled)
+        entry: tuple[object, object] = pickle.loads(pickled)
+        saved_key, data = entry
         return data if saved_key == key else None
 
     def save(self, key: object, data: object) -> None:
         """Save data for a key; an error is raised if that fails."""
-        pickled = dumps((key, data))  # type: ignore[no-untyped-call]
+        pickled: bytes = dumps((key, data))  # type: ignore[no-untyped-call]
         write_checked(self._path(key), (self._state, pickled))
 
     def _path(self, key: object) -> Path:
@@ -89,14 +92,14 @@ class CodeFiles:
 class CheckedCache(FunctionCache):
     """Numba's cache of the code of one function; after an error it compiles again."""
 
-    def __init__(self, function: Any) -> None:
+    def __init__(self, function: FunctionType) -> None:
         """Find the files of a Python function; an error if no folder is writable."""
         super().__init__(function)  # type: ignore[no-untyped-call]
-        stamp = self._impl.locator.get_source_stamp()
+        stamp: object = self._impl.locator.get_source_stamp()
         self._files = CodeFiles(Path(self.cache_path), self._impl.filename_base, stamp)
         self._cache_file = self._files  # type: ignore[assignment]
 
-    def load_overload(self, signature: Any, target: Any) -> Any:
+    def load_overload(self, signature: object, target: object) -> object:
         """Return the code for a signature, or None if it must be compiled.
 
         `target` is numba's context of the compilation. A damaged file is removed, with
@@ -117,7 +120,7 @@ class CheckedCache(FunctionCache):
         messages.warn(f"{self._files.last_read} cannot be used ({problem}): {result}")
         return None
 
-    def save_overload(self, signature: Any, result: Any) -> None:
+    def save_overload(self, signature: object, result: object) -> None:
         """Save the compiled code `result` for a signature; else log a warning."""
         llvm_was_used.set()
         try:
@@ -136,6 +139,19 @@ def _reason(error: Exception) -> str:
     return getattr(error, "strerror", None) or str(error) or repr(error)
 
 
+class Statistics(Protocol):
+    """Where numba keeps the code of a function."""
+
+    cache_path: str | None
+
+
+class Dispatcher(Protocol):
+    """The part of numba's object for a compiled function that is used."""
+
+    py_func: FunctionType
+    stats: Statistics
+
+
 class Messages(Listener):
     """Logs the first compilation of a process, and the first problem of the cache."""
 
@@ -148,7 +164,7 @@ class Messages(Listener):
 
         Numba calls this when it compiles a function, but not when it loads code.
         """
-        dispatcher = event.data["dispatcher"]
+        dispatcher: Dispatcher = event.data["dispatcher"]
         is_ours = str(dispatcher.py_func.__module__).startswith("ddqn_planner.")
         if self._has_announced or not is_ours:
             return

@@ -44,7 +44,7 @@ class _Describer:
         # The functions that have been described: functions may call each other.
         self._functions: set[FunctionType] = set()
 
-    def describe(self, value: Any, names: frozenset[str] = frozenset()) -> object:
+    def describe(self, value: object, names: frozenset[str] = frozenset()) -> object:
         """Return a description of a value: the name of its type, and its content.
 
         The content of a module or a class are its attributes with names in `names`.
@@ -71,13 +71,14 @@ class _Describer:
             return kind, _name_of(value)
         return kind, repr(value)
 
-    def _attributes(self, owner: Any, names: frozenset[str]) -> Iterator[object]:
+    def _attributes(self, owner: object, names: frozenset[str]) -> Iterator[object]:
         """Yield the names and descriptions of attributes of a module or class `owner`.
 
         They are the attributes with names in `names` that `owner` has.
         """
         for name in sorted(names):
             # Not by `getattr` of a module, which may import another one.
+            value: object
             if isinstance(owner, ModuleType):
                 value = vars(owner).get(name, MISSING)
             else:

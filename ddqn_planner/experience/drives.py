@@ -97,8 +97,8 @@ class Drive(NamedTuple):
         means = averaged(Poses(self.seconds, self.positions), WINDOW).position  # (M, 2)
         corners = means[indices_apart(means, STEP)]  # (K, 2), K <= M
         path = np.concatenate([self.positions[:1], corners, self.positions[-1:]])
-        dx, dy = np.diff(path, axis=0).T
-        return float(np.hypot(dx, dy).sum())
+        steps: Float64 = np.diff(path, axis=0)
+        return float(np.hypot(steps[:, 0], steps[:, 1]).sum())
 
     def teach(self, experience: Experience, grid: GridMap | None = None) -> Learned:
         """Let `experience` learn from this drive, and return what it has learned.
@@ -252,8 +252,9 @@ class DriveRecorder:
         self._samples = []
         self._stand = self._last
         positions = samples[:, 1:]
-        dx, dy = (positions - positions[:1]).T
-        distance_from_start = np.hypot(dx, dy).max(initial=0)
+        from_start = positions - positions[:1]
+        distances = np.hypot(from_start[:, 0], from_start[:, 1])
+        distance_from_start = float(distances.max(initial=0))
         has_driven = distance_from_start >= SHORTEST
         has_failed = outcome is DriveEnd.ABORTED and len(samples) > 0
         if has_driven or has_failed:

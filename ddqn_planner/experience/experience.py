@@ -224,8 +224,8 @@ class Experience:
         fastest = float((np.hypot(step[:, 0], step[:, 1]) / elapsed).max())
         if fastest > self.max_speed:
             return self._wrong_speed(fastest, "at", "greater")
-        from_start_x, from_start_y = (poses.position - poses.position[0]).T
-        extent = float(np.hypot(from_start_x, from_start_y).max())
+        from_start = poses.position - poses.position[0]
+        extent = float(np.hypot(from_start[:, 0], from_start[:, 1]).max())
         return f"the robot comes no farther than {extent:.2g} m; give a longer drive"
 
     def _wrong_speed(self, speed: float, words: str, nominal: str) -> str:
@@ -457,8 +457,8 @@ class Experience:
         # The M + 1 cells along the path, (M + 1, 2), and their positions on it, (M +
         # 1,): 2.5 is the middle of the third segment.
         path, position = cells_along(corners)
-        dx, dy = np.diff(corners, axis=0).T
-        metres_of_segment = np.hypot(dx, dy) * grid.resolution  # (K - 1,)
+        steps: NDArray[np.float64] = np.diff(corners, axis=0)  # (K - 1, 2) cells
+        metres_of_segment = np.hypot(steps[:, 0], steps[:, 1]) * grid.resolution
         segment = position[:-1].astype(np.int64)  # (M,): the segment of each move
         metres = np.diff(position) * metres_of_segment[segment]  # (M,)
         x = path[:, 0]
@@ -641,7 +641,9 @@ def _converted(table: Float64, driven: float, half_life: float) -> Float64:
     driven, half_life : float
         Seconds.
     """
-    weight, sum_of_log, _, x, y, driven_before = table.T
+    weight = table[:, 0]
+    sum_of_log = table[:, 1]
+    driven_before = table[:, 5]
     half_lives = (driven - driven_before) / half_life  # since the last visit
     remaining = 0.5**half_lives
     nothing = np.zeros(len(table))
@@ -651,6 +653,6 @@ def _converted(table: Float64, driven: float, half_life: float) -> Float64:
         passages=nothing,
         waited=nothing,
         predicted=nothing,
-        position=np.column_stack([x, y]),
+        position=table[:, 3:5].copy(),
     )
     return places.table()

@@ -156,7 +156,8 @@ class Posterior:
         NO_PLACE off the map, and where no place is within 1.5 sides of a place.
         """
         cells, is_inside = cells_of(position, self.grid)
-        x, y = cells.T
+        x = cells[:, 0]
+        y = cells[:, 1]
         return np.where(is_inside, self._nearest_place[y, x], NO_PLACE)
 
     def predicted_at(self, position: Float64) -> Float64:
@@ -210,7 +211,8 @@ class Posterior:
         if prior is None:
             self._predicted[:] = 0
         else:
-            x, y = self._middle_cells.T
+            x = self._middle_cells[:, 0]
+            y = self._middle_cells[:, 1]
             self._predicted[:] = prior.log_slowness(map_features(self.grid)[y, x])
 
     def _sums_of(self, places: Places) -> SumsOnMap:

@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from io import TextIOWrapper
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -40,6 +40,62 @@ BACKWARD_SHARE = 0.1
 DISTANCE_OF_ROBOTS = 1.0
 # Goals are poses too. A topic with a smaller share of poses is not taken for a robot's.
 SMALLEST_SHARE = 0.1
+
+
+class Stamp(Protocol):
+    """A time of ROS."""
+
+    sec: int
+    nanosec: int
+
+
+class Header(Protocol):
+    """Time and frame of a message."""
+
+    stamp: Stamp
+    frame_id: str
+
+
+class Point(Protocol):
+    """A place, or a shift, in metres."""
+
+    x: float
+    y: float
+
+
+class Quaternion(Protocol):
+    """A rotation."""
+
+    x: float
+    y: float
+    z: float
+    w: float
+
+
+class Stamped(Protocol):
+    """A message with a header."""
+
+    header: Header
+
+
+class Pose(Protocol):
+    """The part of a pose that is used."""
+
+    position: Point
+
+
+class Movement(Protocol):
+    """The content of a transform."""
+
+    translation: Point
+    rotation: Quaternion
+
+
+class StampedTransform(Stamped, Protocol):
+    """A message ``geometry_msgs/TransformStamped``, as the MCAP reader makes it."""
+
+    child_frame_id: str
+    transform: Movement
 
 
 class Recording(NamedTuple):
@@ -150,8 +206,7 @@ def _check_on_map(path: Path, drives: Sequence[Drive], grid: GridMap) -> None:
     """
     positions = np.concatenate([drive.positions for drive in drives])  # (N, 2)
     cells, is_inside = cells_of(positions, grid)
-    x, y = cells.T
-    is_free = is_inside & ~grid.occupancy[y, x]
+    is_free = is_inside & ~grid.occupancy[cells[:, 1], cells[:, 0]]
     if is_free.any():
         return
     lowest = positions.min(axis=0).round(1).tolist()
@@ -292,10 +347,13 @@ def _are_apart(samples: Sequence[Sample], reference: Sequence[Sample]) -> bool:
     if len(samples) < SMALLEST_SHARE * len(reference):
         return False
     # (N,) each: seconds and metres, in the order of the times.
-    times, x, y = np.array(sorted(samples)).T
-    reference_times, reference_x, reference_y = np.array(sorted(reference)).T
-    away_x = x - np.interp(times, reference_times, reference_x)
-    away_y = y - np.interp(times, reference_times, reference_y)
+    # The columns are seconds, x and y.
+    poses = np.array(sorted(samples), dtype=np.float64)
+    references = np.array(sorted(reference), dtype=np.float64)
+    times = poses[:, 0]
+    reference_times = references[:, 0]
+    away_x = poses[:, 1] - np.interp(times, reference_times, references[:, 1])
+    away_y = poses[:, 2] - np.interp(times, reference_times, references[:, 2])
     distance = np.hypot(away_x, away_y)
     return bool(np.median(distance) > DISTANCE_OF_ROBOTS)
 
@@ -351,16 +409,19 @@ class _Bag:
 
     def _add_pose(self, topic: str, message: Any) -> None:
         """Add the pose of a message of one of the POSE_TYPES, if it is in `frame`."""
-        frame: str = message.header.frame_id
+        header: Header = message.header
+        frame = header.frame_id
         self._frames_of_topic[topic].add(frame)
         if frame.lstrip("/") != self.frame or self.robot_frame:
             return
         # With covariance, the pose lies one level deeper.
-        pose = getattr(message.pose, "pose", message.pose)
+        pose: Pose = getattr(message.pose, "pose", message.pose)
         sample = Sample(_seconds(message), pose.position.x, pose.position.y)
         self.samples_of_source[PoseSource(topic)].append(sample)
 
-    def _add_transforms(self, topic: str, transforms: Sequence[Any]) -> None:
+    def _add_transforms(
+        self, topic: str, transforms: Sequence[StampedTransform]
+    ) -> None:
         """Add TransformStamped messages to the tree of `topic`, and poses of robots.
 
         A transform on the chain from a robot's frame to the map frame gives a pose of
@@ -373,7 +434,7 @@ class _Bag:
             transform = _planar(message)
             if transform is None:
                 continue
-            child: str = message.child_frame_id.lstrip("/")
+            child = message.child_frame_id.lstrip("/")
             tree[child] = transform
             for robot in tree:
                 if not self._is_robot(robot):
@@ -393,12 +454,13 @@ class _Bag:
         return name == BASE
 
 
-def _seconds(stamped: Any) -> float:
+def _seconds(stamped: Stamped) -> float:
     """Return the time of a stamped message in seconds."""
-    return float(stamped.header.stamp.sec + stamped.header.stamp.nanosec / 1e9)
+    stamp = stamped.header.stamp
+    return stamp.sec + stamp.nanosec / 1e9
 
 
-def _planar(stamped: Any) -> Transform | None:
+def _planar(stamped: StampedTransform) -> Transform | None:
     """Return the transform of a TransformStamped message, in the plane.
 
     None if its quaternion is no rotation: tf2 leaves such a transform out, too.
@@ -408,7 +470,7 @@ def _planar(stamped: Any) -> Transform | None:
     rotation = Rotation(quaternion.x, quaternion.y, quaternion.z, quaternion.w)
     if not rotation.is_rounded:
         return None
-    parent: str = stamped.header.frame_id.lstrip("/")
+    parent = stamped.header.frame_id.lstrip("/")
     cos = math.cos(rotation.yaw)
     sin = math.sin(rotation.yaw)
     return Transform(parent, shift.x, shift.y, cos, sin)

@@ -239,7 +239,7 @@ def indices_apart(position: Float64, metres: float) -> list[int]:
     `position` is (N, 2), x and y in metres, N >= 1. The first position is chosen, and
     then each position that is `metres` or more away from the one chosen last.
     """
-    points = position.tolist()
+    points: list[list[float]] = position.tolist()
     chosen = [0]  # indices in `points`
     for index, point in enumerate(points):
         last_chosen = points[chosen[-1]]
@@ -264,11 +264,12 @@ def _believed_parts(poses: Poses, limits: Limits) -> Iterator[Poses]:
     is_pause = elapsed > limits.max_pause
     is_cut = is_jump | is_pause | (elapsed <= 0)
     first_poses = np.flatnonzero(is_cut) + 1  # of all parts but the first
-    bounds = [0, *first_poses.tolist(), len(time)]
+    bounds: list[int] = [0, *first_poses.tolist(), len(time)]
     last_believed = 0  # the index of the last pose that was believed
     for start, end in pairwise(bounds):
         # The longest time for which the robot may have driven on without being seen.
-        unseen = min(max(time[start] - time[last_believed], 0), MEMORY)  # seconds
+        since_last: float = time[start] - time[last_believed]  # seconds
+        unseen = min(max(since_last, 0), MEMORY)
         reach = limits.max_speed * unseen + RELOCATION  # metres
         distance = math.dist(position[start], position[last_believed])
         has_several_poses = end - start > 1
@@ -294,9 +295,10 @@ def _steps_along(path: Float64, seconds: Float64, step_length: float) -> Seconds
     SecondsAt
         The middle of each step, and its driving time.
     """
-    dx, dy = np.diff(path, axis=0).T
+    steps: Float64 = np.diff(path, axis=0)  # (P - 1, 2)
+    metres = np.hypot(steps[:, 0], steps[:, 1])
     # (P,): from the beginning of the path to each corner.
-    metres_to_corner = np.cumsum(np.append(0, np.hypot(dx, dy)))
+    metres_to_corner = np.cumsum(np.append(0, metres))
     seconds_to_corner = np.cumsum(np.append(0, seconds))
     # (N + 1,): from the beginning of the path to each point between two steps. The
     # first point is the beginning of the path.

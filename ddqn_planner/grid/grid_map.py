@@ -524,7 +524,8 @@ class GridMap:
         """
         path_ends = arguments.cells_inside(cells, self.occupancy.shape)
         is_backward = arguments.as_flag("backward", backward)
-        x, y = path_ends.T
+        x = path_ends[:, 0]
+        y = path_ends[:, 1]
         occupied = path_ends[self.occupancy[y, x]].tolist()
         if occupied:
             raise ValueError(

@@ -463,10 +463,10 @@ def _grey(image: "Image") -> NDArray[np.integer[Any]]:
     if image.mode in ("1", "L", "LA"):
         return np.asarray(image.convert("L"))
     colours = image.convert("RGBA" if image.mode == "P" else "RGB")
-    channels: NDArray[np.int32] = np.moveaxis(np.asarray(colours, dtype=np.int32), 2, 0)
-    red = channels[0]
-    green = channels[1]
-    blue = channels[2]
+    pixels = np.asarray(colours, dtype=np.int32)  # (H, W, 3)
+    red = pixels[..., 0]
+    green = pixels[..., 1]
+    blue = pixels[..., 2]
     # The luma of 16 bits; times 1000, so that the weights are whole numbers.
     luma_times_1000 = 257 * (299 * red + 587 * green + 114 * blue)
     rounded_luma: NDArray[np.int32] = (luma_times_1000 + 500) // 1000

@@ -6,7 +6,7 @@ from collections.abc import Callable, Coroutine, Generator, Iterator
 from contextlib import contextmanager
 from copy import copy
 from types import coroutine
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from rcl_interfaces import msg, srv
 from rclpy.clock import TimeJump
@@ -39,6 +39,19 @@ FAREWELL = 0.1  # seconds after an answer in which the end of its service would 
 
 Answer = TypeVar("Answer")
 Refusal = TypeVar("Refusal")
+
+
+class Logger(Protocol):
+    """The part of rclpy's logger that is used; rclpy gives it no types."""
+
+    def info(self, message: str) -> bool:
+        """Log what happens."""
+
+    def warning(self, message: str) -> bool:
+        """Log what may be wrong."""
+
+    def error(self, message: str) -> bool:
+        """Log what failed."""
 
 
 class BaseNode(Node):
@@ -77,7 +90,7 @@ class BaseNode(Node):
         Values that nothing reads are logged.
         """
         # The values given, by parameter; also those that the node does not have.
-        overrides = {
+        overrides: dict[str, object] = {
             parameter.name: parameter.value
             for parameter in self.handle.get_parameters(Parameter).values()
         }
@@ -96,7 +109,9 @@ class BaseNode(Node):
                 name, value, declared.descriptor(), ignore_override=True
             )
 
-    def _warn_of_unread(self, overrides: dict[str, Any], known_names: set[str]) -> None:
+    def _warn_of_unread(
+        self, overrides: dict[str, object], known_names: set[str]
+    ) -> None:
         """Warn of given parameters that the node does not have.
 
         Parameters
@@ -133,6 +148,11 @@ class BaseNode(Node):
         )
         for forget in self.jump_back_callbacks:
             forget()
+
+    def get_logger(self) -> Logger:
+        """Return the node's logger."""
+        logger: Logger = super().get_logger()
+        return logger
 
     # Parameters
 

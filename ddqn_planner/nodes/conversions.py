@@ -228,8 +228,8 @@ def along(points: Float64, spacing: float = math.inf) -> tuple[Float64, Float64]
         The points, with all corners among them, and the heading from each point to the
         next, radians.
     """
-    dx, dy = np.diff(points, axis=0).T
-    yaw_of_pieces = np.arctan2(dy, dx)  # (N - 1,), of the straight pieces of the path
+    steps: NDArray[np.float64] = np.diff(points, axis=0)  # of the N - 1 straight pieces
+    yaw_of_pieces = np.arctan2(steps[:, 1], steps[:, 0])  # (N - 1,)
     if len(points) < 2 or math.isinf(spacing):
         return points, yaw_of_pieces
     dense_points, piece_of_points = dense(points, spacing)
@@ -280,7 +280,9 @@ def in_outer_frame(poses: Float64, origin: Origin) -> Float64:
     origin
         The pose (x, y, yaw) of the frame of the poses in the other frame.
     """
-    x, y, yaw = poses.T
+    x = poses[:, 0]
+    y = poses[:, 1]
+    yaw = poses[:, 2]
     origin_x, origin_y, origin_yaw = origin
     cos = math.cos(origin_yaw)
     sin = math.sin(origin_yaw)

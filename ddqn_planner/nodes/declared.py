@@ -101,7 +101,7 @@ class Declared(NamedTuple):
             raise ValueError(f"{name} is {value!r}; name {noun}")
         return value
 
-    def _in_type(self, value: Any) -> Any:
+    def _in_type(self, value: object) -> Any:
         """Return a number in the type of the parameter's default, if nothing is lost.
 
         65 becomes 65.0 for a float, and 65.0 becomes 65 for an int. Any other value is
@@ -167,7 +167,7 @@ class Declared(NamedTuple):
             return "a list of namespaces, such as [r1, r2]"
         return TYPES[kind] if kind is str else f"{TYPES[kind]}, {self.limits}"
 
-    def _shown(self, value: Any) -> str:
+    def _shown(self, value: object) -> str:
         """Return a wrong value in words: its type, and whether its quotes are wrong."""
         if value is None:  # also what ROS makes of [] and of blanks
             return "no value, an empty list or blanks"
@@ -203,7 +203,7 @@ def declared_by(settings: Any) -> dict[str, Declared]:
     return {entry.name: entry.metadata["declaration"] for entry in fields(settings)}
 
 
-def read_all(parameters: Parameters, values: Mapping[str, Any]) -> dict[str, Any]:
+def read_all(parameters: Parameters, values: Mapping[str, object]) -> dict[str, Any]:
     """Return the values of some parameters in the types of their defaults.
 
     A ValueError names all values that are wrong, with remedies; see `Declared.read`.

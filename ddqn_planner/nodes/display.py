@@ -194,7 +194,8 @@ def outlines_along(poses: Float64, footprint: Float64) -> Float64:
     y = outlined_poses[:, 1:2]
     cos = np.cos(outlined_poses[:, 2:])
     sin = np.sin(outlined_poses[:, 2:])
-    ahead, aside = footprint.T  # (K,) each
+    ahead = footprint[:, 0]
+    aside = footprint[:, 1]
     corner_x = x + (cos * ahead - sin * aside)
     corner_y = y + (sin * ahead + cos * aside)
     return np.stack([corner_x, corner_y], axis=-1)
@@ -202,7 +203,9 @@ def outlines_along(poses: Float64, footprint: Float64) -> Float64:
 
 def _is_outlined(poses: Float64) -> NDArray[np.bool_]:
     """Return at which poses (N, 3) of a path an outline is drawn, (N,) bool."""
-    x, y, yaw = poses.T
+    x = poses[:, 0]
+    y = poses[:, 1]
+    yaw = poses[:, 2]
     turns = np.abs(turn_between(yaw[:-1], yaw[1:]))  # (N - 1,) radians
     steps = np.hypot(np.diff(x), np.diff(y))  # (N - 1,) metres
     distance = np.cumsum(steps + turns * METRES_PER_RADIAN)  # from the first pose

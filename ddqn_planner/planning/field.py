@@ -221,7 +221,7 @@ class DistanceField(QField):
         self.goal = goals[0]
         self.goals = goals
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[object, ...]:
         """Return how a copy is made: it grows anew."""
         return DistanceField, (self.goals, self.grid, self.costs, self.move_rule)
 
@@ -235,8 +235,8 @@ class DistanceField(QField):
         mark[numbers] = wavefront.OPEN
         return Known(distance, mark, opened=numbers)
 
-    def _number(self, x: Any, y: Any) -> Any:
-        """Return the number of cell (x, y) on the padded map; of many cells for arrays.
+    def _number(self, x: int, y: int) -> int:
+        """Return the number of cell (x, y) on the padded map.
 
         The padded map has a border of one cell; its cells are numbered row by row.
         """
@@ -349,8 +349,8 @@ class DistanceField(QField):
         steps = np.arange(-1, 2)
         # What leads from a cell's number to those of the 9 cells around it.
         offsets = (steps[:, None] * width + steps).reshape(9, 1)
-        x, y = cells.T
-        numbers = (offsets + self._number(x, y)).astype(np.int32)  # (9, N)
+        number = self._number(0, 0) + cells[:, 1] * width + cells[:, 0]  # (N,)
+        numbers = (offsets + number).astype(np.int32)  # (9, N)
         # Without the first and the last row, and so without number 0.
         end = self.costs.patch_number.size - width - 1
         inside = np.sort(numbers[(numbers > width) & (numbers < end)])

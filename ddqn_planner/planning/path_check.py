@@ -93,7 +93,8 @@ def _part_to_check(poses: Float64, robot: Any, distance: float) -> tuple[int, in
     distance : float
         Metres along the path that are checked; 0, less or NaN means all.
     """
-    x, y, _ = poses.T
+    x = poses[:, 0]
+    y = poses[:, 1]
     first = 0
     if robot is not None:
         distance_to_robot = np.hypot(x - robot[0], y - robot[1])  # (N,)
@@ -135,6 +136,6 @@ def _is_closed(cells: Float64, closed: Occupancy) -> NDArray[np.bool_]:
     is_closed: NDArray[np.bool_]
     is_closed = np.any((cells < 0) | (cells >= (width, height)), axis=1)  # if outside
     is_inside = ~is_closed
-    column, row = cells[is_inside].astype(np.int64).T
-    is_closed[is_inside] = closed[row, column]
+    cells_inside = cells[is_inside].astype(np.int64)  # (K, 2)
+    is_closed[is_inside] = closed[cells_inside[:, 1], cells_inside[:, 0]]
     return is_closed

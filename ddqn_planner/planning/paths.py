@@ -2,7 +2,7 @@
 
 import heapq
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,7 +85,10 @@ def search(
 
 @compiled
 def _search(
-    start: Cell, is_end: Any, value: Any, layers: Layers
+    start: Cell,
+    is_end: NDArray[np.bool_],
+    value: NDArray[np.float32],
+    layers: Layers,
 ) -> tuple[NDArray[np.int8], int]:
     """Search a path from a start to an end by A*.
 
@@ -126,16 +129,16 @@ def _search(
         if is_end[y, x]:
             return entered_by, cell
         for action in range(8):
-            next_x = x + MOVES[action, 0]
-            next_y = y + MOVES[action, 1]
+            next_x: int = x + MOVES[action, 0]
+            next_y: int = y + MOVES[action, 1]
             if not (0 <= next_x < width and 0 <= next_y < height):
                 continue
             if visited[next_y, next_x] or layers.occupancy[next_y, next_x]:
                 continue
             if not is_legal(x, y, action, layers):
                 continue
-            next_cost = cost + cost_of_move(x, y, action, layers)
-            key = next_cost - value[next_y, next_x]
+            next_cost: float = cost + cost_of_move(x, y, action, layers)
+            key: float = next_cost - value[next_y, next_x]
             if np.isnan(key):  # a cell whose value is no number is visited last
                 key = np.inf
             next_cell = next_y * width + next_x
@@ -189,7 +192,8 @@ def _way_out_to(candidates: NDArray[np.int64], request: PlanRequest) -> WayOut:
         leads_to_candidate = grid.reachable(candidates, rule, backward=True)  # (H, W)
         way_out = find_way_out(request, leads_to_candidate)
     is_reached = grid.reachable(way_out[-1:], rule)  # (H, W)
-    x, y = candidates.T
+    x = candidates[:, 0]
+    y = candidates[:, 1]
     ends = candidates[is_reached[y, x]].tolist()
     return WayOut(way_out, tuple((end_x, end_y) for end_x, end_y in ends))
 
@@ -204,9 +208,9 @@ def obstacles_in_the_way(
     """
     obstacles = grid.uninflated
     if clearing_radius > 0 and grid.is_obstacle(start):
-        x, y = _cells_within(obstacles, start, clearing_radius * ROUNDING).T
+        near = _cells_within(obstacles, start, clearing_radius * ROUNDING)  # (K, 2)
         obstacles = obstacles.copy()
-        obstacles[y, x] = False
+        obstacles[near[:, 1], near[:, 0]] = False
     return obstacles
 
 

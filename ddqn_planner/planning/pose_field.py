@@ -104,8 +104,10 @@ class PoseField(Field[Search]):
             aim=NOWHERE,
             world=world,
         )
-        x, y, heading = self.goals.T
-        goal_numbers = pose_space.number_of_state(x, y, heading, world)
+        goals = self.goals
+        goal_numbers = pose_space.number_of_state(
+            goals[:, 0], goals[:, 1], goals[:, 2], world
+        )
         search.mark[goal_numbers] = wavefront.OPEN
         search.touched[goal_numbers >> pose_space.TILE_BITS] = True
         return search
@@ -277,7 +279,9 @@ class PoseField(Field[Search]):
             passability = world.passability
         corner_bound = np.empty((rows + 1, columns + 1), np.float32)  # cells
         aim_with_look = aim._replace(corner_bound=corner_bound, shift=shift)
-        goal_x, goal_y = self.goals[:, :2].T >> shift  # of the tile of each goal
+        goal_tiles = self.goals[:, :2] >> shift  # (G, 2): the tile of each goal
+        goal_x = goal_tiles[:, 0]
+        goal_y = goal_tiles[:, 1]
         is_goal = np.zeros(corner_bound.shape, np.bool_)
         is_goal[goal_y, goal_x] = True
         box = np.array([goal_x.min(), goal_y.min(), goal_x.max(), goal_y.max()])
@@ -305,9 +309,10 @@ class PoseField(Field[Search]):
             most_poses = int(np.diff(body.first_pose).max())  # of a primitive
             rows = np.empty((4, 1 + most_primitives * most_poses))
             count = pose_space.follow(search, start_number, most_primitives, rows)
-        x, y, yaw, costs = rows[:, :count]  # cells, radians on the map, cells
         grid = self.grid
-        in_cells = np.column_stack([x, y])
+        in_cells = np.column_stack([rows[0, :count], rows[1, :count]])
+        yaw = rows[2, :count]  # radians on the map
+        costs = rows[3, :count]  # cells
         yaw_in_frame = turn_between(0, yaw + grid.origin[2])
         self.path = PosePath(
             poses=np.column_stack([grid.centres(in_cells), yaw_in_frame]),
@@ -387,7 +392,9 @@ class PoseField(Field[Search]):
         """
         is_near = np.zeros(self.world.nearness.shape, np.bool_)
         reach = self.world.body.reach // TILE + 1  # tiles
-        columns, rows = (cells // TILE).T.tolist()
+        tiles = cells // TILE  # (N, 2)
+        columns: list[int] = tiles[:, 0].tolist()
+        rows: list[int] = tiles[:, 1].tolist()
         for x, y in set(zip(columns, rows, strict=True)):
             rows_near = slice(max(y - reach, 0), y + reach + 1)
             columns_near = slice(max(x - reach, 0), x + reach + 1)

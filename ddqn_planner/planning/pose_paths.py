@@ -189,8 +189,10 @@ def cost_of_poses(poses: Float64, grid: GridMap) -> float:
     The sum is nearly the cost of the primitives of which the path is made.
     """
     path = in_cells(poses, grid)
+    steps: Float64 = np.diff(path[:, :2], axis=0)
+    dx = steps[:, 0]
+    dy = steps[:, 1]
     # All arrays from here on are (N - 1,), a number for each step.
-    dx, dy = np.diff(path[:, :2], axis=0).T
     length = np.hypot(dx, dy)
     yaw = path[:-1, 2]
     turn = turn_between(yaw, path[1:, 2])
@@ -202,7 +204,9 @@ def cost_of_poses(poses: Float64, grid: GridMap) -> float:
     is_on_the_spot = length < ON_THE_SPOT
     cost = np.where(is_on_the_spot, turn_cost, drive_cost)
     # The layers of the map count at the cell in which a step begins.
-    x, y = cells_of(path[:-1]).T
+    cells = cells_of(path[:-1])  # (N - 1, 2)
+    x = cells[:, 0]
+    y = cells[:, 1]
     cell_costs = body_costs(grid)
     if cell_costs is not None:
         cost *= multipliers_of(cell_costs[y, x])
@@ -228,14 +232,14 @@ def touches(path: Float64, points: Float64, occupied: NDArray[np.uint8]) -> bool
     height, width = occupied.shape
     for number in range(len(path)):
         # From the corner of cell (0, 0), so that rounding down gives the cell.
-        x = path[number, 0] + 0.5
-        y = path[number, 1] + 0.5
-        yaw = path[number, 2]
+        x: float = path[number, 0] + 0.5
+        y: float = path[number, 1] + 0.5
+        yaw: float = path[number, 2]
         cos = math.cos(yaw)
         sin = math.sin(yaw)
         for point in range(len(points)):
-            ahead = points[point, 0]
-            left = points[point, 1]
+            ahead: float = points[point, 0]
+            left: float = points[point, 1]
             column = math.floor(x + cos * ahead - sin * left)
             row = math.floor(y + sin * ahead + cos * left)
             if not (0 <= column < width and 0 <= row < height):

@@ -407,13 +407,11 @@ def placed(corners: Corners, poses: Poses) -> NDArray[np.float64]:
     The corners (K, 2) are ahead and to the left of the robot's origin. The poses (N, 3)
     are in metres and radians.
     """
-    x: NDArray[np.float64]
-    y: NDArray[np.float64]
-    yaw: NDArray[np.float64]
-    ahead: NDArray[np.float64]
-    left: NDArray[np.float64]
-    x, y, yaw = poses.T[..., None]  # (N, 1) each
-    ahead, left = corners.T  # (K,) each: in the robot's own frame
+    x = poses[:, :1]  # (N, 1), as y and yaw
+    y = poses[:, 1:2]
+    yaw = poses[:, 2:]
+    ahead = corners[:, 0]  # (K,), in the robot's own frame, as left
+    left = corners[:, 1]
     cos = np.cos(yaw)
     sin = np.sin(yaw)
     corner_x = cos * ahead - sin * left + x  # (N, K)

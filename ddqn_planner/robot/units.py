@@ -46,7 +46,9 @@ def units_of(motions: Motions) -> Units:
 
 def _turned_back(poses: Poses, quarter_turns: int) -> Poses:
     """Return poses (N, 3) turned clockwise around the origin by some quarter turns."""
-    x, y, yaw = poses.T
+    x = poses[:, 0]
+    y = poses[:, 1]
+    yaw = poses[:, 2]
     for _ in range(quarter_turns):
         turned_x = y
         y = -x
@@ -66,5 +68,6 @@ def _are_same(first_poses: Poses, second_poses: Poses) -> bool:
     """Return whether poses (N, 3) are the same except for rounding and whole turns."""
     if len(first_poses) != len(second_poses):
         return False
-    dx, dy, dyaw = (first_poses - second_poses).T
-    return bool(np.abs([dx, dy, turn_between(0, dyaw)]).max() < SAME)
+    difference = first_poses - second_poses
+    difference[:, 2] = turn_between(0, difference[:, 2])
+    return bool(np.abs(difference).max() < SAME)
