@@ -98,7 +98,7 @@ def test_training_takes_numbers_of_any_type_and_is_that_of_a_trainer() -> None:
 def test_a_training_is_stopped_copied_and_continued(
     small: Scenario, network: str
 ) -> None:
-    parameters = replace(BRIEF, network=network, environments=3)
+    parameters = replace(BRIEF, network=network, environments=3, update_interval=10)
     whole, cut = (Trainer([small], parameters) for _ in range(2))
     reports = list(whole.run(every=100))
     assert [report.step for report in reports] == [102, 201, 300]
