@@ -1,7 +1,7 @@
 """How large a map may be for the paper's network: the paper's map, scaled up.
 
 python experiments/map_sizes.py                  # 20 to 200 cells a side, 50,000 steps
-python experiments/map_sizes.py 1 2 3 --steps 200000
+python experiments/map_sizes.py 1 2 3 --steps 200000 --network propagation
 
 Each cell becomes a square of so many cells a side as the arguments say. The times are
 those of one processor core.
@@ -12,6 +12,7 @@ import time
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 from tables import table
 
 from ddqn_planner import GridMap
@@ -22,10 +23,12 @@ from ddqn_planner.training import (
     TrainingRecord,
     paper_scenario,
 )
+from ddqn_planner.training.training_record import EVALUATIONS
 
 SCALES = (1, 2, 3, 4, 5, 7, 10)
 COLUMNS = (
-    "map | starts | solved | from the given start | steps per second | MB of weights"
+    "map | starts | solved | from the given start | steps per second | MB of weights | "
+    "100 evaluations in 50,000 steps"
 )
 
 
@@ -51,6 +54,8 @@ def row(scale: int, parameters: HyperParameters) -> list[str]:
     for progress in trainer.run():
         record.add(progress)
     seconds = time.process_time() - began
+    share = evaluation_seconds(trainer) * EVALUATIONS
+    share /= seconds / parameters.steps * HyperParameters().steps
     point = record.curve[-1]
     weights = sum(tensor.nbytes for tensor in trainer.network.tensors.values())
     return [
@@ -60,7 +65,17 @@ def row(scale: int, parameters: HyperParameters) -> list[str]:
         f"{point.start_ratio:.3f}" if np.isfinite(point.start_ratio) else "trapped",
         f"{parameters.steps / seconds:,.0f}",
         f"{weights / 1e6:.2f}",
+        f"{share:.1%} of the time",
     ]
+
+
+def evaluation_seconds(trainer: Trainer) -> float:
+    """Return the time of an evaluation, the mean of some."""
+    times = 5
+    began = time.process_time()
+    for _ in range(times):
+        TrainingRecord(trainer)
+    return (time.process_time() - began) / times
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -68,8 +83,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("scales", type=int, nargs="*", default=SCALES)
     parser.add_argument("--steps", type=int, default=HyperParameters().steps)
+    parser.add_argument("--network", default="paper")
     options = parser.parse_args(arguments)
-    parameters = HyperParameters(steps=options.steps)
+    torch.set_num_threads(1)
+    parameters = HyperParameters(steps=options.steps, network=options.network)
     print(table(COLUMNS, [row(scale, parameters) for scale in options.scales]))
 
 

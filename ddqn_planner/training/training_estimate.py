@@ -49,7 +49,8 @@ def estimate(scenarios: Sequence[Scenario], parameters: HyperParameters) -> Esti
     100x100    21 %
     ======== ======
 
-    ``python experiments/map_sizes.py`` measures the shares and the times.
+    ``python experiments/map_sizes.py`` measures the shares and the times. The times of
+    other networks are rough.
 
     Parameters
     ----------
@@ -100,7 +101,11 @@ def _warning(
     grid = scenario.grid
     side = math.isqrt(MOST_CELLS)
     minutes = estimated.seconds / 60
-    time = f"{minutes:,.0f} minutes" if minutes < 120 else f"{minutes / 60:,.0f} hours"
+    time = f"{minutes:,.0f} minutes"
+    if minutes < 2:
+        time = f"{estimated.seconds:,.0f} seconds"
+    elif minutes > 120:
+        time = f"{minutes / 60:,.0f} hours"
     return (
         f"a map of {grid.width} x {grid.height} cells is too large for the paper's "
         f"network, which solves few starts of more than {side} x {side} cells: "
