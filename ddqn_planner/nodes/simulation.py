@@ -167,11 +167,15 @@ class Simulation:
         start = self._cell("start", self._poses["start"], map_in_frame)
         goal = self._cell("goal", self._poses["goal"], map_in_frame)
         from ddqn_planner.training import Scenario, TrainingRun  # they need torch
+        from ddqn_planner.training.training_estimate import estimate
 
         node = self._node
         move_rule = MoveRule(node.value("move_rule"))
         scenario = Scenario(map_in_frame.grid, start, goal, move_rule)
         parameters = hyper_parameters(node.values())
+        warning = estimate([scenario], parameters).warning
+        if warning:
+            node.get_logger().warning(warning)
         return TrainingRun(node.folder, [scenario], parameters, node.value("seed"))
 
     def stop(self) -> Answer:
