@@ -86,19 +86,24 @@ def robot(footprint: str, motion: Motion | str) -> Planner:
 
 
 class Oracle:
-    """Counts the occupied cells that a body touches along poses."""
+    """Counts the poses of a path where a body touches an obstacle.
 
-    def __init__(self, grid: GridMap, footprint: str) -> None:
-        y, x = np.nonzero(np.pad(grid.occupancy, 1, constant_values=True))
-        low = np.column_stack([x - 1.0, y - 1.0]) * grid.resolution + grid.origin[:2]
-        high = low + grid.resolution
-        self.cells = shapely.STRtree(shapely.box(*low.T, *high.T))
+    Parameters
+    ----------
+    obstacles : (N,) array of Shapely's polygons
+        In metres.
+    footprint : str
+        The body's.
+    """
+
+    def __init__(self, obstacles: NDArray[np.object_], footprint: str) -> None:
+        self.obstacles = shapely.STRtree(obstacles)
         corners = read_footprint(footprint)
         self.body = shapely.Polygon(corners).buffer(-SHRUNK, join_style="mitre")
         self.corners = np.array(self.body.exterior.coords)
 
     def collisions(self, poses: NDArray[np.float64]) -> int:
-        """Return how many poses of a path touch an occupied cell.
+        """Return at how many poses of a path the body touches an obstacle.
 
         Poses are tried every 2 cm and every 2 degrees between those of `poses` (N, 3):
         x, y in metres and the yaw in radians.
@@ -124,8 +129,17 @@ class Oracle:
         outline_x = cos * ahead - sin * left + x[:, None]  # (M, corners)
         outline_y = sin * ahead + cos * left + y[:, None]
         outlines = shapely.polygons(np.stack([outline_x, outline_y], axis=-1))
-        touching, _ = self.cells.query(outlines, predicate="intersects")
+        touching, _ = self.obstacles.query(outlines, predicate="intersects")
         return len(np.unique(touching))
+
+
+def occupied_cells(grid: GridMap) -> NDArray[np.object_]:
+    """Return the squares (N,) of a map's occupied cells, and of those around it."""
+    y, x = np.nonzero(np.pad(grid.occupancy, 1, constant_values=True))
+    low = np.column_stack([x - 1.0, y - 1.0]) * grid.resolution + grid.origin[:2]
+    high = low + grid.resolution
+    squares: NDArray[np.object_] = shapely.box(*low.T, *high.T)
+    return squares
 
 
 def inner_radius(corners: NDArray[np.float64]) -> float:
@@ -377,7 +391,7 @@ def collisions(options: argparse.Namespace) -> Iterator[list[Any]]:
         plans = []
         colliding = 0
         for grid in maps.values():
-            oracle = Oracle(grid, footprint)
+            oracle = Oracle(occupied_cells(grid), footprint)
             drawn = requests(grid, radius + CELL, random)
             for start, goal in islice(drawn, options.requests):
                 plan = planner.plan_poses(grid, start, goal)
