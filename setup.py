@@ -113,7 +113,7 @@ setup(
         "tensorboard": ["tensorboard>=2.10"],
         "experiments": ["joblib>=1.3", "matplotlib>=3.6"],
         "bags": ["mcap-ros2-support>=0.5"],
-        "docs": ["furo", "myst-parser>=3.0", "sphinx>=7.3"],
+        "docs": ["furo", "myst-parser>=3.0", "sphinx>=7.3", "sphinx-copybutton>=0.5"],
         "bench": [
             "dijkstra3d>=1.15",
             "nano-astar>=0.1.2",

@@ -18,6 +18,7 @@ repository = manifest.findtext("url[@type='repository']", "")
 
 extensions = [
     "myst_parser",
+    "sphinx_copybutton",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
@@ -33,6 +34,10 @@ if ".example" not in repository:
 html_title = f"ddqn_planner {release}"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+# Buttons that copy a block leave out the prompt and the output after it.
+copybutton_prompt_text = "$ "
+copybutton_exclude = ".linenos, .gp, .go"
+
 pygments_style = "friendly"
 pygments_dark_style = "native"
 

@@ -10,8 +10,10 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import page_pictures
 import scipy.ndimage
-from figures import draw_map, draw_path, plt
+import training_pictures
+from figures import draw_path, plt
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -22,16 +24,11 @@ from ddqn_planner.gymnasium_registration import ENVIRONMENT
 from ddqn_planner.pictures import draw_obstacles
 from ddqn_planner.resources import find_map
 from ddqn_planner.training.environment import paper_scenario
-from ddqn_planner.training.evaluation import length_ratios
-from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.trainer import Trainer
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
-DPI = 100
-PALETTE = 64  # colours of a file, which keep it small
+DPI = 130
+PALETTE = 128  # colours of a file, which keep it small
 RULE = MoveRule.ROBOT_SAFE
-
-TRAINING_STEPS = (1_000, 15_000, 50_000)
 
 OFFICE_DETAIL = (240, 160)  # width and height of its lower left corner, in cells
 OFFICE_GOAL: Cell = (230, 98)
@@ -56,29 +53,6 @@ def draw_ends(axes: Any, start: Cell, goal: Cell) -> None:
     style: Any = {"color": "black", "edgecolors": "white", "zorder": 5}
     axes.scatter(*start, 60, marker="o", **style)
     axes.scatter(*goal, 150, marker="*", **style)
-
-
-def training() -> Any:
-    """Draw which starts reach the goal after three numbers of steps."""
-    scenario = paper_scenario()
-    parameters = HyperParameters(steps=TRAINING_STEPS[-1])
-    trainer = Trainer([scenario], parameters, seed=0)
-    figure, panels = plt.subplots(1, 3, figsize=(9.6, 3.5), layout="constrained")
-    for axes, steps in zip(panels, TRAINING_STEPS, strict=True):
-        for _ in trainer.run(steps, every=500):
-            pass
-        field = trainer.planner().q_field(scenario.grid, scenario.goal)
-        ratios = length_ratios(field, scenario.grid, scenario.move_rule)
-        # 1 where a start reaches the goal, 0 where not, NaN where none can.
-        is_solved = np.where(np.isnan(ratios), np.nan, np.isfinite(ratios))
-        axes.imshow(
-            is_solved, origin="lower", cmap="RdYlGn", vmin=-0.6, vmax=1.6, alpha=0.6
-        )
-        share = float(np.nanmean(is_solved))
-        draw_map(axes, scenario, f"step {steps:,}: {share:.0%} of the starts")
-        path = field.rollout(scenario.start).cells
-        draw_path(axes, path, 0, "path from the start")
-    return figure
 
 
 def start_of(map_file: MapFile) -> Cell:
@@ -244,27 +218,52 @@ def gymnasium_frames() -> Any:
 
 
 PICTURES: Mapping[str, Callable[[], Any]] = {
-    "training": training,
+    "task": training_pictures.task,
+    "dead_end": training_pictures.dead_end,
+    "improvements": training_pictures.improvements,
+    "training": training_pictures.training,
+    "learning_curves": training_pictures.learning_curves,
     "tuning": tuning,
     "warehouse": warehouse,
     "costmap": costmap,
     "nav2": nav2,
     "gymnasium": gymnasium_frames,
+    "network": page_pictures.network,
+    "kinds": page_pictures.kinds,
+    "decisions": page_pictures.decisions,
+    "speed": page_pictures.speed,
+    "python_api": page_pictures.python_api,
+}
+
+
+# What these save is complete: a film, or a picture that a user's command draws.
+FILES: Mapping[str, Callable[[Path], None]] = {
+    "own_map.png": training_pictures.save_own_map,
+    "training.gif": training_pictures.save_film,
+    "command_line.png": page_pictures.save_command_line,
 }
 
 
 def main(names: Sequence[str]) -> int:
     """Draw pictures into docs/images, in few colours."""
-    for name in names or PICTURES:
-        figure = PICTURES[name]()
-        path = IMAGES / f"{name}.png"
-        figure.canvas.draw()
-        figure.savefig(path, dpi=DPI)
-        plt.close(figure)
-        with Image.open(path) as image:
-            image.convert("RGB").quantize(PALETTE).save(path, optimize=True)
+    for name in names or [*PICTURES, *FILES]:
+        if name in FILES:
+            path = IMAGES / name
+            FILES[name](path)
+        else:
+            path = IMAGES / f"{name}.png"
+            save_picture(PICTURES[name](), path)
         print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
     return 0
+
+
+def save_picture(figure: Any, path: Path) -> None:
+    """Save a figure in few colours, and close it."""
+    figure.canvas.draw()
+    figure.savefig(path, dpi=DPI)
+    plt.close(figure)
+    with Image.open(path) as image:
+        image.convert("RGB").quantize(PALETTE).save(path, optimize=True)
 
 
 if __name__ == "__main__":
