@@ -136,6 +136,7 @@ RVIZ_TOPICS = {
     "/planner/value": f"{PLANNER}/value",
     "/planner/value_updates": f"{PLANNER}/value_updates",
     "/trainer/episode": "trainer/episode",
+    "/trainer/episode_markers": "trainer/episode_markers",
     "/initialpose": "initialpose",
     "/goal_pose": "goal_pose",
 }

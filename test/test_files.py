@@ -194,7 +194,7 @@ def test_each_option_that_names_a_file_knows_the_home_folder(
     # The network that needs the least compiling.
     train = "train ~/m.yaml --start 0 0 --goal 9 2 --network propagation --steps 20"
     ran = console(f"{train} --out ~/run").out
-    assert f"saved {home}/run/model.safetensors" in ran
+    assert f"{home}/run/model.safetensors\n" in ran
     names = ("out/p.csv", "p.png", "e.npz", "f.npz", "run/checkpoint.safetensors")
     assert all((home / name).is_file() for name in names)
     for command in ("train dilemma --out", "learn ~/d.csv --map ~/m.yaml --experience"):

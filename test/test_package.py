@@ -160,7 +160,8 @@ def test_the_version_is_that_of_the_source_else_of_the_installation(
         # Isolated from the environment's installation.
         script = f"import sys; sys.path.insert(0, {str(folder)!r}); {PRINT_VERSION}"
         command = [sys.executable, "-S", "-c", script]
-        return subprocess.check_output(command, text=True).strip()
+        # Not in the folder of the tests, which may have metadata, too.
+        return subprocess.check_output(command, text=True, cwd=folder).strip()
 
     assert version_in(tmp_path) == VERSION
     # A copy, as installed: the package.xml beside it is of another package.

@@ -405,11 +405,11 @@ def placed(corners: Corners, poses: Poses) -> NDArray[np.float64]:
     """Return where the corners of a body are at each of some poses: (N, K, 2), metres.
 
     The corners (K, 2) are ahead and to the left of the robot's origin. The poses (N, 3)
-    are in metres and radians.
+    are in metres and radians; the result of one pose, (3,), is (K, 2).
     """
-    x = poses[:, :1]  # (N, 1), as y and yaw
-    y = poses[:, 1:2]
-    yaw = poses[:, 2:]
+    x = poses[..., :1]  # (N, 1), as y and yaw
+    y = poses[..., 1:2]
+    yaw = poses[..., 2:]
     ahead = corners[:, 0]  # (K,), in the robot's own frame, as left
     left = corners[:, 1]
     cos = np.cos(yaw)

@@ -293,7 +293,7 @@ def test_rviz_shows_the_planner_of_its_namespace(workspace: Workspace) -> None:
     topics = topics_of(
         yaml.safe_load((ROOT / "rviz" / "ddqn_planner.rviz").read_text())
     )
-    assert len(topics) == 8
+    assert len(topics) == 9
     assert rviz.remaps.keys() == topics | {"/tf", "/tf_static"}
     for topic, target in rviz.remaps.items():
         assert target == topic[1:].replace("planner/", "ddqn_planner/")

@@ -339,7 +339,13 @@ CLASSES = {  # of rviz_default_plugins
     "geometry_msgs/PoseStamped": "SetGoal",
     "geometry_msgs/PoseWithCovarianceStamped": "SetInitialPose",
 }
-SHOWN = {"/map", "/plan", "/planner/value", "/trainer/episode"}
+SHOWN = {
+    "/map",
+    "/plan",
+    "/planner/value",
+    "/trainer/episode",
+    "/trainer/episode_markers",
+}
 SET = {"/initialpose", "/goal_pose"}
 
 
