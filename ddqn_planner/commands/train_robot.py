@@ -11,6 +11,7 @@ from ddqn_planner.commands.options import Option, add_options
 from ddqn_planner.files import as_path, check_distinct, check_writable
 from ddqn_planner.grid.arguments import as_whole
 from ddqn_planner.model import save_model
+from ddqn_planner.model.model_file import check_model_path
 from ddqn_planner.training.robot import MOST_STEPS, ROBOT, RobotTrainer
 
 OPTIONS = (
@@ -51,6 +52,7 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
     options = parser.parse_args(arguments)
     as_whole("--steps", options.steps, 1, MOST_STEPS)
     out = as_path(options.out, "--out")
+    check_model_path(out)  # before a long training
     check_writable(out, "--out")
     check_distinct({"--out": out}, {"--lattice": options.lattice})
     trainer = RobotTrainer(

@@ -94,9 +94,10 @@ class GridMap:
         Metres: cells nearer than this to an obstacle are occupied, too; see `inflate`.
     cost_multiplier : (H, W) array of numbers, optional
         Costs of free cells as factors, 1 to 100: a path through a cell of 2.5 costs 2.5
-        times its length. They multiply the other costs, and all factors of a cell give
-        100 at most, its `cost` apart. Values of occupied cells are ignored. The map's
-        attribute `cost_multiplier` has the product of all costs.
+        times its length. Percent belong into `cost`. The factors multiply the other
+        costs, and all factors of a cell give 100 at most, its `cost` apart. Values of
+        occupied cells are ignored. The map's attribute `cost_multiplier` has the
+        product of all costs.
 
     Examples
     --------
@@ -177,7 +178,8 @@ class GridMap:
             shape = self.occupancy.shape
             array = arguments.numbers("cost_multiplier", cost_multiplier, shape)
             of_free = np.where(self.occupancy, 1, array)
-            factors = _factors("cost_multiplier", of_free, shape)
+            remedy = f"1 to {arguments.MAX_SLOWNESS:g}; percent belong into `cost`"
+            factors = _factors("cost_multiplier", of_free, shape, remedy)
             self._set(_factors=factors)
             self._set(slowness=self._multiplied(self.slowness))
 
@@ -798,11 +800,16 @@ def _forbidden(
 
 
 def _factors(
-    name: str, factors: ArrayLike, shape: tuple[int, ...]
+    name: str, factors: ArrayLike, shape: tuple[int, ...], remedy: str = ""
 ) -> NDArray[np.float32]:
-    """Return a checked copy of factors of cells (H, W), which errors call `name`."""
+    """Return a checked copy of factors of cells (H, W), which errors call `name`.
+
+    `remedy` says what to give instead of wrong ones, by default the range.
+    """
     limits = 1, arguments.MAX_SLOWNESS
-    array = arguments.numbers(name, factors, shape, "iuf", limits, whole=False)
+    array = arguments.numbers(
+        name, factors, shape, "iuf", limits, whole=False, remedy=remedy
+    )
     return array.astype(np.float32, order="C")
 
 

@@ -71,8 +71,7 @@ def find_model(name: str | Path) -> Path:
         path = as_path(name, "the model")
     except ValueError as error:
         raise ModelFileError(str(error)) from None
-    is_path = path.suffix == MODEL_SUFFIX or path.name != str(name)
-    if is_path:
+    if _is_path(name, path):
         kind = kind_of(path)  # such as "a pipe"; empty for a regular or missing file
         if kind:
             raise ModelFileError(
@@ -86,12 +85,39 @@ def find_model(name: str | Path) -> Path:
     except FileNotFoundError as error:
         problem = f"there is no shipped model {str(name)!r}: {error}"
         remedy = f"give one of these or the path of a {MODEL_SUFFIX} file"
+        if os.path.isfile(path):
+            remedy = f"give './{path}' for the file of that name"
         raise ModelFileError(f"{problem}; {remedy}") from None
 
 
+def _is_path(name: str | Path, path: Path) -> bool:
+    """Return whether the name of a model is a path: not a shipped model's name.
+
+    `path` is that of `as_path`.
+    """
+    return path.suffix == MODEL_SUFFIX or path.name != str(name)
+
+
+def check_model_path(path: str | Path) -> Path:
+    """Return the path of a new model file, as `as_path`.
+
+    A ValueError if `load_model` would take it for a shipped model's name.
+    """
+    file = as_path(path)
+    if not _is_path(path, file):
+        raise ValueError(
+            f"the path {str(path)!r} would be read as a shipped model's name; give a "
+            f"name that ends in {MODEL_SUFFIX}"
+        )
+    return file
+
+
 def save_model(path: str | Path, network: QNetwork, description: ModelMetadata) -> None:
-    """Write a model file; an older file stays until the new one is complete."""
-    write_atomically(as_path(path), model_bytes(network, description))
+    """Write a model file; an older file stays until the new one is complete.
+
+    A ValueError says that `load_model` would not read the file by this path.
+    """
+    write_atomically(check_model_path(path), model_bytes(network, description))
 
 
 def model_bytes(network: QNetwork, description: ModelMetadata) -> bytes:

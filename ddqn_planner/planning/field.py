@@ -116,7 +116,8 @@ class QField(Field[Known]):
     def rollout(self, start: Cell, straight: bool = False) -> Plan:
         """Return the plan of greedy steps from a free cell, (x, y), to a goal.
 
-        Its path, or its status without one, is that of `greedy_path`.
+        Its path, or its status without one, is that of `greedy_path`. A start outside
+        the map is a ValueError.
         """
         outcome = self.greedy_path(start, straight)
         if isinstance(outcome, PlanStatus):

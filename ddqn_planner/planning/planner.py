@@ -77,7 +77,9 @@ class Planner:
     def save(self, path: str | Path) -> None:
         """Save the model to a file for `load`.
 
-        After an OSError, a file that was there is unchanged.
+        A name without a folder must end in .safetensors, as `load` takes another one
+        for a shipped model's; otherwise it is a ValueError. After an OSError, a file
+        that was there is unchanged.
         """
         save_model(path, self.network, self.metadata)
 

@@ -25,7 +25,7 @@ def train(
 
     It learns to reach this goal on this map; `Planner.save` saves it. The same
     arguments give the same network. A UserWarning tells that a map is too large for the
-    paper's network, see `estimate`.
+    paper's network, see `estimate`, or that the steps are too few to learn anything.
 
     Parameters
     ----------

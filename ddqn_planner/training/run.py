@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ddqn_planner.files import WorkFolder, write_atomically
+from ddqn_planner.training.checkpoint import CHECKPOINT
 from ddqn_planner.training.episodes import Progress, open_record, record
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.scenario import Scenario
@@ -12,7 +13,6 @@ from ddqn_planner.training.trainer import Trainer
 
 SAVE_INTERVAL = 5_000  # environment steps between two checkpoints
 LOCK = "training.lock"
-CHECKPOINT = "checkpoint.safetensors"
 
 
 class TrainingRun(WorkFolder):

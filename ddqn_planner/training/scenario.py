@@ -71,8 +71,14 @@ def map_scenario(name: str) -> Scenario:
 
 def check_scenarios(scenarios: Sequence[Scenario]) -> None:
     """Raise a ValueError unless there are scenarios, all with maps of one size."""
-    if not scenarios or not all(isinstance(item, Scenario) for item in scenarios):
+    if not scenarios:
         raise ValueError(f"the scenarios are {scenarios!r}; give at least one Scenario")
+    for item in scenarios:
+        if not isinstance(item, Scenario):
+            raise ValueError(
+                f"the scenarios hold a {type(item).__name__}; give "
+                "Scenario(grid, start, goal)"
+            )
     shapes = {scenario.grid.occupancy.shape for scenario in scenarios}
     if len(shapes) != 1:
         raise ValueError(

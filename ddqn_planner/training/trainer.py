@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from safetensors import safe_open
 
-from ddqn_planner.files import as_path, differences, open_regular, write_atomically
+from ddqn_planner.files import as_path, differences, write_atomically
 from ddqn_planner.grid import MOVES
 from ddqn_planner.grid.arguments import as_seed, as_whole, listed
 from ddqn_planner.interrupts import interrupts_wait
@@ -31,7 +31,9 @@ from ddqn_planner.training.checkpoint import (
     CHECKPOINT_KEY,
     DIGEST_KEY,
     CheckpointError,
+    check_checkpoint,
     digest_of,
+    reason_of,
 )
 from ddqn_planner.training.compiled_learner import Counters, play, training_of
 from ddqn_planner.training.double_dqn import (
@@ -405,7 +407,7 @@ class Trainer:
             "generators": states,
         }
 
-    def save_checkpoint(self, path: Path) -> None:
+    def save_checkpoint(self, path: str | Path) -> None:
         """Write all that `restore` needs; after an OSError an old file is unchanged."""
         # The file has arrays in the order of C alone.
         tensors = {
@@ -416,7 +418,7 @@ class Trainer:
         metadata = {CHECKPOINT_KEY: text, DIGEST_KEY: digest_of(text, tensors)}
         write_atomically(as_path(path), safetensors.numpy.save(tensors, metadata))
 
-    def restore(self, path: Path) -> None:
+    def restore(self, path: str | Path) -> None:
         """Continue from the checkpoint at `path`, which must be of this training.
 
         The checkpoint's parameters may differ in `steps` alone. A learning rate that
@@ -425,12 +427,14 @@ class Trainer:
         Raises
         ------
         CheckpointError
-            If the file is not a complete checkpoint, or one of another training. Then
-            this trainer may have read a part of it, and must not be used any more.
+            If there is no such file, it is not a complete checkpoint, or one of another
+            training. Then this trainer may have read a part of it, and must not be used
+            any more.
         """
+        path = as_path(path, "the checkpoint")
+        check_checkpoint(path)
         try:
-            open_regular(as_path(path)).close()  # safe_open would wait for a pipe
-            with safe_open(as_path(path), framework="np") as file:
+            with safe_open(path, framework="np") as file:
                 metadata = file.metadata()
                 description = json.loads(metadata[CHECKPOINT_KEY])
                 self._check_training(description)
@@ -447,9 +451,9 @@ class Trainer:
         except MemoryError:
             raise
         except Exception as error:  # a broken file can raise any error in the libraries
-            problem = f"is no complete checkpoint ({error!r}); remove it to train anew"
             raise CheckpointError(
-                f"{path}: {problem}, or train into another folder"
+                f"{path}: is no complete checkpoint ({reason_of(error)}); remove it to "
+                "train anew, or train into another folder"
             ) from error
 
     def _check_training(self, saved: dict[str, Any]) -> None:

@@ -30,7 +30,7 @@ class Estimate(NamedTuple):
     seconds: float  # of all steps
     checkpoint_bytes: int
     memory_bytes: int  # beside that of the libraries, about 400 MB
-    warning: str  # "" unless the maps are too large for the network
+    warning: str  # "" unless the maps are too large, or nothing is learned
 
 
 def estimate(scenarios: Sequence[Scenario], parameters: HyperParameters) -> Estimate:
@@ -81,9 +81,10 @@ def estimate(scenarios: Sequence[Scenario], parameters: HyperParameters) -> Esti
         memory_bytes=5 * checkpoint + BYTES_OF_CELL * cells + replay,
         warning="",
     )
-    if parameters.network != "paper" or grid.width * grid.height <= MOST_CELLS:
-        return result
-    return result._replace(warning=_warning(scenarios[0], parameters, result))
+    warnings = [_warning_of_steps(parameters)]
+    if parameters.network == "paper" and grid.width * grid.height > MOST_CELLS:
+        warnings.append(_warning(scenarios[0], parameters, result))
+    return result._replace(warning="; ".join(filter(None, warnings)))
 
 
 def _count_weights(scenario: Scenario, parameters: HyperParameters) -> int:
@@ -92,6 +93,21 @@ def _count_weights(scenario: Scenario, parameters: HyperParameters) -> int:
     sizes = {**asdict(parameters), "height": grid.height, "width": grid.width}
     shapes = NETWORKS[parameters.network].shapes(sizes)
     return sum(math.prod(shape) for shape in shapes.values())
+
+
+def _warning_of_steps(parameters: HyperParameters) -> str:
+    """Return the warning that no update falls within the steps; "" if one does."""
+    steps = parameters.steps
+    if steps <= parameters.learning_starts:
+        name, value = "learning_starts", parameters.learning_starts
+    elif steps < parameters.update_interval:
+        name, value = "update_interval", parameters.update_interval
+    else:
+        return ""
+    return (
+        f"steps is {steps} and {name} {value}: nothing is learned; give more steps or "
+        f"a smaller {name}"
+    )
 
 
 def _warning(

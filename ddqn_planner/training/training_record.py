@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, shortest_distances
+from ddqn_planner.grid.arguments import as_whole
 from ddqn_planner.training.episodes import Episode, EpisodeEnd, Progress
 from ddqn_planner.training.evaluation import Evaluation, ratios_to, summary_of
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from ddqn_planner.training.trainer import Trainer
 
 EVALUATIONS: Final = 100  # in a training; they take 1 to 3 % of its time
+MOST_EVALUATIONS: Final = 10**12  # as many as a training can have steps
 SHOWN_EPISODES: Final = 40  # the last ones before an evaluation
 
 
@@ -86,9 +88,16 @@ class TrainingRecord:
         evaluations : int
             How many evaluations a whole training has: as many frames has its film.
         """
+        from ddqn_planner.training.trainer import Trainer  # needs torch
+
+        if not isinstance(trainer, Trainer):
+            raise ValueError(f"the trainer is {trainer!r}; give a Trainer")
+        scenario = as_whole("scenario", scenario, 0, len(trainer.scenarios) - 1)
+        steps = trainer.parameters.steps
+        evaluations = as_whole("evaluations", evaluations, 1, MOST_EVALUATIONS)
         self.trainer = trainer
         self.scenario = trainer.scenarios[scenario]
-        self.interval = max(1, trainer.parameters.steps // evaluations)
+        self.interval = max(1, steps // evaluations)
         self.curve: list[CurvePoint] = []
         self.snapshots: list[Snapshot] = []
         self._scenario_number = scenario
@@ -96,6 +105,7 @@ class TrainingRecord:
             self.scenario.grid, self.scenario.goal, self.scenario.move_rule
         )
         self._episodes: list[Episode] = []  # since the last evaluation
+        self._last_step = trainer.steps  # of which the episodes are known
         self._begin = time.monotonic()
         self.evaluate()
 
@@ -108,8 +118,21 @@ class TrainingRecord:
     def add(self, progress: Progress) -> CurvePoint | None:
         """Add the episodes of a progress; return an evaluation if one was due.
 
-        Call this with all that `Trainer.run` yields.
+        Call this at once with all that `Trainer.run` yields: a progress of another step
+        than the trainer's is a ValueError. One that was added before is ignored.
         """
+        if not isinstance(progress, Progress):
+            raise ValueError(
+                f"the progress is {progress!r}; give what the trainer's run yields"
+            )
+        if progress.step != self.trainer.steps:
+            raise ValueError(
+                f"the progress is of step {progress.step}, and the trainer at step "
+                f"{self.trainer.steps}; give what this trainer's run yields, at once"
+            )
+        if progress.step <= self._last_step:
+            return None
+        self._last_step = progress.step
         self._episodes.extend(progress.episodes)
         evaluated = self.curve[-1].step // self.interval
         is_due = progress.step // self.interval > evaluated

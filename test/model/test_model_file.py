@@ -25,6 +25,7 @@ from ddqn_planner.model import (
     save_model,
 )
 from ddqn_planner.model.move_costs import MAX_MULTIPLIER
+from ddqn_planner.planning import Planner
 from ddqn_planner.planning.field import network_field
 
 SIZED = {"height": 4, "width": 5, "filters": 2, "hidden_units": 0}
@@ -285,3 +286,19 @@ def test_a_model_of_any_name_is_shipped_or_refused(name: str) -> None:
     with suppress(ModelFileError):
         load_model(name)
         assert name in ("any_map", "dilemma", "differential_robot", "car")
+
+
+def test_a_model_is_saved_only_where_it_can_be_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    planner = Planner.load("dilemma")
+    for name in ("m.pt", "mm", "any_map", Path("m.pt")):
+        with pytest.raises(ValueError, match=r"give a name that ends in .safetensors"):
+            planner.save(name)
+    assert not [*tmp_path.iterdir()]
+    for name in ("m.safetensors", "./m.pt", "./any_map", str(tmp_path / "mm")):
+        planner.save(name)
+        assert Planner.load(name).metadata == planner.metadata
+    with pytest.raises(ModelFileError, match=r"give './m\.pt' for the file"):
+        Planner.load("m.pt")

@@ -201,8 +201,10 @@ def test_a_scenario_takes_cells_of_any_type_and_one_way_zones_count() -> None:
 
 
 def test_only_scenarios_and_parameters_make_an_environment(paper: Scenario) -> None:
-    for scenarios in ([], ["office"], [paper, None]):
-        with pytest.raises(ValueError, match="give at least one Scenario"):
+    wrong = {"give at least one Scenario": [], "hold a str; give Scenario": ["office"]}
+    wrong |= {"hold a GridMap; give Scenario": [paper, paper.grid]}
+    for problem, scenarios in wrong.items():
+        with pytest.raises(ValueError, match=problem):
             GridVectorEnvironment(scenarios, PARAMETERS)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="give HyperParameters"):
         GridVectorEnvironment([paper], 5)  # type: ignore[arg-type]

@@ -234,8 +234,8 @@ BRIEF = replace(QUICK, replay_capacity=100)
 def checkpoint(small: Scenario, tmp_path: Path) -> Path:
     trainer = make(small, BRIEF)
     train(trainer, 60)
-    trainer.save_checkpoint(tmp_path / "checkpoint")
-    return tmp_path / "checkpoint"
+    trainer.save_checkpoint(tmp_path / "checkpoint.safetensors")
+    return tmp_path / "checkpoint.safetensors"
 
 
 def test_the_format_of_a_checkpoint_stays(checkpoint: Path) -> None:
@@ -289,6 +289,31 @@ def test_a_wrong_checkpoint_is_refused(
         # Another bit in a fingerprint is another map.
         with pytest.raises(CheckpointError, match="or train into another folder"):
             make(small, BRIEF).restore(checkpoint)
+
+
+def test_only_a_broken_checkpoint_should_be_removed(
+    small: Scenario, checkpoint: Path, tmp_path: Path
+) -> None:
+    trainer = make(small, BRIEF)
+    notes, model, broken = (tmp_path / name for name in ("notes", "model", "broken"))
+    notes.write_text("mine")
+    trainer.planner().save(model)
+    broken.write_bytes(checkpoint.read_bytes()[:-1])
+    for path, problem in (
+        (tmp_path / "none", "no such file"),
+        (tmp_path, "is a folder"),
+        (notes, "is no checkpoint"),
+        (model, "is no checkpoint"),
+    ):
+        with pytest.raises(CheckpointError, match="give the path of a") as error:
+            trainer.restore(path)
+        assert problem in str(error.value)
+        assert "remove" not in str(error.value)
+    with pytest.raises(CheckpointError, match="remove it to train anew, or") as error:
+        trainer.restore(broken)
+    assert "Error(" not in str(error.value)
+    with pytest.raises(ValueError, match="the checkpoint is None; give a str or"):
+        trainer.restore(None)  # type: ignore[arg-type]
 
 
 def test_a_checkpoint_of_holes_is_refused_unread(

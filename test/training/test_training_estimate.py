@@ -45,6 +45,22 @@ def test_longer_trainings_on_larger_maps_take_longer() -> None:
         assert quicker.memory_bytes < long.memory_bytes
 
 
+def test_steps_without_an_update_are_told() -> None:
+    scenario = Scenario(GridMap(np.zeros((3, 3))), (0, 0), (2, 2))
+    for number, values in enumerate(
+        ({"learning_starts": 40}, {"learning_starts": 0, "update_interval": 41}) * 2
+    ):
+        steps = 40 if number < 2 else 41
+        parameters = HyperParameters(filters=4, steps=steps, **values)
+        trainer = Trainer([scenario], parameters, seed=0)
+        for _ in trainer.run():
+            pass
+        is_told = "nothing is learned" in estimate([scenario], parameters).warning
+        assert is_told == (trainer.updates == 0) == (steps == 40)
+    with pytest.warns(UserWarning, match="steps is 3 and learning_starts 500: nothing"):
+        train(scenario.grid, (0, 0), (2, 2), steps=3, learning_starts=500)
+
+
 def test_training_in_one_call_warns() -> None:
     with pytest.warns(UserWarning, match="81 x 81 cells is too large"):
         train(LARGE.grid, LARGE.start, LARGE.goal, steps=1)

@@ -138,3 +138,24 @@ def test_an_old_film_stays_if_the_disk_is_full(
         with pytest.raises(OSError, match="No space left"):
             save(file)
         assert file.read_bytes() == b"old"
+
+
+def test_a_record_takes_its_own_trainer_and_progress_alone(small: Scenario) -> None:
+    trainer = Trainer([small], PARAMETERS, seed=0)
+    with pytest.raises(ValueError, match="the trainer is None; give a Trainer"):
+        TrainingRecord(None)  # type: ignore[arg-type]
+    for name, value in {"scenario": 1, "evaluations": 0}.items():
+        with pytest.raises(ValueError, match=f"{name} is {value}; give"):
+            TrainingRecord(trainer, **{name: value})
+    record = TrainingRecord(trainer, evaluations=1)
+    with pytest.raises(ValueError, match="the progress is 3; give what"):
+        record.add(3)  # type: ignore[arg-type]
+    other = Trainer([small], PARAMETERS, seed=1)
+    with pytest.raises(ValueError, match="of step 100, and the trainer at step 0"):
+        record.add(next(other.run(every=100)))
+    for progress in trainer.run():
+        record.add(progress)
+        record.add(progress)  # is ignored
+    steps = [point.step for point in record.curve]
+    assert steps == [0, 600]
+    assert record.add(progress) is None
