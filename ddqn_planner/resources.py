@@ -20,6 +20,7 @@ PACKAGES: Final = {
     "mcap_ros2": "mcap-ros2-support",
     "numba": "numba",
     "safetensors": "safetensors",
+    "stable_baselines3": "stable-baselines3",
     "tensorboard": "tensorboard",
     "torch": "torch",
 }

@@ -3,6 +3,7 @@
 python examples/body_film.py robots.gif
 """
 
+import argparse
 import math
 import sys
 from collections.abc import Sequence
@@ -64,6 +65,22 @@ def lane() -> tuple[GridMap, Pose, Pose]:
 
 def main(arguments: Sequence[str]) -> int:
     """Save the film; return 1 if there is no path."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument(
+        "file",
+        nargs="?",
+        default="robots.gif",
+        help="where to save the film, by default %(default)s",
+    )
+    name = parser.parse_args(arguments).file
+    try:
+        file = as_path(name, "the film")
+    except ValueError as error:
+        parser.error(str(error))
+    if file.suffix.lower() != ".gif":
+        parser.error(f"the film is {name!r}; give a name that ends in .gif")
+    if not file.parent.is_dir():
+        parser.error(f"there is no folder {str(file.parent)!r}; make it")
     scenes = {"differential_robot": door(), "car": lane()}
     figure, panels = plt.subplots(2, 1, figsize=(4.4, 5.8), layout="constrained")
     drives: list[Drive] = []
@@ -98,9 +115,9 @@ def main(arguments: Sequence[str]) -> int:
     longest = max(len(drive.outlines) for drive in drives)
     frames = [*range(0, longest, 2), *[longest] * LAST_FRAMES]
     animation = FuncAnimation(figure, draw, frames)
-    animation.save(as_path(arguments[0]), PillowWriter(FRAMES_PER_SECOND))
+    animation.save(file, PillowWriter(FRAMES_PER_SECOND))
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:] or ["robots.gif"]))
+    sys.exit(main(sys.argv[1:]))

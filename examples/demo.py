@@ -1,5 +1,6 @@
 """Starts the map server and the planner, and shows a path on each of two maps."""
 
+import argparse
 import sys
 import time
 from collections.abc import Sequence
@@ -71,11 +72,12 @@ def show_path(client: Client, case: Case, nodes: Sequence[Popen[bytes]]) -> None
     print(f"picture: {case.picture}\n", flush=True)
 
 
-def main(_: Sequence[str]) -> int:
+def main(arguments: Sequence[str]) -> int:
     """Show a path on each map.
 
     No process is left behind, also when this one is interrupted.
     """
+    argparse.ArgumentParser(description=__doc__).parse_args(arguments)
     with claim_ros_domain():
         for case in CASES:
             yaml_file = f"{case.map_name}.yaml"

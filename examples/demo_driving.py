@@ -1,8 +1,6 @@
-"""A robot learns by driving where it is slow, with the real nodes.
+"""A robot learns by driving where it is slow, with the real nodes."""
 
-The number of missions is an argument, 40 by default.
-"""
-
+import argparse
 import math
 import sys
 import tempfile
@@ -167,9 +165,25 @@ def save_pictures(world: World, missions: Sequence[Mission]) -> None:
     curve.savefig("demo_driving_curve.png", dpi=110)
 
 
+def mission_count(arguments: Sequence[str]) -> int:
+    """Return the number of missions from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "missions",
+        nargs="?",
+        type=int,
+        default=MISSIONS,
+        help="how many the robot drives, by default %(default)s",
+    )
+    count: int = parser.parse_args(arguments).missions
+    if count < 1:
+        parser.error(f"the number of missions is {count}; give 1 or more")
+    return count
+
+
 def main(arguments: Sequence[str]) -> int:
     """Drive the missions, and save what they show."""
-    count = int(arguments[0]) if arguments else MISSIONS
+    count = mission_count(arguments)
     world, random = generated_world(WORLD, SEED), np.random.default_rng(SEED)
     # Its route is compared with others cell by cell.
     planning = {

@@ -1,8 +1,6 @@
-"""A robot learns to leave the dead end of the paper's map: a film.
+"""A robot learns to leave the dead end of the paper's map: a film."""
 
-The number of steps is an argument, 50,000 by default.
-"""
-
+import argparse
 import sys
 from collections.abc import Sequence
 
@@ -18,8 +16,20 @@ FILM = "demo_training.gif"
 
 def main(arguments: Sequence[str]) -> int:
     """Train, print how well, and save the film."""
-    steps = int(arguments[0]) if arguments else HyperParameters().steps
-    trainer = Trainer([paper_scenario()], HyperParameters(steps=steps), seed=0)
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "steps",
+        nargs="?",
+        type=int,
+        default=HyperParameters().steps,
+        help="of the training, by default %(default)s",
+    )
+    steps = parser.parse_args(arguments).steps
+    try:
+        parameters = HyperParameters(steps=steps)
+    except ValueError as error:
+        parser.error(str(error))
+    trainer = Trainer([paper_scenario()], parameters, seed=0)
     record = TrainingRecord(trainer, evaluations=60)
     for progress in trainer.run(every=record.interval):
         point = record.add(progress)

@@ -8,15 +8,21 @@ Both are parameters of the environment, so that any learner can use them.
 """
 
 import argparse
+import sys
 import time
 
 import gymnasium
 import numpy as np
 import torch
-from stable_baselines3 import DQN
-from stable_baselines3.common.callbacks import BaseCallback
 
+from ddqn_planner.resources import with_remedy
 from ddqn_planner.training import HyperParameters, Scenario, paper_scenario
+
+try:
+    from stable_baselines3 import DQN
+    from stable_baselines3.common.callbacks import BaseCallback
+except ImportError as error:
+    sys.exit(with_remedy(error))
 
 PLAIN = HyperParameters(p_r=0, alpha=0, beta=0)
 IMPROVED = HyperParameters()

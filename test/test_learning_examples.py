@@ -1,3 +1,4 @@
+import importlib
 import re
 import sys
 from typing import Any
@@ -71,6 +72,41 @@ def test_the_single_file_runs(
     monkeypatch.setattr(sys, "argv", ["single_file_ddqn.py", *options])
     single_file_ddqn.main()
     assert re.match(r"step 40: \d+ of 287 starts solved", capsys.readouterr().out)
+
+
+def test_the_example_of_stable_baselines_3_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    monkeypatch.delitem(sys.modules, "sb3_dqn", raising=False)
+    with pytest.raises(SystemExit, match="; pip install stable-baselines3"):
+        importlib.import_module("sb3_dqn")
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("demo_training", ["many"]),
+        ("demo_training", ["-1"]),
+        ("body_film", ["robots.txt"]),
+        ("body_film", ["no_such_folder/robots.gif"]),
+        ("demo", ["office"]),
+        ("demo_driving", ["0"]),
+    ],
+)
+def test_an_example_explains_its_arguments(
+    name: str, wrong: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("matplotlib")
+    if name in ("demo", "demo_driving"):
+        pytest.importorskip("rclpy")
+    program = importlib.import_module(name)
+    with pytest.raises(SystemExit, match=r"^0$"):
+        program.main(["--help"])
+    assert "usage: " in capsys.readouterr().out
+    with pytest.raises(SystemExit, match=r"^2$"):
+        program.main(wrong)
+    assert "error: " in capsys.readouterr().err
 
 
 def test_stable_baselines_3_runs(

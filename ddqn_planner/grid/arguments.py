@@ -140,7 +140,7 @@ def as_number(
     if lowest <= number <= highest:
         return number
     remedy = remedy or f"{lowest:g} to {highest:g}"
-    raise ValueError(f"{name} is {_short(value)}; give {remedy}")
+    raise ValueError(f"{name} is {shortened(value)}; give {remedy}")
 
 
 def as_whole(name: str, value: Any, lowest: int, highest: int) -> int:
@@ -149,11 +149,11 @@ def as_whole(name: str, value: Any, lowest: int, highest: int) -> int:
     if lowest <= number <= highest and number.is_integer():
         return int(value)
     raise ValueError(
-        f"{name} is {_short(value)}; give a whole number, {lowest} to {highest}"
+        f"{name} is {shortened(value)}; give a whole number, {lowest} to {highest}"
     )
 
 
-def _short(value: object) -> str:
+def shortened(value: object) -> str:
     """Return the text of a value in an error: the beginning and end of a long one."""
     try:
         text = repr(value)
@@ -203,7 +203,7 @@ def numbers(
     whole : bool
         Whether numbers within a range must be whole, of whatever kind.
     remedy : str
-        What to give instead of numbers out of the range; by default the range.
+        What to give instead of what is wrong; by default the range, or numbers.
     """
     try:
         array = np.asarray(values)
@@ -214,10 +214,11 @@ def numbers(
     if shape is not None and array.shape != shape:
         raise ValueError(f"{name} has shape {array.shape}; give {shape}")
     if "b" not in kinds and not isinstance(values, np.ndarray):
-        _refuse_flags(name, values)
+        _refuse_flags(name, values, remedy or "numbers")
     if array.dtype.kind not in kinds:
         raise ValueError(
-            f"{name}: the elements are of type {array.dtype}; give numbers"
+            f"{name}: the elements are of type {array.dtype}; "
+            f"give {remedy or 'numbers'}"
         )
     if between is not None and array.dtype.kind != "b" and array.size > 0:
         _check_range(name, array, between, whole, remedy)
@@ -253,12 +254,12 @@ def _check_range(
     raise ValueError(f"{name} holds {array[~is_right].flat[0]}; give {remedy}")
 
 
-def _refuse_flags(name: str, values: ArrayLike) -> None:
+def _refuse_flags(name: str, values: ArrayLike, remedy: str) -> None:
     """Refuse lists with True or False, which NumPy takes for 1 and 0 beside numbers."""
     elements = np.asarray(values, dtype=object).ravel().tolist()
     flag = next(filter(is_flag, elements), None)
     if flag is not None:
-        raise ValueError(f"{name} holds {flag}; give numbers")
+        raise ValueError(f"{name} holds {flag}; give {remedy}")
 
 
 def as_pose(name: str, pose: Any) -> tuple[float, float, float]:

@@ -168,11 +168,19 @@ def load_map(
     MapDataError
         If the cells of the map cannot be read.
     """
+    map_file = read_map_file(map_path(path))
+    return map_file.grid(occupied_threshold, allow_unknown, use_map_costs)
+
+
+def map_path(path: str | Path) -> Path:
+    """Return the path of a map file, or of a shipped map by its name: see `load_map`.
+
+    A MapNotFoundError says why there can be no such file.
+    """
     try:
-        file = find_map(path) if isinstance(path, str) else as_path(path)
+        return find_map(path) if isinstance(path, str) else as_path(path)
     except (FileNotFoundError, ValueError) as error:
         raise MapNotFoundError(str(error)) from None
-    return read_map_file(file).grid(occupied_threshold, allow_unknown, use_map_costs)
 
 
 def read_map_file(path: str | Path, only_below: bool = False) -> MapFile:

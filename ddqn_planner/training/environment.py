@@ -5,7 +5,7 @@ from types import EllipsisType
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.grid import MOVES, neighbours
 from ddqn_planner.grid.arguments import numbers
@@ -172,15 +172,26 @@ class GridVectorEnvironment:
         self.terminated[mask] = False
         self.truncated[mask] = False
 
+    def as_actions(self, actions: ArrayLike) -> NDArray[np.int64]:
+        """Return the actions of all robots, (N,); a ValueError if one is wrong."""
+        highest = len(MOVES) - 1
+        array = numbers(
+            "the array of actions",
+            actions,
+            self.cell.shape,
+            "iu",
+            (0, highest),
+            remedy=f"whole numbers, 0 to {highest}",
+        )
+        return array.astype(np.int64, copy=False)
+
     def move(self, actions: NDArray[np.int64]) -> Outcome:
         """Move each robot by its action (N,), 0 to 7; a robot that collides stays.
 
         A RuntimeError if an episode has ended. The next move overwrites
         `terminated` and `truncated` of the result.
         """
-        actions = numbers(
-            "the actions", actions, self.cell.shape, "iu", (0, len(MOVES) - 1)
-        )
+        actions = self.as_actions(actions)
         if (self.terminated | self.truncated).any():
             raise RuntimeError("an episode has ended; call reset before the next step")
         # Shapes: (N,).

@@ -1,8 +1,11 @@
 """The grid environment with Gymnasium's interfaces: of one robot, and of N robots."""
 
+import inspect
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from numbers import Integral
+from pathlib import Path
 from typing import Any, ClassVar, Protocol, TypeAlias
 
 import gymnasium
@@ -13,7 +16,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.grid import MOVES, Cell
-from ddqn_planner.grid.arguments import cell_inside
+from ddqn_planner.grid.arguments import cell_inside, is_flag, real, shortened
 from ddqn_planner.model.networks import GOAL, OBSTACLE, ROBOT
 from ddqn_planner.training.environment import GridVectorEnvironment, Observations
 from ddqn_planner.training.episodes import EpisodeEnd
@@ -38,11 +41,11 @@ class RewardFunction(Protocol):
         """
 
 
-def _as_scenario(scenario: Scenario | str | None) -> Scenario:
-    """Return a scenario, that of a map by its name, or by default the paper's."""
+def _as_scenario(scenario: Scenario | str | Path | None) -> Scenario:
+    """Return a scenario, that of a map by its name or file, or the paper's."""
     if scenario is None:
         return paper_scenario()
-    if isinstance(scenario, str):
+    if isinstance(scenario, (str, Path)):
         return map_scenario(scenario)
     if not isinstance(scenario, Scenario):
         raise ValueError(
@@ -67,14 +70,40 @@ def _as_parameters(
         raise ValueError(f"the parameters are {parameters!r}; give HyperParameters")
     if isinstance(reward, str):
         parameters = replace(parameters, reward=reward)
-    elif reward is not None and not callable(reward):
-        raise ValueError(
-            f"the reward is {reward!r}; give a function (cell, action, next_cell, "
-            "outcome), or the name of a reward"
-        )
+    elif reward is not None:
+        _check_reward_function(reward)
     if max_episode_steps is not None:
         parameters = replace(parameters, max_episode_steps=max_episode_steps)
     return replace(parameters, environments=robots)
+
+
+def _check_reward_function(function: object) -> None:
+    """Raise a ValueError unless a function can be called with a `RewardFunction`'s."""
+    remedy = "give a function (cell, action, next_cell, outcome)"
+    if not callable(function):
+        raise ValueError(
+            f"the reward is {function!r}; {remedy}, or the name of a reward"
+        )
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # some functions written in C have none
+        return
+    try:
+        signature.bind((0, 0), 0, (0, 0), None)
+    except TypeError as error:
+        raise ValueError(
+            f"the reward function takes {signature} ({error}); {remedy}"
+        ) from None
+
+
+def _as_reward(value: object) -> float:
+    """Return what a reward function returned as a float, True and False as 1 and 0."""
+    reward = float(bool(value)) if is_flag(value) else real(value)
+    if not math.isfinite(reward):
+        raise ValueError(
+            f"the reward function returned {shortened(value)}; give a finite number"
+        )
+    return reward
 
 
 class _Robots:
@@ -118,7 +147,12 @@ class _Robots:
         self, random: np.random.Generator, options: Mapping[str, Any] | None
     ) -> None:
         """Start an episode of each robot; `options` may have their `start`."""
-        options = options or {}
+        if options is None:
+            options = {}
+        if not isinstance(options, Mapping):
+            raise ValueError(
+                f"the options are {shortened(options)}; give a dict with the start"
+            )
         unknown = set(options) - {"start"}
         if unknown:
             raise ValueError(f"the options have {sorted(unknown)}; give only start")
@@ -137,11 +171,17 @@ class _Robots:
         A ValueError if no episode can begin in one of them.
         """
         count = len(self.batch.cell)
-        starts = np.asarray(start)
-        if starts.shape != (count, 2):
-            starts = np.array([start])
+        try:
+            starts = np.asarray(start)
+        except ValueError:  # rows of different lengths
+            starts = np.empty(0)
+        if starts.shape not in ((2,), (count, 2)):
+            for_each = f", or one for each of the {count} robots" if count > 1 else ""
+            raise ValueError(
+                f"the start is {shortened(start)}; give one cell (x, y){for_each}"
+            )
         cells = []
-        for cell in starts.tolist():
+        for cell in starts.reshape(-1, 2).tolist():
             x, y = cell_inside(cell, self.batch.shape, "the start")
             if not self.scenario.grid.is_free((x, y)) or (x, y) == self.scenario.goal:
                 raise ValueError(
@@ -164,12 +204,13 @@ class _Robots:
             outcomes = self.outcomes()
             for robot in moving.tolist():
                 outcome = outcomes[robot]
-                rewards[robot] = self.reward(
+                reward = self.reward(
                     self.xy(cell[robot]),
                     int(actions[robot]),
                     self.xy(self.batch.cell[robot]),
                     None if outcome is None else EpisodeEnd(outcome),
                 )
+                rewards[robot] = _as_reward(reward)
         return rewards
 
     def xy(self, cell: np.int64) -> Cell:
@@ -243,7 +284,7 @@ class GridEnvironment(gymnasium.Env[Observations, np.int64]):
 
     def __init__(
         self,
-        scenario: Scenario | str | None = None,
+        scenario: Scenario | str | Path | None = None,
         parameters: HyperParameters | None = None,
         reward: RewardFunction | str | None = None,
         render_mode: str | None = None,
@@ -252,9 +293,9 @@ class GridEnvironment(gymnasium.Env[Observations, np.int64]):
 
         Parameters
         ----------
-        scenario : Scenario or str, optional
-            The map, the start and the goal, or the name of a map whose file names a
-            start and a goal; by default the paper's.
+        scenario : Scenario, str or Path, optional
+            The map, the start and the goal, or the name or the file of a map that names
+            a start and a goal; by default the paper's.
         parameters : HyperParameters, optional
             How episodes begin and end, and the weights of the reward; `environments`
             does not count.
@@ -369,7 +410,7 @@ class BatchedGridEnvironment(
     def __init__(
         self,
         num_envs: int = 1,
-        scenario: Scenario | str | None = None,
+        scenario: Scenario | str | Path | None = None,
         parameters: HyperParameters | None = None,
         reward: RewardFunction | str | None = None,
         render_mode: str | None = None,
@@ -439,6 +480,7 @@ class BatchedGridEnvironment(
         if not self._robots.is_begun:
             raise ResetNeeded("no episode has begun; call reset before the first step")
         batch = self._robots.batch
+        actions = batch.as_actions(actions)  # a wrong one changes nothing
         is_new = batch.terminated | batch.truncated
         if is_new.any():
             batch.reset(is_new)

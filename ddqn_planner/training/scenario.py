@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule, read_map_file
 from ddqn_planner.grid.arguments import as_cell
 from ddqn_planner.grid.grid_map import check_grid
-from ddqn_planner.resources import find_map
+from ddqn_planner.grid.map_file import map_path
 
 
 @dataclass(frozen=True)
@@ -55,13 +56,13 @@ def paper_scenario() -> Scenario:
     return map_scenario("dilemma")
 
 
-def map_scenario(name: str) -> Scenario:
+def map_scenario(name: str | Path) -> Scenario:
     """Return a map with the start and the goal that its file names.
 
-    `name` is a shipped map's, or a path, as of `load_map`. A ValueError if the file
-    names no start or no goal.
+    `name` is a shipped map's, or a path, as of `load_map`, which names the
+    errors. A ValueError if the file names no start or no goal.
     """
-    map_file = read_map_file(find_map(name))
+    map_file = read_map_file(map_path(name))
     if map_file.start is None or map_file.goal is None:
         raise ValueError(
             f"the map {name} names no start and goal; give Scenario(grid, start, goal)"

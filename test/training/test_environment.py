@@ -120,7 +120,7 @@ def test_a_batch_makes_no_step_after_the_end_of_an_episode(small: Scenario) -> N
     batch.begin(np.array([5]))
     batch.move(np.array([0]))
     assert batch.visited.tolist() == [[5, 6]]
-    with pytest.raises(ValueError, match="the actions"):
+    with pytest.raises(ValueError, match="the array of actions"):
         GridVectorEnvironment([small], PARAMETERS).move(np.array([-1]))
 
 

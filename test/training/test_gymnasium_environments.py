@@ -7,6 +7,7 @@ import sys
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
-from ddqn_planner.grid import Cell
+from ddqn_planner.grid import Cell, MapNotFoundError
 from ddqn_planner.gymnasium_registration import ENVIRONMENT
 from ddqn_planner.training import GridVectorEnvironment, Scenario
 from ddqn_planner.training.episodes import EpisodeEnd
@@ -164,7 +165,7 @@ def test_no_step_is_made_before_a_reset_or_after_the_end(paper: Scenario) -> Non
     with pytest.raises(ResetNeeded, match="call reset before the first step"):
         batch.step(np.zeros(2, np.int64))
     batch.reset()
-    with pytest.raises(ValueError, match="the actions"):
+    with pytest.raises(ValueError, match="the array of actions"):
         batch.step(np.array([0, 8]))
 
 
@@ -255,6 +256,96 @@ def test_a_reward_has_a_name(small: Scenario) -> None:
         GridEnvironment(small, reward=5)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(
+    "value",
+    [None, math.nan, math.inf, "1", np.ones(2), [1], 1j, 10**400, Fraction(10**400)],
+)
+def test_a_reward_that_is_no_number_is_refused(small: Scenario, value: Any) -> None:
+    reason = "the reward function returned .*; give a finite number"
+    function: Any = lambda *_: value  # noqa: E731
+    environment = GridEnvironment(small, reward=function)
+    environment.reset()
+    with pytest.raises(ValueError, match=reason):
+        environment.step(np.int64(EAST))
+    batch = BatchedGridEnvironment(2, small, reward=function)
+    batch.reset()
+    with pytest.raises(ValueError, match=reason):
+        batch.step(np.array([EAST, EAST]))
+
+
+@pytest.mark.parametrize(
+    "value", [1, True, np.True_, np.float32(1), np.int8(1), Fraction(1)]
+)
+def test_each_type_of_number_is_a_reward(small: Scenario, value: Any) -> None:
+    environment = GridEnvironment(small, reward=lambda *_: value)
+    environment.reset()
+    reward = environment.step(np.int64(EAST))[1]
+    assert (type(reward), reward) == (float, 1)
+
+
+@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
+@pytest.mark.parametrize(
+    "function",
+    [lambda: 1.0, lambda cell, action: 1.0, lambda *_, size: 1.0, len],
+)
+def test_a_reward_function_takes_four_arguments(make: Any, function: Any) -> None:
+    reason = r"the reward function takes \(.*; give a function \(cell, action, "
+    with pytest.raises(ValueError, match=reason):
+        make(ENVIRONMENT, reward=function)
+
+
+@pytest.mark.parametrize(
+    "scenario", ["nope", "no/such.yaml", Path("nope.yaml"), "~x/y"]
+)
+def test_a_map_that_is_missing_is_named(scenario: str | Path) -> None:
+    for make in (gymnasium.make, gymnasium.make_vec):
+        with pytest.raises(MapNotFoundError, match="; give"):
+            make(ENVIRONMENT, scenario=scenario)  # type: ignore[operator]
+
+
+@pytest.mark.parametrize(
+    "actions",
+    [
+        [0.0, 1.0],
+        [0, math.nan],
+        np.array([0, None]),
+        np.array([0, 1], object),
+        ["0", "1"],
+        [0, True],
+        [0, 8],
+        [0, -1],
+    ],
+)
+def test_wrong_actions_are_refused_and_change_nothing(
+    small: Scenario, actions: Any
+) -> None:
+    parameters = replace(PARAMETERS, max_episode_steps=1)
+    batch, reference = (BatchedGridEnvironment(2, small, parameters) for _ in range(2))
+    for environment in (batch, reference):
+        environment.reset(seed=0)
+        environment.step(np.array([EAST, EAST]))
+    with pytest.raises(
+        ValueError, match=r"the array of actions.*; give whole numbers, 0 to 7"
+    ):
+        batch.step(actions)
+    steps = [item.step(np.array([EAST, EAST])) for item in (batch, reference)]
+    assert data_equivalence(*steps)
+
+
+@pytest.mark.parametrize(
+    "start", [[(0, 1), (3,)], [(0, 1)] * 3, [[(0, 1)], 2], 5, "east", {"x": 1}, []]
+)
+def test_starts_of_a_wrong_shape_are_refused(small: Scenario, start: Any) -> None:
+    reason = r"the start is .*; give one cell \(x, y\)"
+    with pytest.raises(ValueError, match=reason + "$"):
+        GridEnvironment(small).reset(options={"start": start})
+    batch = BatchedGridEnvironment(2, small)
+    with pytest.raises(ValueError, match=reason + ", or one for each of the 2 robots$"):
+        batch.reset(options={"start": start})
+    with pytest.raises(ValueError, match="the options are 5; give a dict"):
+        batch.reset(options=5)  # type: ignore[arg-type]
+
+
 def test_only_scenarios_maps_and_parameters_make_an_environment(
     small: Scenario, tmp_path: Any
 ) -> None:
@@ -265,7 +356,7 @@ def test_only_scenarios_maps_and_parameters_make_an_environment(
         "occupied_thresh: 0.65, free_thresh: 0.196}"
     )
     with pytest.raises(ValueError, match="names no start and goal; give Scenario"):
-        GridEnvironment(str(tmp_path / "map.yaml"))
+        GridEnvironment(tmp_path / "map.yaml")
     with pytest.raises(ValueError, match="the scenario is 5; give a Scenario or the"):
         GridEnvironment(5)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="give HyperParameters"):
