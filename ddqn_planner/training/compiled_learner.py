@@ -44,8 +44,8 @@ BETA_1 = 0.9
 BETA_2 = 0.999
 EPSILON = np.float32(1e-8)
 SMALLEST_MEAN = np.float32(1e-30)  # of a gradient: a smaller one moves no weight
-# Absolute errors of Q, in rewards. A transition with the greatest one or more is drawn
-# whenever its slot is; the other one is added, so that each transition has a chance.
+# Absolute errors of Q, in rewards. A transition with GREATEST_ERROR or more is never
+# drawn in vain. LEAST_ERROR is added to each error, so that none is left out.
 GREATEST_ERROR = 10.0
 LEAST_ERROR = 0.1
 # Windows that the steps of one call evaluate, so that it returns within milliseconds.
@@ -203,13 +203,13 @@ def training_of(
     """
     parameters = environment.parameters
     gradients = {name: np.zeros_like(tensor) for name, tensor in parts[0].items()}
+    tensors_of_networks = [*parts, gradients]
+    if average:
+        tensors_of_networks.append(average)
     # The networks evaluate either a batch or the states of all robots.
     states = max(parameters.batch_size, parameters.environments)
     windows, networks = networks_of(
-        environment.background,
-        environment.shape,
-        [*parts, gradients, *([average] if average else [])],
-        states,
+        environment.background, environment.shape, tensors_of_networks, states
     )
     online, target, mean, square, gradient, *averaged = networks
     no_weights = _zeros((0,), environment.background)

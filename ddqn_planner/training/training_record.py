@@ -18,7 +18,8 @@ from ddqn_planner.training.evaluation import Evaluation, ratios_to, summary_of
 if TYPE_CHECKING:
     from ddqn_planner.training.trainer import Trainer
 
-EVALUATIONS: Final = 100  # in a training; they take 1 to 3 % of its time
+# In a training; they take 1 to 5 % of its time, see experiments/map_sizes.py.
+EVALUATIONS: Final = 100
 MOST_EVALUATIONS: Final = 10**12  # as many as a training can have steps
 SHOWN_EPISODES: Final = 40  # the last ones before an evaluation
 
