@@ -154,7 +154,9 @@ class Evidence:
         weight = visits.metres / self.side  # (V,)
         # A drive may visit a place several times.
         np.add.at(places.weight, rows, weight)
+        np.add.at(places.sum_of_slowness, rows, weight * np.exp(log))
         np.add.at(places.sum_of_log, rows, weight * log)
+        np.add.at(places.sum_of_squares, rows, weight * log**2)
         np.add.at(places.passages, rows, weight * passes_wait)
 
     def _limit_sums_of_waits(self, rows_of_waits: Int64) -> None:
@@ -295,10 +297,7 @@ class Evidence:
         rows = self._find_or_add_rows(other.places.position)  # of each place of `other`
         # No row is there twice, as both divide the world into the same squares.
         places = self.places
-        places.weight[rows] += other.places.weight
-        places.sum_of_log[rows] += other.places.sum_of_log
-        places.passages[rows] += other.places.passages
-        places.waited[rows] += other.places.waited
+        places.add(rows, other.places)
         is_new = rows >= count_before
         places.predicted[rows[is_new]] = other.places.predicted[is_new] + shift
         self.errors += other.errors
@@ -328,7 +327,7 @@ class Evidence:
 
         Parameters
         ----------
-        table : (N, 7) float64
+        table : (N, 8) float64
             A row for each place, see `Places.table`.
         driven : () float64
             Seconds.
@@ -373,7 +372,7 @@ def _is_consistent(
     """Return whether arrays of a file can be those of evidence.
 
     They must have the right shapes and finite numbers, and sums of 0 or more: `table`
-    (N, 7) of `Places.table`, `driven` () seconds, and `errors` and `surprises` (D,) of
+    (N, 8) of `Places.table`, `driven` () seconds, and `errors` and `surprises` (D,) of
     the last D drives.
     """
     if table.ndim != 2 or table.shape[1] != COLUMNS:
@@ -383,7 +382,15 @@ def _is_consistent(
     if not all(np.isfinite(a).all() for a in (table, driven, errors, surprises)):
         return False
     places = Places.from_table(table)
-    positive = places.weight, places.passages, places.waited, driven
+    # Logarithms may be negative; all other sums are 0 or more.
+    positive = (
+        places.weight,
+        places.sum_of_slowness,
+        places.sum_of_squares,
+        places.passages,
+        places.waited,
+        driven,
+    )
     if any((values < 0).any() for values in positive):
         return False
     return bool((np.abs(places.position) <= FARTHEST).all())

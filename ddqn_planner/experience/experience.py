@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.experience.evidence import FARTHEST, Evidence
-from ddqn_planner.experience.places import Float32, Float64, Int64, Places
+from ddqn_planner.experience.places import NOISE, Float32, Float64, Int64
 from ddqn_planner.experience.posterior import Posterior
 from ddqn_planner.experience.prior import Prior
 from ddqn_planner.experience.visits import (
@@ -40,8 +40,9 @@ from ddqn_planner.grid.grid_map import Exploration
 from ddqn_planner.grid.moves import cells_along
 
 MAX_FILE_BYTES = 2**27  # a larger file is refused before it is read
-VERSION = 3  # 2 was never released
+VERSION = 4  # 2 was never released
 FIRST_VERSION = 1  # until 0.4.0
+LOG_VERSION = 3  # until 0.5.0, with the logarithms of slowness alone
 PRIOR = "prior_"  # before the names of its arrays in a file
 EXPERIENCE = "experience.npz"  # the name of the file in a folder
 SPEEDS = 0.001, 1000.0  # metres per second
@@ -53,6 +54,9 @@ OPTIONS = {
     "half_life": (1.0, 1e12, "seconds"),
     "max_pause": (0.1, 1e6, "seconds"),
 }
+
+LEAST_WEIGHT = 1e-9  # of places of old files: others have the log slowness 0
+LOG_RANGE = -math.log(MAX_SLOWNESS), math.log(MAX_SLOWNESS)
 
 LATEST = 1e12  # seconds of a clock: a pose of a later time is not believed
 # Times the nominal speed: a robot that usually drives faster is not believed.
@@ -516,7 +520,7 @@ class Experience:
         arrays: dict[str, Any] = {
             "version": VERSION,
             "options": list(self.options.values()),
-            "evidence": evidence.places.table(),  # (N, 7)
+            "evidence": evidence.places.table(),  # (N, 8)
             "driven": evidence.driven,  # seconds
             "errors": evidence.errors,  # (D,): of the last D drives, as the surprises
             "surprises": evidence.surprises,
@@ -551,14 +555,16 @@ class Experience:
         they cannot be those of an experience.
         """
         version = int(arrays["version"])
-        if version not in (FIRST_VERSION, VERSION):
+        if version not in (FIRST_VERSION, LOG_VERSION, VERSION):
             raise ValueError(f"it has version {version}, not {VERSION}")
         options = dict(zip(OPTIONS, arrays["options"].tolist(), strict=True))
         experience = cls(**options)
         table = arrays["evidence"].astype(np.float64)
         driven = arrays["driven"].astype(np.float64)
         if version == FIRST_VERSION:
-            table = _converted(table, float(driven), experience.half_life)
+            table = _without_dates(table, float(driven), experience.half_life)
+        if version != VERSION:
+            table = _with_sums(table)
         # The first files have neither errors nor surprises.
         nothing = np.zeros(0)
         errors = arrays.get("errors", nothing).astype(np.float64)
@@ -630,8 +636,8 @@ def _arrays_in(data: bytes) -> dict[str, NDArray[Any]]:
         return dict(file)
 
 
-def _converted(table: Float64, driven: float, half_life: float) -> Float64:
-    """Return the table of a file of version 1 as a table of today, (N, 7).
+def _without_dates(table: Float64, driven: float, half_life: float) -> Float64:
+    """Return the table of a file of version 1 as one of version 3, (N, 7).
 
     Parameters
     ----------
@@ -646,13 +652,29 @@ def _converted(table: Float64, driven: float, half_life: float) -> Float64:
     driven_before = table[:, 5]
     half_lives = (driven - driven_before) / half_life  # since the last visit
     remaining = 0.5**half_lives
-    nothing = np.zeros(len(table))
-    places = Places(
-        weight=weight * remaining,
-        sum_of_log=sum_of_log * remaining,
-        passages=nothing,
-        waited=nothing,
-        predicted=nothing,
-        position=table[:, 3:5].copy(),
+    nothing = np.zeros((len(table), 3))  # no passages, waits and predictions
+    return np.column_stack(
+        [weight * remaining, sum_of_log * remaining, nothing, table[:, 3:5]]
     )
-    return places.table()
+
+
+def _with_sums(table: Float64) -> Float64:
+    """Return the table of a file of version 3 as a table of today, (N, 8).
+
+    Its visits are assumed to differ by NOISE, and to have passed where robots wait.
+
+    Parameters
+    ----------
+    table : (N, 7) float64
+        The columns are weight, sum of the log slowness, the weight of passages since a
+        robot first waited near, the seconds waited, a prediction, and x and y.
+    """
+    weight, sum_of_log, passages, waited, _, x, y = table.T
+    mean_log = sum_of_log / np.maximum(weight, LEAST_WEIGHT)
+    # The mean of a lognormal, and the squares that give the variance NOISE.
+    slowness = np.exp(np.clip(mean_log, *LOG_RANGE) + NOISE / 2)
+    variance = NOISE * np.maximum(weight - 1, 0)
+    squares = sum_of_log * mean_log + variance
+    most_passages = np.maximum(passages, weight)
+    columns = weight, weight * slowness, sum_of_log, squares, most_passages, waited
+    return np.column_stack([*columns, x, y])

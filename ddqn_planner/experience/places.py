@@ -13,20 +13,33 @@ Int64 = NDArray[np.int64]
 
 NOISE = 0.1  # variance of the log slowness of one visit
 
-COLUMNS = 7  # of the table in which files hold places
+# The sums of `Places`, in the order of the columns in files.
+SUMS = (
+    "weight",
+    "sum_of_slowness",
+    "sum_of_log",
+    "sum_of_squares",
+    "passages",
+    "waited",
+)
+COLUMNS = len(SUMS) + 2  # of the table in which files hold places
 
 
 @dataclass
 class Places:
-    """Sums of what was seen at N places. The first four fade with time."""
+    """Sums of what was seen at N places; all but the positions fade with time."""
 
     # (N,): the sum of the weights of all visits; a visit of a side's length weighs 1
     weight: Float64
-    sum_of_log: Float64  # (N,): of the log slowness of the visits, times their weights
-    passages: Float64  # (N,): the weight of the visits since a robot first waited near
+    # (N,) each: sums over all visits, times their weights
+    sum_of_slowness: Float64
+    sum_of_log: Float64  # of the logarithm of the slowness
+    sum_of_squares: Float64  # of the square of that logarithm
+    passages: Float64  # (N,): the weight of the visits that could have had a wait
     waited: Float64  # (N,): seconds
-    predicted: Float64  # (N,): log slowness, from the prior before the first visit
     position: Float64  # (N, 2): x and y of the first visit, metres
+    # (N,): log slowness, from the prior before the first visit; files do not hold it
+    predicted: Float64
 
     @classmethod
     def none(cls) -> Places:
@@ -35,28 +48,20 @@ class Places:
 
     @classmethod
     def from_table(cls, table: Float64) -> Places:
-        """Return the places in the rows of a table, (N, 7): the columns of `table`."""
-        weight, sum_of_log, passages, waited, predicted, x, y = table.T.copy()
-        position = np.column_stack([x, y])
-        return cls(weight, sum_of_log, passages, waited, predicted, position)
+        """Return the places in the rows of a table, (N, 8): the columns of `table`."""
+        *sums, x, y = table.T.copy()
+        return cls(*sums, np.column_stack([x, y]), np.zeros(len(table)))
 
     def table(self) -> Float64:
-        """Return the places as the rows of a table, (N, 7), which files hold.
+        """Return the places as the rows of a table, (N, 8), which files hold.
 
-        The columns: weight, the sum of the weights of all visits; the sum of their log
-        slowness, times their weights; the weight of passages since a robot first waited
-        near; the seconds waited; the log slowness that the prior predicted before the
-        first visit; and x and y of the first visit, in metres.
+        The columns are those of SUMS, and x and y of the first visit, in metres.
         """
-        columns = (
-            self.weight,
-            self.sum_of_log,
-            self.passages,
-            self.waited,
-            self.predicted,
-            self.position,
-        )
-        return np.column_stack(columns)
+        return np.column_stack([*self.sums(), self.position])
+
+    def sums(self) -> tuple[Float64, ...]:
+        """Return what fades with time: an array (N,) for each name in SUMS."""
+        return tuple(getattr(self, name) for name in SUMS)
 
     def __len__(self) -> int:
         return len(self.weight)
@@ -68,16 +73,17 @@ class Places:
         (M, 2) x and y of the first visit, in metres.
         """
         nothing = np.zeros(len(predicted))
-        self.weight = np.append(self.weight, nothing)
-        self.sum_of_log = np.append(self.sum_of_log, nothing)
-        self.passages = np.append(self.passages, nothing)
-        self.waited = np.append(self.waited, nothing)
+        for name, values in zip(SUMS, self.sums(), strict=True):
+            setattr(self, name, np.append(values, nothing))
         self.predicted = np.append(self.predicted, predicted)
         self.position = np.concatenate([self.position, position])
 
+    def add(self, rows: Int64, other: Places) -> None:
+        """Add the sums of other places to those in some rows, (M,), each row once."""
+        for values, more in zip(self.sums(), other.sums(), strict=True):
+            values[rows] += more
+
     def fade(self, share: float) -> None:
         """Multiply all sums of what was seen with `share`, 0 to 1."""
-        self.weight *= share
-        self.sum_of_log *= share
-        self.passages *= share
-        self.waited *= share
+        for values in self.sums():
+            values *= share

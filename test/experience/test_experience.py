@@ -353,17 +353,17 @@ def test_every_broken_file_is_named(path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("version", 4),
+        ("version", 5),
         ("options", [0.5, -1.0, 900.0, 45.0]),
-        ("evidence", np.full((39, 7), np.nan)),
+        ("evidence", np.full((39, 8), np.nan)),
         ("driven", np.zeros(2)),
         ("driven", np.array("a")),
         ("driven", -1.0),
-        # Neither a weight nor passages nor seconds waited are negative.
-        *[("evidence", -np.eye(1, 7, column)) for column in (0, 2, 3)],
+        # No sum but that of logarithms is negative.
+        *[("evidence", -np.eye(1, 8, column)) for column in (0, 1, 3, 4, 5)],
         ("evidence", np.zeros((39, 5))),
-        ("evidence", np.zeros((39, 7))),
-        ("evidence", np.full((1, 7), 1e9)),
+        ("evidence", np.zeros((39, 8))),
+        ("evidence", np.full((1, 8), 1e9)),
         ("surprises", [math.nan]),
         ("errors", np.array([print], dtype=object)),  # nothing is unpickled
     ],
@@ -433,14 +433,16 @@ def test_one_that_knows_nothing_knows_all_of_another_after_a_merge() -> None:
 def test_a_file_of_an_older_version_is_read(path: Path) -> None:
     with np.load(path) as arrays:
         old = dict(arrays)
-    table = old["evidence"]  # with failures, and when each place was visited
-    old["evidence"] = np.column_stack(
-        [table[:, :2], table[:, 0] * 9, table[:, 5:], 0 * table[:, 0]]
-    )
-    np.savez(path, **{**old, "version": 1})
-    assert at(HALL, Experience.load(path).slowness(HALL), 7, 5) == pytest.approx(
-        3, rel=0.15
-    )
+    weight, _, log, _, passages, waited, x, y = old["evidence"].T
+    tables = {  # with failures, and when each place was visited; with predictions
+        1: (weight, log, weight * 9, x, y, 0 * weight),
+        3: (weight, log, passages, waited, 0 * weight, x, y),
+    }
+    for version, columns in tables.items():
+        evidence = np.column_stack(columns)
+        np.savez(path, **{**old, "evidence": evidence, "version": version})
+        slowness = Experience.load(path).slowness(HALL)
+        assert at(HALL, slowness, 7, 5) == pytest.approx(3, rel=0.15)
 
 
 def test_a_file_with_directions_of_slowness_loads_without_them(tmp_path: Path) -> None:

@@ -135,10 +135,6 @@ def test_what_all_places_have_in_common_is_not_learned_twice() -> None:
     assert before[36, 60] == pytest.approx(4, rel=0.4)
     teach_prior(experience, grid)
     np.testing.assert_allclose(experience.slowness(grid), before, rtol=0.1)
-    again = Experience.from_bytes(experience.to_bytes())
-    np.testing.assert_allclose(
-        again.slowness(grid), experience.slowness(grid), rtol=0.01
-    )
     merged = Experience(0.5)
     merged.merge(experience)
     np.testing.assert_allclose(merged.slowness(grid), before, rtol=0.1)
