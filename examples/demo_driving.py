@@ -25,7 +25,8 @@ from ddqn_planner.planning import Planner
 
 sys.path.insert(0, str(FilePath(__file__).resolve().parents[1] / "experiments"))
 from client import Client, Recorder, cells_of, pose, wait_for
-from driving_worlds import RULE, Float64, Routes, World, generated_world, path_seconds
+from driving_laws import Float64
+from driving_worlds import RULE, Routes, World, generated_world, path_seconds
 from figures import ROUTE_STYLES, draw_slowness, draw_times, frame_of
 from map_files import save_map
 from processes import claim_ros_domain, run_script, running, running_node

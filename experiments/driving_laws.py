@@ -62,5 +62,10 @@ class Law:
     whole_drive: Callable[[float], float] | None = None
 
 
+def always(slowness: Float64) -> Law:
+    """Return the law of a world whose slowness (H, W) is always the same."""
+    return Law(lambda clock: slowness)
+
+
 MakeLaw: TypeAlias = Callable[[GridMap, Sequence[Cell], np.random.Generator], Law]
 """Draws the law of a world from its map, the cells of its stations, and chance."""

@@ -7,8 +7,10 @@ from typing import Any, Final
 
 import driving_worlds as worlds
 import numpy as np
+from driving_kinds import law_of
+from driving_laws import Float64
 from driving_learners import LEARNERS
-from driving_worlds import RATE, RULE, Drive, Float64, World, drive, path_seconds
+from driving_worlds import RATE, RULE, Drive, World, drive, path_seconds
 from random_maps import Random
 
 from ddqn_planner import Experience, Planner, inflate, load_map
@@ -26,16 +28,16 @@ MARKED: Final = 0.25  # metres from a path within which cells count as driven
 
 @dataclass(frozen=True)
 class Job:
-    """A world, who drives in it, and how.
+    """A world, who drives in it one after another, and how.
 
-    The world is of a kind, or a map file with what is slow.
+    The world is of a kind, or a map file with a law.
     """
 
     kind: str
     seed: int
-    learner: str
+    learners: Sequence[str]
     missions: int
-    exploration: float | None = None
+    exploration: float | None = None  # None for the default of `Experience.apply`
     is_faulty: bool = False
     is_moved: bool = False
     prior_from: str | None = None
@@ -44,22 +46,31 @@ class Job:
 
 @dataclass(frozen=True)
 class Result:
-    """The seconds of a job's routes, and of the best and the shortest routes."""
+    """The seconds of a learner's routes, and of the best and the shortest routes."""
 
-    job: Job
+    kind: str
+    learner: str
     seconds: Float64
     best: Float64
     shortest: Float64
     forecast: Float64
     """(M, 5) seconds: measured, expected, least and greatest expected; new share."""
 
-    def ratio(self, first: int, end: int) -> float:
-        """Return the total time over the best possible, over some missions."""
-        return float(self.seconds[first:end].sum() / self.best[first:end].sum())
+    def above(self, first: int, end: int) -> float:
+        """Return the percentage above the best possible time, over some missions."""
+        ratio = self.seconds[first:end].sum() / self.best[first:end].sum()
+        return 100 * float(ratio - 1)
 
     def over_shortest(self, first: int, end: int) -> float:
-        """Return the total time over that of the shortest paths."""
-        return float(self.seconds[first:end].sum() / self.shortest[first:end].sum())
+        """Return the percentage points that it is above the shortest paths."""
+        difference = (self.seconds - self.shortest)[first:end].sum()
+        return 100 * float(difference / self.best[first:end].sum())
+
+    def of_shortest_path(self) -> "Result":
+        """Return the result of one who drives the shortest paths of these missions."""
+        return replace(
+            self, learner="shortest path", seconds=self.shortest, forecast=np.empty(0)
+        )
 
 
 @cache
@@ -70,42 +81,50 @@ def planner() -> Planner:
 
 def world_of(job: Job) -> World:
     """Make the world of a job."""
-    name, hidden = job.kind.rsplit("-", 1)
+    name, law = job.kind.rsplit("-", 1)
     if name.endswith(".yaml"):
         random = np.random.default_rng([job.seed, 1])
-        world = worlds.make_world(inflate(load_map(name), ROBOT_RADIUS), hidden, random)
+        world = worlds.make_world(inflate(load_map(name), ROBOT_RADIUS), law, random)
     else:
         world = worlds.generated_world(job.kind, job.seed)
     if job.prior_from is not None:  # the same law holds on both maps
-        world.change(hidden, np.random.default_rng(job.seed))
+        world = worlds.moved(world, law, np.random.default_rng(job.seed))
     return world
 
 
-def run(job: Job) -> Result:
-    """Drive the missions of a job."""
+def run(job: Job) -> list[Result]:
+    """Drive the missions of a job with each of its learners."""
     world = world_of(job)
-    learner = LEARNERS[job.learner](world.grid)
-    if job.prior_from:
-        lesson = replace(job, kind=job.prior_from, prior_from="", missions=TEACHING)
-        teacher = Experience(worlds.SPEED)
-        taught_world = world_of(lesson)
-        run_in(lesson, taught_world, teacher)
-        places = teacher.evidence.places
-        learner.prior = prior_of(taught_world.grid, places, teacher.prior)
-    return run_in(job, world, learner)
+    results = []
+    for name in job.learners:
+        learner = LEARNERS[name](world.grid)
+        if job.prior_from:
+            learner.prior = _taught_prior(job, job.prior_from)
+        results.append(run_in(job, world, name, learner))
+    return results
 
 
-def run_in(job: Job, world: World, learner: Any) -> Result:
+def _taught_prior(job: Job, kind: str) -> Any:
+    """Return the prior that a robot learns in a world of another kind."""
+    lesson = replace(job, kind=kind, prior_from="", missions=TEACHING)
+    teacher = Experience(worlds.SPEED)
+    world = world_of(lesson)
+    run_in(lesson, world, "teacher", teacher)
+    return prior_of(world.grid, teacher.evidence.places, teacher.prior)
+
+
+def run_in(job: Job, world: World, name: str, learner: Any) -> Result:
     """Drive a job's missions in its world, with a learner."""
-    return _Missions(job, world, learner).drive_all()
+    return _Missions(job, world, name, learner).drive_all()
 
 
 class _Missions:
     """The missions of one robot: what it drives, sees, and learns."""
 
-    def __init__(self, job: Job, world: World, learner: Any) -> None:
+    def __init__(self, job: Job, world: World, name: str, learner: Any) -> None:
         self.job = job
         self.world = world
+        self.name = name
         self.learner = learner
         self.pairs, self.noise, self.faults, self.moves = (
             np.random.default_rng([job.seed, number]) for number in range(4)
@@ -125,11 +144,12 @@ class _Missions:
         times = []
         for mission in range(self.job.missions):
             if self.job.is_moved and mission == MOVED_AT:
-                hidden = self.job.kind.rsplit("-", 1)[1]
-                self.world.change(hidden, self.moves)
+                law = law_of(self.job.kind)
+                self.world = worlds.moved(self.world, law, self.moves)
             times.append(self._drive_one())
         seconds, shortest, best = np.array(times).T
-        return Result(self.job, seconds, best, shortest, np.array(self.forecast))
+        forecast = np.array(self.forecast)
+        return Result(self.job.kind, self.name, seconds, best, shortest, forecast)
 
     def _drive_one(self) -> list[float]:
         """Drive a mission between two stations.

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import client as ros
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
+from driving_laws import always
 from driving_worlds import World
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
@@ -180,7 +181,7 @@ class DrivenRobot(ros.Client):
         self._free_cells = self._grid.free_cells()
         self._random = random.Random(0)
         slowness = np.full(self._grid.occupancy.shape, SLOWNESS)
-        world = World(self._grid, slowness, [], self._free_cells)
+        world = World(self._grid, always(slowness), self._free_cells)
         self._robot = Robot(world, seed=0)
         self._silence = ""  # the event that made the costmap or the poses stop
         self._visited: set[Cell] = set()

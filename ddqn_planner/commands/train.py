@@ -18,10 +18,8 @@ from ddqn_planner.commands.options import (
 )
 from ddqn_planner.commands.training_options import (
     add_training_options,
-    exit_code_of,
     hyper_parameters_of,
     opened_training,
-    stop_report,
     train_with_bar,
 )
 from ddqn_planner.files import check_distinct, check_writable
@@ -48,8 +46,8 @@ OPTIONS: Final = (
 def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
     """Train, and print what the greedy rollouts solve, as a table or as JSON.
 
-    `parser` gets the command's options, which `arguments` give. Returns the exit code,
-    see `exit_code_of`.
+    `parser` gets the command's options, which `arguments` give. Returns the exit code
+    0.
     """
     add_map_options(parser, "corner_cutting")
     add_options(parser, *OPTIONS)
@@ -73,8 +71,6 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
         print(json.dumps(_entries(options, training, record), allow_nan=False))
     else:
         print(*_lines(training, record), sep="\n")
-    if not training.is_complete:
-        print(stop_report(training), file=output, flush=True)
     # After the results: to draw takes seconds, which Ctrl-C may cut off.
     if options.picture:
         record.save_picture(options.picture)
@@ -83,7 +79,7 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
         print(f"drawing {len(record.snapshots)} frames", file=output, flush=True)
         record.save_film(options.film)
         print(f"saved {options.film}", file=output)
-    return exit_code_of(training)
+    return 0
 
 
 def _check_outputs(options: Namespace, map_file: MapFile) -> None:
@@ -165,7 +161,10 @@ def _lines(training: "TrainingRun", record: TrainingRecord) -> list[str]:
     first_step = record.curve[0].step
     if first_step:
         rows["training"] += f" since step {first_step:,}"
-    return [f"{name:22}{text}" for name, text in rows.items()]
+    lines = [f"{name:22}{text}" for name, text in rows.items()]
+    if training.requests:
+        lines.append(f"stopped at step {trainer.steps}; run the same command to resume")
+    return lines
 
 
 def _since(record: TrainingRecord, step: int | None) -> str:
@@ -207,7 +206,7 @@ def _entries(
         for row in (point._asdict() for point in record.curve)
     ]
     return {
-        "is_complete": training.is_complete,
+        "is_complete": trainer.steps >= trainer.parameters.steps,
         "first_step": record.curve[0].step,
         "episodes": trainer.episodes,
         **curve[-1],

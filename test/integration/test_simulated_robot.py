@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import simulated_robot
 from client import Client
+from driving_laws import always
 from driving_worlds import World
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
@@ -20,7 +21,8 @@ from ddqn_planner.grid import Cell, GridMap, MoveRule, shortest_path
 
 
 def world(occupancy: np.ndarray, *stations: Cell) -> World:
-    return World(GridMap(occupancy, 0.25), np.ones(occupancy.shape), [], [*stations])
+    law = always(np.ones(occupancy.shape))
+    return World(GridMap(occupancy, 0.25), law, [*stations])
 
 
 def metres(robot: Robot, path: tuple[Cell, ...]) -> np.ndarray:
