@@ -8,7 +8,6 @@ from importlib import import_module
 from typing import Final
 
 from ddqn_planner.output import unless_cut_off
-from ddqn_planner.resources import with_remedy
 
 # Names and descriptions. The module of a command, `commands.train_any_map` for
 # `train-any-map`, is imported when the command runs: it needs libraries that others do
@@ -35,7 +34,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command with arguments, by default those of the process.
 
     Returns the exit code: 0 if the command did its work, 1 without a path or a proof, 2
-    for bad input or a missing library, 130 after Ctrl-C.
+    for bad input or a missing library, 130 after Ctrl-C, and 143 if SIGTERM stopped a
+    training.
     """
     # NumPy is not yet imported. For small products one thread is as fast as several,
     # and on a busy machine several are ten times as slow.
@@ -56,6 +56,10 @@ def exit_code(program: str, run: Callable[[], int]) -> int:
         print(f"{program}: interrupted", file=sys.stderr)
         return 130
     except (OSError, ValueError, ImportError, MemoryError, OverflowError) as error:
+        # Ctrl-C gives a traceback until `main` runs: the fewer imports before, the
+        # better.
+        from ddqn_planner.resources import with_remedy
+
         print(f"{program}: {with_remedy(error)}", file=sys.stderr)
         return 2
 

@@ -5,8 +5,6 @@ from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any
 
-from ddqn_planner.resources import with_remedy
-
 
 def imported_at_first_use(
     package: str, modules: Mapping[str, str]
@@ -32,6 +30,9 @@ def imported_at_first_use(
         try:
             module = import_module(f"{package}.{modules[name]}")
         except ModuleNotFoundError as error:
+            # It imports ten modules, which would delay each program.
+            from ddqn_planner.resources import with_remedy
+
             raise ModuleNotFoundError(with_remedy(error)) from error
         value = getattr(module, name)
         namespace[name] = value

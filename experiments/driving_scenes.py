@@ -5,6 +5,8 @@ from argparse import Namespace
 from typing import Final
 
 import numpy as np
+from driving_halls import SQUARES
+from driving_halls import hall as hall_with
 from driving_laws import Door, Float64, Law, Stand, always
 from driving_missions import Job, Result, planner, run_in
 from driving_worlds import RULE, SPEED, World, drive
@@ -19,11 +21,6 @@ RESOLUTION: Final = 0.25  # metres
 DOOR_WAITS: Final = (10, 30, 60)  # seconds
 DOOR_DRIVES: Final = 40
 ALIKE: Final = 2.5  # seconds by which ways through one door differ, at most
-# The middles of slow squares in a hall of 20 m by 10 m, in metres; its stations are 1 m
-# from its ends, at half its height.
-HALL_SQUARES: Final = tuple(itertools.product((7.0, 10.0, 13.0), (5.0, 6.0)))
-HALL_SIDE: Final = 4.0  # metres, of a square
-HALL_SLOWNESS: Final = 6.0
 HALL_MISSIONS: Final = 60
 PASSAGES: Final = 100  # of a door, before and after the one wait there
 ONE_WAIT: Final = 70  # seconds
@@ -79,24 +76,20 @@ def one_wait(options: Namespace) -> Sections:
 
 def hall(options: Namespace) -> Sections:
     """Measure missions from one end of a hall to the other, past a slow square."""
-    shape = round(10 / RESOLUTION), round(20 / RESOLUTION)
-    y, x = (np.indices(shape) + 0.5) * RESOLUTION
     rows = []
-    for middle_x, middle_y in HALL_SQUARES:
-        metres = np.maximum(abs(x - middle_x), abs(y - middle_y))
-        slowness = np.where(metres < HALL_SIDE / 2, HALL_SLOWNESS, 1.0)
-        grid = GridMap(np.zeros(shape, dtype=np.bool_), RESOLUTION)
-        row = shape[0] // 2
-        world = World(grid, always(slowness), [(4, row), (shape[1] - 5, row)])
+    for square in SQUARES:
+        world = hall_with(square)
         ratios = []  # of each seed and mission
         for seed in range(options.seeds):
             result = _result(world, seed, HALL_MISSIONS, options)
             ratios.append(result.seconds / result.best)
         mean = np.mean(ratios, axis=0)
         last = f"{mean[-1]:.2f} ({np.max(ratios, axis=0)[-1]:.2f})"
-        square = f"{middle_x:g} m, {middle_y:g} m"
-        rows.append([square, f"{mean[1]:.2f}", f"{mean[19]:.2f}", last])
-    header = "middle of the square | mission 2 | mission 20 | mission 60 (worst)"
+        middle = f"{square.x:g} m, {square.y:g} m"
+        size = f"{square.side:g} m"
+        shown = [f"{mean[mission - 1]:.2f}" for mission in (2, 20)]
+        rows.append([middle, size, square.slowness, *shown, last])
+    header = "middle | side | slowness | mission 2 | mission 20 | mission 60 (worst)"
     return {"The hall": table(header, rows)}
 
 

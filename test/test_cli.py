@@ -19,6 +19,7 @@ from ddqn_planner.resources import ROS, with_remedy
 from ddqn_planner.training.any_map import ANY_MAP, random_scenarios
 from ddqn_planner.training.environment import Scenario
 from ddqn_planner.training.hyper_parameters import HyperParameters
+from ddqn_planner.training.robot import RobotTrainer
 from ddqn_planner.training.trainer import Trainer
 
 PARAMETERS: Any = fields(HyperParameters)
@@ -213,7 +214,7 @@ def test_an_interrupted_training_is_saved_and_resumed(
             time.sleep(0.05)
         os.kill(child.pid, number)
         printed, _ = child.communicate(timeout=PATIENCE)
-        assert child.returncode == 0
+        assert child.returncode == 128 + number
         assert f"from step {steps} to" in printed
         assert "run the same command to resume" in printed
         before, steps = (
@@ -267,3 +268,20 @@ def test_an_interrupted_compilation_ends_with_one_line(tmp_path: Path) -> None:
     assert child.wait(PATIENCE) == 130
     assert child.stderr.read() == "ddqn-planner: interrupted\n"
     child.stderr.close()
+
+
+def test_an_interrupted_training_of_a_robot_says_that_nothing_is_saved(
+    console: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settle = RobotTrainer._settle
+
+    def settle_at_ctrl_c(trainer: RobotTrainer) -> None:
+        settle(trainer)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(RobotTrainer, "_settle", settle_at_ctrl_c)
+    words = "train-robot --footprint 0.1 --motion differential --out"
+    error = console(words, tmp_path / "robot.safetensors", status=130).err
+    assert "after 0 transitions; nothing is saved" in error
+    assert error.endswith("ddqn-planner: interrupted\n")
+    assert not any(tmp_path.iterdir())

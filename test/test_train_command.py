@@ -68,26 +68,34 @@ def test_a_picture_and_a_film_are_saved_into_new_folders(
         assert frames.n_frames == 2
 
 
-def test_ctrl_c_saves_the_film_so_far(
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_training_that_a_signal_stops_says_so_and_saves_its_film(
     console: Any,
     small_map: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
+    number: signal.Signals,
 ) -> None:
     pytest.importorskip("matplotlib")
 
     class Interrupted(train_command._Watcher):
         def __call__(self, *arguments: Any) -> dict[str, object]:
             if self.record.trainer.steps >= 10:
-                os.kill(os.getpid(), signal.SIGINT)
+                os.kill(os.getpid(), number)
             return super().__call__(*arguments)
 
     monkeypatch.setattr(train_command, "_Watcher", Interrupted)
-    film = tmp_path / "film.gif"
-    printed = console(TRAIN, small_map, "--out", tmp_path / "run", "--film", film).out
-    assert "run the same command to resume" in printed
+    film, run = tmp_path / "film.gif", tmp_path / "run"
+    command = TRAIN, small_map, "--out", run
+    printed = console(*command, "--film", film, status=128 + number).out
+    assert re.search(rf"stopped at step \d+ and saved in {run}; run the sam", printed)
     with Image.open(film) as frames:
         assert 2 <= frames.n_frames < 10
+    as_json = console(*command, "--json", status=128 + number)
+    assert json.loads(as_json.out)["is_complete"] is False
+    assert "run the same command to resume" in as_json.err
+    monkeypatch.undo()
+    console(*command)
 
 
 def test_wrong_outputs_are_refused_before_the_training(

@@ -18,8 +18,10 @@ from ddqn_planner.commands.options import (
 )
 from ddqn_planner.commands.training_options import (
     add_training_options,
+    exit_code_of,
     hyper_parameters_of,
     opened_training,
+    stop_report,
     train_with_bar,
 )
 from ddqn_planner.files import check_distinct, check_writable
@@ -46,8 +48,8 @@ OPTIONS: Final = (
 def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
     """Train, and print what the greedy rollouts solve, as a table or as JSON.
 
-    `parser` gets the command's options, which `arguments` give. Returns the exit code
-    0.
+    `parser` gets the command's options, which `arguments` give. Returns the exit code,
+    see `exit_code_of`.
     """
     add_map_options(parser, "corner_cutting")
     add_options(parser, *OPTIONS)
@@ -71,6 +73,8 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
         print(json.dumps(_entries(options, training, record), allow_nan=False))
     else:
         print(*_lines(training, record), sep="\n")
+    if not training.is_complete:
+        print(stop_report(training), file=output, flush=True)
     # After the results: to draw takes seconds, which Ctrl-C may cut off.
     if options.picture:
         record.save_picture(options.picture)
@@ -79,7 +83,7 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
         print(f"drawing {len(record.snapshots)} frames", file=output, flush=True)
         record.save_film(options.film)
         print(f"saved {options.film}", file=output)
-    return 0
+    return exit_code_of(training)
 
 
 def _check_outputs(options: Namespace, map_file: MapFile) -> None:
@@ -161,10 +165,7 @@ def _lines(training: "TrainingRun", record: TrainingRecord) -> list[str]:
     first_step = record.curve[0].step
     if first_step:
         rows["training"] += f" since step {first_step:,}"
-    lines = [f"{name:22}{text}" for name, text in rows.items()]
-    if training.requests:
-        lines.append(f"stopped at step {trainer.steps}; run the same command to resume")
-    return lines
+    return [f"{name:22}{text}" for name, text in rows.items()]
 
 
 def _since(record: TrainingRecord, step: int | None) -> str:
@@ -206,7 +207,7 @@ def _entries(
         for row in (point._asdict() for point in record.curve)
     ]
     return {
-        "is_complete": trainer.steps >= trainer.parameters.steps,
+        "is_complete": training.is_complete,
         "first_step": record.curve[0].step,
         "episodes": trainer.episodes,
         **curve[-1],

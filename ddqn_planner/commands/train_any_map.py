@@ -7,15 +7,17 @@ from functools import partial
 from ddqn_planner.commands.options import Option, add_options
 from ddqn_planner.commands.training_options import (
     add_training_options,
+    exit_code_of,
     opened_training,
     reward_figures,
+    stop_report,
     train_with_bar,
 )
 from ddqn_planner.training.any_map import ANY_MAP, MAPS, random_scenarios
 
 
 def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
-    """Train on ``--maps`` random maps; return 0."""
+    """Train on ``--maps`` random maps; return the code of `exit_code_of`."""
     add_options(parser, Option("maps", int, MAPS, "number of maps"))
     add_training_options(parser, "runs/any_map", ANY_MAP)
     options = parser.parse_args(arguments)
@@ -26,7 +28,7 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
         print(run.description)
         train_with_bar(run, reward_figures)
     trainer = run.trainer
-    if run.requests:
-        print(f"stopped at step {trainer.steps}; run the same command to resume")
+    if not run.is_complete:
+        print(stop_report(run))
     print(f"{trainer.steps} steps, {trainer.episodes} episodes, saved {run.model_path}")
-    return 0
+    return exit_code_of(run)

@@ -12,6 +12,7 @@ from ddqn_planner.files import as_path, check_distinct, check_writable
 from ddqn_planner.grid.arguments import as_whole
 from ddqn_planner.model import save_model
 from ddqn_planner.model.model_file import check_model_path
+from ddqn_planner.robot.body_certificate import BodyCertificate
 from ddqn_planner.training.robot import MOST_STEPS, ROBOT, RobotTrainer
 
 OPTIONS = (
@@ -64,13 +65,15 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
         options.seed,
         options.padding,
     )
-    # disable=None: no bar if the output is not a terminal.
-    with tqdm(total=options.steps, disable=None) as bar:
-        for certificate in trainer.run(options.steps):
-            bar.update(trainer.steps - bar.n)
-            bar.set_postfix(
-                weak=certificate.weak, forbidden=certificate.forbidden, refresh=False
-            )
+    try:
+        certificate = _train_with_bar(trainer, options.steps)
+    except KeyboardInterrupt:
+        print(
+            f"stopped after {trainer.steps:,} transitions; nothing is saved, and the "
+            "same command begins anew",
+            file=sys.stderr,
+        )
+        raise
     print(f"{trainer.steps:,} transitions: {certificate}")
     if not certificate.proved:
         remedy = "give more --steps, or another --seed or --resolution"
@@ -78,3 +81,15 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
         return 1
     save_model(out, trainer.network, trainer.metadata())
     return 0
+
+
+def _train_with_bar(trainer: RobotTrainer, until: int) -> BodyCertificate:
+    """Train until the body is proved or until step `until`; return the certificate."""
+    # disable=None: no bar if the output is not a terminal.
+    with tqdm(total=until, disable=None) as bar:
+        for certificate in trainer.run(until):
+            bar.update(trainer.steps - bar.n)
+            bar.set_postfix(
+                weak=certificate.weak, forbidden=certificate.forbidden, refresh=False
+            )
+    return certificate

@@ -69,11 +69,29 @@ def opened_training(
         # Python's own handler would raise an exception within a step. The run looks at
         # its requests between two steps.
         for number in (signal.SIGINT, signal.SIGTERM):
-            earlier_handler = signal.signal(number, lambda *_: run.requests.add("stop"))
+            earlier_handler = signal.signal(number, run.stop_by_signal)
             run.callback(signal.signal, number, earlier_handler)
         yield run
     if run.save_error:
         raise OSError(run.save_error)
+
+
+def exit_code_of(run: "TrainingRun") -> int:
+    """Return the exit code of a training: 0 if it is complete.
+
+    Otherwise it is 128 and the number of the signal that stopped it, as shells have it.
+    """
+    if run.is_complete or run.stop_signal is None:
+        return 0
+    return 128 + run.stop_signal
+
+
+def stop_report(run: "TrainingRun") -> str:
+    """Return in words what is saved of a training that was stopped."""
+    return (
+        f"stopped at step {run.trainer.steps} and saved in {run.folder}; "
+        "run the same command to resume"
+    )
 
 
 def hyper_parameters_of(options: Namespace) -> HyperParameters:

@@ -28,6 +28,8 @@ class TrainingRun(WorkFolder):
         The step at which the run saved last, or began.
     model : bytes
         The model's file of the last save.
+    stop_signal : int or None
+        The number of the signal that requested the stop, if one did.
     """
 
     def __init__(
@@ -64,10 +66,21 @@ class TrainingRun(WorkFolder):
             )
             self.callback(self._record.close)
         self.requests: set[str] = set()
+        self.stop_signal: int | None = None
         self.saved_at = self.trainer.steps
         self.description = (
             f"training in {self.folder} from step {self.saved_at} to {parameters.steps}"
         )
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the training has reached its last step."""
+        return self.trainer.steps >= self.trainer.parameters.steps
+
+    def stop_by_signal(self, number: int, _: object = None) -> None:
+        """Request the run to stop: a handler of the signal `number`."""
+        self.requests.add("stop")
+        self.stop_signal = number
 
     def steps(self, every: int | None = None) -> Iterator[Progress]:
         """Train to the last step or until `requests` has "stop"; save at intervals.
