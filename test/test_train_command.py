@@ -40,6 +40,7 @@ def test_the_end_is_a_table_and_a_resumed_training_tells_its_first_step(
     assert re.search(r"given start after \d+ steps, from all after \d+ st", printed)
     assert re.search(r"600 steps, \d+ episodes, \d+\.\d s\n", printed)
     assert str(folder / "model.safetensors") in printed
+    (folder / "curve.csv").unlink()  # as in a folder of version 0.5.0
     resumed = console(TRAIN, small_map, "--out", folder, "--steps", 601).out
     assert "given start at step 600 or before, from all at step 600" in resumed
     assert "s since step 600\n" in resumed
@@ -68,34 +69,38 @@ def test_a_picture_and_a_film_are_saved_into_new_folders(
         assert frames.n_frames == 2
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_training_that_a_signal_stops_says_so_and_saves_its_film(
     console: Any,
     small_map: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    number: signal.Signals,
 ) -> None:
     pytest.importorskip("matplotlib")
+
+    numbers = [signal.SIGINT, signal.SIGTERM]
 
     class Interrupted(train_command._Watcher):
         def __call__(self, *arguments: Any) -> dict[str, object]:
             if self.record.trainer.steps >= 10:
-                os.kill(os.getpid(), number)
+                os.kill(os.getpid(), numbers[0])
             return super().__call__(*arguments)
 
     monkeypatch.setattr(train_command, "_Watcher", Interrupted)
     film, run = tmp_path / "film.gif", tmp_path / "run"
     command = TRAIN, small_map, "--out", run
-    printed = console(*command, "--film", film, status=128 + number).out
+    printed = console(*command, "--film", film, status=130).out
     assert re.search(rf"stopped at step \d+ and saved in {run}; run the sam", printed)
     with Image.open(film) as frames:
         assert 2 <= frames.n_frames < 10
-    as_json = console(*command, "--json", status=128 + number)
+    del numbers[0]
+    as_json = console(*command, "--json", status=143)
     assert json.loads(as_json.out)["is_complete"] is False
     assert "run the same command to resume" in as_json.err
     monkeypatch.undo()
-    console(*command)
+    answer = json.loads(console(*command, "--json").out)
+    assert answer["first_step"] == 0
+    steps = [point["step"] for point in answer["curve"]]
+    assert steps == sorted({*steps, *range(0, 601, 6)})
 
 
 def test_wrong_outputs_are_refused_before_the_training(

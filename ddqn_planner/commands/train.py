@@ -27,6 +27,7 @@ from ddqn_planner.commands.training_options import (
 from ddqn_planner.files import check_distinct, check_writable
 from ddqn_planner.grid import MapFile, MoveRule
 from ddqn_planner.pictures import film_format, picture_format
+from ddqn_planner.training.curve_file import CURVE, CurveFile
 from ddqn_planner.training.episodes import Progress
 from ddqn_planner.training.hyper_parameters import HyperParameters
 from ddqn_planner.training.scenario import Scenario
@@ -65,10 +66,12 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
         # With --json, the object alone goes to stdout.
         output = sys.stderr if options.json else sys.stdout
         print(training.description, file=output, flush=True)
-        record = TrainingRecord(training.trainer)
-        event_files = _event_files(options, training)
-        train_with_bar(training, _Watcher(record, event_files))
-        record.evaluate()
+        curve_file = CurveFile(training.folder / CURVE, training.saved_at)
+        training.callback(curve_file.close)
+        record = TrainingRecord(training.trainer, earlier_curve=curve_file.earlier)
+        watcher = _Watcher(record, curve_file, _event_files(options, training))
+        train_with_bar(training, watcher)
+        watcher.finish()
     if options.json:
         print(json.dumps(_entries(options, training, record), allow_nan=False))
     else:
@@ -118,9 +121,15 @@ def _event_files(options: Namespace, training: "TrainingRun") -> "EventFiles | N
 class _Watcher:
     """Takes the progress of a training, and returns what stands beside its bar."""
 
-    def __init__(self, record: TrainingRecord, event_files: "EventFiles | None"):
+    def __init__(
+        self,
+        record: TrainingRecord,
+        curve_file: CurveFile,
+        event_files: "EventFiles | None",
+    ) -> None:
         """Write the first evaluation, too."""
         self.record = record
+        self.curve_file = curve_file
         self.event_files = event_files
         self._write()
 
@@ -134,8 +143,15 @@ class _Watcher:
             figures["reward per step"] = point.reward_per_step
         return figures
 
+    def finish(self) -> None:
+        """Evaluate the present network, and write that, too."""
+        last_point = self.record.curve[-1]
+        if self.record.evaluate() is not last_point:
+            self._write()
+
     def _write(self) -> None:
-        """Write the last evaluation into the event files, if there are any."""
+        """Write the last evaluation into the curve's file, and the event files."""
+        self.curve_file.add(self.record.curve[-1])
         if self.event_files is not None:
             self.event_files.add(self.record.curve[-1])
 

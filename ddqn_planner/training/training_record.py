@@ -70,13 +70,17 @@ class TrainingRecord:
     interval : int
         Environment steps from an evaluation to the next.
     curve : list of CurvePoint
-        The evaluations, in the order of their steps.
+        The evaluations of the whole training, in the order of their steps.
     snapshots : list of Snapshot
         What the last evaluations look like: of `curve[-len(snapshots):]`.
     """
 
     def __init__(
-        self, trainer: Trainer, scenario: int = 0, evaluations: int = EVALUATIONS
+        self,
+        trainer: Trainer,
+        scenario: int = 0,
+        evaluations: int = EVALUATIONS,
+        earlier_curve: Sequence[CurvePoint] = (),
     ) -> None:
         """Evaluate the network as it is now.
 
@@ -88,6 +92,9 @@ class TrainingRecord:
             The number of the map in `trainer.scenarios`.
         evaluations : int
             How many evaluations a whole training has: as many frames has its film.
+        earlier_curve : sequence of CurvePoint
+            The `curve` of an earlier record of this training, if it continues from a
+            checkpoint. Points after the trainer's step are left out.
         """
         from ddqn_planner.training.trainer import Trainer  # needs torch
 
@@ -96,10 +103,14 @@ class TrainingRecord:
         scenario = as_whole("scenario", scenario, 0, len(trainer.scenarios) - 1)
         steps = trainer.parameters.steps
         evaluations = as_whole("evaluations", evaluations, 1, MOST_EVALUATIONS)
+        if not all(isinstance(point, CurvePoint) for point in earlier_curve):
+            raise ValueError(
+                "earlier_curve holds what is no CurvePoint; give the curve of a record"
+            )
         self.trainer = trainer
         self.scenario = trainer.scenarios[scenario]
         self.interval = max(1, steps // evaluations)
-        self.curve: list[CurvePoint] = []
+        self.curve = [point for point in earlier_curve if point.step <= trainer.steps]
         self.snapshots: list[Snapshot] = []
         self._scenario_number = scenario
         self._optimum = shortest_distances(
@@ -107,7 +118,8 @@ class TrainingRecord:
         )
         self._episodes: list[Episode] = []  # since the last evaluation
         self._last_step = trainer.steps  # of which the episodes are known
-        self._begin = time.monotonic()
+        seconds = self.curve[-1].seconds if self.curve else 0.0  # of the training
+        self._begin = time.monotonic() - seconds
         self.evaluate()
 
     @property
@@ -141,8 +153,8 @@ class TrainingRecord:
 
     def evaluate(self) -> CurvePoint:
         """Evaluate the network as it is now, unless this step is in the curve."""
-        step = self.trainer.steps
-        if self.curve and self.curve[-1].step == step:
+        is_in_curve = bool(self.curve) and self.curve[-1].step == self.trainer.steps
+        if is_in_curve and self.snapshots:
             return self.curve[-1]
         scenario = self.scenario
         field = self.trainer.planner().q_field(scenario.grid, scenario.goal)
@@ -155,7 +167,8 @@ class TrainingRecord:
             episodes=self._shown_episodes(),
         )
         self.snapshots.append(snapshot)
-        self.curve.append(self._point(summary_of(ratios), float(ratios[y, x])))
+        if not is_in_curve:  # an earlier record knows its episodes, too
+            self.curve.append(self._point(summary_of(ratios), float(ratios[y, x])))
         self._episodes.clear()
         return self.curve[-1]
 

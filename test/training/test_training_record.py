@@ -15,6 +15,7 @@ from ddqn_planner.training import (
     TrainingRecord,
     evaluate,
 )
+from ddqn_planner.training.curve_file import CurveFile
 
 PARAMETERS = HyperParameters(
     network="propagation",
@@ -64,6 +65,47 @@ def test_the_curve_has_a_point_for_each_interval(small: Scenario) -> None:
     for_good = record.all_solved_for_good()
     assert for_good in [point.step for point in record.curve]
     assert record.start_solved_for_good() <= for_good
+
+
+def test_the_curve_of_a_restored_training_is_that_of_the_whole(
+    small: Scenario, tmp_path: Path
+) -> None:
+    whole, cut = record_of([small], steps=150), record_of([small], steps=102)
+    cut.trainer.save_checkpoint(tmp_path / "checkpoint")
+    for _ in cut.trainer.run(105):
+        cut.evaluate()  # later than the checkpoint
+    restored = Trainer([small], PARAMETERS, seed=0)
+    restored.restore(tmp_path / "checkpoint")
+    record = TrainingRecord(restored, earlier_curve=cut.curve)
+    assert record.curve == [point for point in cut.curve if point.step <= 102]
+    for progress in restored.run(150, every=record.interval):
+        record.add(progress)
+    for point, expected in zip(record.curve, whole.curve, strict=True):
+        np.testing.assert_equal(point._replace(seconds=0), expected._replace(seconds=0))
+    seconds = [point.seconds for point in record.curve]
+    assert seconds == sorted(seconds)
+    assert len(record.snapshots) == 1 + 48 // record.interval
+    with pytest.raises(ValueError, match="no CurvePoint; give the curve of a record"):
+        TrainingRecord(restored, earlier_curve=[1])  # type: ignore[list-item]
+
+
+@pytest.mark.parametrize("rest", [b"", b"200,1.5,16", b"x,1\r\n", b"\xff\0,,,\r\n\r\n"])
+def test_complete_points_of_a_broken_file_are_read(
+    small: Scenario, tmp_path: Path, rest: bytes
+) -> None:
+    points = record_of([small], steps=18).curve
+    path = tmp_path / "curve.csv"
+    file = CurveFile(path, step=0)
+    for point in [points[0], *points]:
+        file.add(point)
+    file.close()
+    path.write_bytes(path.read_bytes() + rest)
+    again = CurveFile(path, step=12)
+    np.testing.assert_equal(again.earlier, points[:3])
+    again.close()
+    assert len(path.read_bytes().splitlines()) == 1 + 3
+    CurveFile(path, step=0).close()  # a new training in the folder
+    assert len(path.read_bytes().splitlines()) == 1
 
 
 def test_a_start_that_is_lost_again_is_not_solved_for_good(small: Scenario) -> None:
