@@ -112,7 +112,8 @@ setup(
         "figures": ["matplotlib>=3.6"],
         "tensorboard": ["tensorboard>=2.10"],
         "experiments": ["joblib>=1.3", "matplotlib>=3.6"],
-        "bags": ["mcap-ros2-support>=0.5"],
+        # mcap brings zstandard, which unpacks bags of each kind.
+        "bags": ["mcap>=1.1", "rosbags>=0.10"],
         "docs": ["furo", "myst-parser>=3.0", "sphinx>=7.3", "sphinx-copybutton>=0.5"],
         "bench": [
             "dijkstra3d>=1.15",

@@ -16,13 +16,14 @@ ROS: Final = (
 PACKAGES: Final = {
     "gymnasium": "gymnasium",
     "matplotlib": "matplotlib",
-    "mcap": "mcap-ros2-support",
-    "mcap_ros2": "mcap-ros2-support",
+    "mcap": "mcap rosbags",
     "numba": "numba",
+    "rosbags": "mcap rosbags",
     "safetensors": "safetensors",
     "stable_baselines3": "stable-baselines3",
     "tensorboard": "tensorboard",
     "torch": "torch",
+    "zstandard": "mcap rosbags",
 }
 
 

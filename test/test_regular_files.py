@@ -15,8 +15,9 @@ import pytest
 from ddqn_planner import Experience, GridMap, Planner, load_map
 from ddqn_planner.cli import main
 from ddqn_planner.code_cache import read_checked
+from ddqn_planner.experience.bags import read_messages
 from ddqn_planner.experience.drives import DriveFolder, read_drives
-from ddqn_planner.experience.recordings import read_csv, read_mcap
+from ddqn_planner.experience.recordings import read_csv
 from ddqn_planner.files import read_file, write_atomically
 from ddqn_planner.grid.map_file import MapNotFoundError
 from ddqn_planner.resources import find_resource
@@ -33,7 +34,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "drives": lambda path: list(read_drives(path)),
     "episodes": lambda path: list(read_cells(path, 1)),
     "csv": read_csv,
-    "mcap": lambda path: read_mcap([path]),
+    "bag": lambda path: list(read_messages(path)),
     "code": read_checked,
 }
 
@@ -55,7 +56,7 @@ def test_only_regular_files_of_some_size_are_read(
         if reader != Experience.load or kind != "a folder":  # which has experience.npz
             with pytest.raises(ValueError, match=f"is {kind}; give"):
                 reader(path)
-    if reader is not READERS["mcap"]:  # of which parts are read
+    if reader is not READERS["bag"]:  # of which parts are read
         large.touch()
         os.truncate(large, LARGE)
         with pytest.raises(ValueError, match=f"{LARGE} bytes; give at most"):

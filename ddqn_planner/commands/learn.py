@@ -43,10 +43,10 @@ OPTIONS = (
         "topic",
         str,
         "",
-        "MCAP: of poses or transforms, by default that with most of them",
+        "bags: of poses or transforms, by default that with most of them",
     ),
-    Option("frame", str, "map", "MCAP: the map's frame"),
-    Option("robot-frame", str, "", "MCAP: by default any that ends in base_link"),
+    Option("frame", str, "map", "bags: the map's frame"),
+    Option("robot-frame", str, "", "bags: by default any that ends in base_link"),
 )
 
 
@@ -74,7 +74,7 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
         "drives",
         type=file_of,
         nargs="+",
-        help="trainers' folders, bags, MCAP files, or CSV files with the columns "
+        help="trainers' folders, bags of ROS 1 or 2, or CSV files with the columns "
         "seconds, x, y",
     )
     parser.add_argument(
@@ -144,6 +144,8 @@ def _read_drives(
             robot_frame=options.robot_frame,
         )
         print(f"{path}: {recording.source}")
+        for words in recording.damage:
+            print(words)
         drives += recording.drives
     return drives
 

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import math
 import re
 from pathlib import Path
 from typing import Any
@@ -11,88 +10,14 @@ from map_files import save_map
 
 from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience.drives import Drive, DriveEnd, DriveFolder
-from ddqn_planner.experience.recordings import read_csv, read_mcap, read_recording
+from ddqn_planner.experience.recordings import read_csv, read_recording
 
 GRID = GridMap(np.zeros((40, 120), dtype=np.bool_), resolution=0.25)
 
-Sample = tuple[float, float, float]
-Message = tuple[str, str, dict[str, Any]]
-"""A topic, a kind of message, and its content."""
 
-TYPES = """
-std_msgs/Header: builtin_interfaces/Time stamp, string frame_id
-builtin_interfaces/Time: int32 sec, uint32 nanosec
-geometry_msgs/Pose: geometry_msgs/Vector position
-geometry_msgs/PoseWithCovariance: geometry_msgs/Pose pose
-geometry_msgs/Transform: geometry_msgs/Vector translation, \
-geometry_msgs/Quaternion rotation
-geometry_msgs/TransformStamped: std_msgs/Header header, string child_frame_id, \
-geometry_msgs/Transform transform
-geometry_msgs/Vector: float64 x, float64 y
-geometry_msgs/Quaternion: float64 x, float64 y, float64 z, float64 w
-nav_msgs/msg/Odometry: std_msgs/Header header, geometry_msgs/PoseWithCovariance pose
-geometry_msgs/msg/PoseStamped: std_msgs/Header header, geometry_msgs/Pose pose
-geometry_msgs/msg/PoseWithCovarianceStamped: std_msgs/Header header, \
-geometry_msgs/PoseWithCovariance pose
-tf2_msgs/msg/TFMessage: geometry_msgs/TransformStamped[] transforms
-std_msgs/msg/String: string data
-"""
-"""The types in messages and the messages, with the fields that are read."""
-
-ODOMETRY = "nav_msgs/msg/Odometry"
-WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
-
-
-def slow_drive() -> list[Sample]:
+def slow_drive() -> list[tuple[float, float, float]]:
     """20 m along x at a third of the nominal speed."""
     return [(1e9 + t, 5 + t / 6, 5.0) for t in np.arange(0, 120, 0.1).tolist()]
-
-
-def header(seconds: float, frame: str) -> dict[str, Any]:
-    stamp = {"sec": int(seconds), "nanosec": int(1e9 * (seconds % 1))}
-    return {"stamp": stamp, "frame_id": frame}
-
-
-def message(topic: str, kind: str, sample: Sample, frame: str = "map") -> Message:
-    seconds, x, y = sample
-    placed: dict[str, Any] = {"position": {"x": x, "y": y}}
-    if kind in (ODOMETRY, WITH_COVARIANCE):
-        placed = {"pose": placed}
-    return topic, kind, {"header": header(seconds, frame), "pose": placed}
-
-
-def transform(
-    seconds: float, frame: str, child: str, x: float, y: float, yaw: float = 0.0
-) -> Any:
-    rotation = {"z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
-    moved = {"translation": {"x": x, "y": y}, "rotation": rotation}
-    return {
-        "header": header(seconds, frame),
-        "child_frame_id": child,
-        "transform": moved,
-    }
-
-
-def write_mcap(path: Path, messages: list[Message]) -> Path:
-    pytest.importorskip("mcap_ros2")
-    from mcap_ros2.writer import Writer
-
-    fields = dict(line.split(": ") for line in TYPES.split("\n") if line)
-    fields = {kind: text.replace(", ", "\n") for kind, text in fields.items()}
-    types = "".join(
-        f"\n{'=' * 80}\nMSG: {kind}\n{text}" for kind, text in fields.items()
-    )
-    with path.open("wb") as file:
-        writer = Writer(file)
-        schemas = {
-            kind: writer.register_msgdef(kind, text + types)
-            for kind, text in fields.items()
-            if "/msg/" in kind
-        }
-        for number, (topic, kind, content) in enumerate(messages):
-            writer.write_message(topic, schemas[kind], content, log_time=number)
-        writer.finish()
-    return path
 
 
 @pytest.fixture
@@ -175,9 +100,10 @@ REFUSED = [
         "seconds,x,y\n1,-50,1\n2,-51,1\n3,-52,1\n",
         r"\[-52.0, 1.0\] to .* map has 30.0 x",
     ),
-    ("drive.db3", "", r"no \.csv and no \.mcap file.* `ros2 bag convert`"),
+    ("drive.txt", "", r"no \.csv file, no bag, .* give files that end in .csv, .mcap"),
     ("missing.csv", None, "No such file"),
-    (".", None, r"no folder with episodes\.csv or \.mcap files"),
+    ("missing.db3", None, "No such file"),
+    (".", None, r"no folder with episodes\.csv or a bag"),
 ]
 
 
@@ -197,135 +123,12 @@ def test_what_cannot_be_learned_is_refused(
     assert not [*tmp_path.glob("experience.npz"), *tmp_path.glob("*.lock")]
 
 
-@pytest.mark.parametrize(
-    "kind", [ODOMETRY, WITH_COVARIANCE, "geometry_msgs/msg/PoseStamped"]
-)
-def test_poses_of_an_mcap_file_are_learned(
-    tmp_path: Path, map_file: Path, kind: str, console: Any
-) -> None:
-    messages = [message("/where", kind, sample) for sample in slow_drive()]
-    messages += [message("/odom", ODOMETRY, (t, 0.0, 0.0), "odom") for t in range(9)]
-    messages += [("/chatter", "std_msgs/msg/String", {"data": "hello"})]
-    file = write_mcap(tmp_path / "drive.mcap", messages)
-    assert "1200 poses of /where" in console("learn", file, "--map", map_file).out
-    assert slowness(tmp_path / "experience.npz") > 2
-
-
-def tree(robot: str, y: float, topic: str = "/tf") -> list[Message]:
-    """What a robot sends on 10 m along x: few corrections, dated into the future."""
-    kind, map_frame = "tf2_msgs/msg/TFMessage", "map"
-    odom, footprint, base = (
-        f"{robot}{name}" for name in ("odom", "base_footprint", "base_link")
-    )
-    upwards = transform(0, footprint, base, 1.0, 0.0)
-    messages: list[Message] = [(f"{topic}_static", kind, {"transforms": [upwards]})]
-    for step in range(200):
-        sent = [transform(100 + step / 20, odom, footprint, 2.0, 5 - step / 20)]
-        if step % 10 == 0:
-            turned = transform(101 + step / 20, map_frame, odom, 10.0, y, math.pi / 2)
-            sent = [turned, transform(100 + step / 20, footprint, "door", 0, 0), *sent]
-        messages.append((topic, kind, {"transforms": sent}))
-    return messages
-
-
-def driven(y: float) -> np.ndarray:
-    """What the transforms of `tree` tell of."""
-    return np.array([(100 + s / 20, 10 - 5 + s / 20, y + 2 + 1) for s in range(200)])
-
-
-def test_transforms_of_a_bag_lead_from_a_frame_below_the_one_that_moves_to_the_map(
-    tmp_path: Path, map_file: Path, console: Any
-) -> None:
-    messages = [*tree("", 5.0), message("/goal_pose", ODOMETRY, (100.0, 20.0, 1.0))]
-    parts = [
-        write_mcap(tmp_path / name, part)
-        for name, part in (
-            ("bag_9.mcap", messages[:101]),
-            ("bag_10.mcap", messages[101:]),
-        )
-    ]
-    source, samples = read_mcap(parts)
-    assert source == "/tf of base_link"
-    np.testing.assert_allclose(samples, driven(5.0), atol=1e-9)
-    printed = console("learn", tmp_path, "--map", map_file).out
-    assert "200 poses of /tf of base_link" in printed
-
-
-def test_transforms_with_rounded_rotations_count_and_those_without_do_not(
-    tmp_path: Path,
-) -> None:
-    messages, empty = tree("", 5.0), {"x": 0.0, "y": 0.0, "z": 0.0, "w": 0.0}
-    for _, _, sent in messages:
-        for each in sent["transforms"]:
-            numbers = each["transform"]["rotation"]
-            each["transform"]["rotation"] = {
-                axis: round(n, 3) for axis, n in numbers.items()
-            }
-    bad = transform(105, "map", "odom", 30.0, 3.0)
-    bad["transform"]["rotation"] = empty
-    messages.insert(90, ("/tf", "tf2_msgs/msg/TFMessage", {"transforms": [bad]}))
-    _, samples = read_mcap([write_mcap(tmp_path / "bag.mcap", messages)])
-    np.testing.assert_allclose(samples, driven(5.0), atol=1e-9)
-
-
-BY_TURNS = zip(tree("", 9.0, "/robot2/tf"), tree("", 1.0, "/robot1/tf"), strict=True)
-# The poses of two robots, their messages, and what chooses the second robot.
-TWO_ROBOTS: dict[str, tuple[list[Message], dict[str, str]]] = {
-    "/tf of robot1/base_link, /tf of robot2/base_link": (
-        [*tree("robot1/", 1.0), *tree("robot2/", 9.0)],
-        {"robot_frame": "robot2/base_link"},
-    ),
-    "/robot1/tf of base_link, /robot2/tf of base_link": (
-        [sent for both in BY_TURNS for sent in both],
-        {"topic": "/robot2/tf"},
-    ),
-    "/a, /tf of base_link": (
-        [message("/a", ODOMETRY, s) for s in driven(6.0).tolist()] + tree("", 9.0),
-        {"robot_frame": "base_link"},
-    ),
-}
-
-
-@pytest.mark.parametrize("names", TWO_ROBOTS)
-def test_of_several_robots_one_is_chosen(tmp_path: Path, names: str) -> None:
-    messages, choice = TWO_ROBOTS[names]
-    file = write_mcap(tmp_path / "two.mcap", messages)
-    with pytest.raises(
-        ValueError, match=f"poses of several robots: {names}; give --topic"
-    ):
-        read_mcap([file])
-    _, samples = read_mcap([file], **choice)
-    np.testing.assert_allclose(samples, driven(9.0), atol=1e-9)
-
-
-def test_an_mcap_file_without_poses_on_the_map_names_what_it_has(
-    tmp_path: Path,
-) -> None:
-    file = write_mcap(
-        tmp_path / "odom.mcap", [message("/odom", ODOMETRY, (1, 2, 3), "odom")]
-    )
-    with pytest.raises(
-        ValueError, match=r"no poses in the frame 'map' .*/odom in \['odom'\]"
-    ):
-        read_mcap([file])
-    assert read_mcap([file], "/odom", "odom")[1] == [(1, 2, 3)]
-
-
-@pytest.mark.parametrize("cut", [0, 20, 400])
-def test_a_broken_mcap_file_is_refused(tmp_path: Path, cut: int) -> None:
-    messages = [message("/odom", ODOMETRY, sample) for sample in slow_drive()]
-    file = write_mcap(tmp_path / "drive.mcap", messages)
-    file.write_bytes(file.read_bytes()[:cut])
-    with pytest.raises(ValueError, match="cannot be read as MCAP"):
-        read_mcap([file])
-
-
 def test_a_recording_of_hours_has_a_drive_for_each_way(tmp_path: Path) -> None:
     way = [(t, min(t / 2, 10.0), 0.0) for t in np.arange(0, 200, 0.1).tolist()]
     back = [(200 + t, 10 - x, y) for t, x, y in way]
     rows = [f"{t},{x},{y}" for t, x, y in [*way, *back]]
     (tmp_path / "drive.csv").write_text("\n".join(["seconds,x,y", *rows]))
-    _, drives = read_recording(tmp_path / "drive.csv", GRID)
+    drives = read_recording(tmp_path / "drive.csv", GRID).drives
     assert [drive.outcome.value for drive in drives] == ["paused", "paused"]
     assert [round(drive.metres) for drive in drives] == [10, 10]
 
