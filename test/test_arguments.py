@@ -228,3 +228,30 @@ def test_cells_outside_the_map_and_fractions_are_refused(cell: Any) -> None:
             call()
     with pytest.raises(ValueError, match=r"holds 0\.5"):
         Plan(PlanStatus.SUCCEEDED, [(0.5, 0)])  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("call", "name"),
+    [
+        (GridMap, "occupancy"),
+        (GridMap, "cost"),
+        (GridMap, "slowness"),
+        (GridMap.from_occupancy_values, "values"),
+        (GRID.reachable, "cells"),
+        (GRID.contains, "cell"),
+        (EXPERIENCE.record, "positions"),
+        (QField, "q"),
+    ],
+)
+def test_masked_elements_are_refused_and_a_mask_of_none_is_not(
+    call: Callable[..., Any], name: str
+) -> None:
+    right = CALLS[call]
+    value = np.zeros(SHAPE) if right[name] is None else np.asarray(right[name])
+    masked = np.ma.masked_array(value)
+    call(**{**right, name: masked})
+    first_element = (0,) * value.ndim
+    masked[first_element] = np.ma.masked
+    reason = r"has 1 masked elements; give array\.filled\(VALUE\)|the cell is masked_"
+    with pytest.raises(ValueError, match=reason):
+        call(**{**right, name: masked})

@@ -74,7 +74,7 @@ def as_cell(cell: Any, name: str = "the cell") -> Cell:
             y = int(cell[1])
             if x == cell[0] and y == cell[1]:
                 return x, y
-    except (TypeError, ValueError, OverflowError, LookupError):
+    except (TypeError, ValueError, OverflowError, LookupError, np.ma.MAError):
         pass
     raise ValueError(f"{name} is {reprlib.repr(cell)}; give two whole numbers (x, y)")
 
@@ -97,6 +97,7 @@ def cells_inside(cells: Any, shape: tuple[int, ...]) -> NDArray[np.int64]:
     A ValueError names a cell outside.
     """
     height, width = shape
+    _refuse_masked("the cells", cells)
     is_right = False
     if (
         isinstance(cells, np.ndarray)
@@ -204,7 +205,13 @@ def numbers(
         Whether numbers within a range must be whole, of whatever kind.
     remedy : str
         What to give instead of what is wrong; by default the range, or numbers.
+
+    Raises
+    ------
+    ValueError
+        If the array is not such, or if elements of it are masked.
     """
+    _refuse_masked(name, values)
     try:
         array = np.asarray(values)
     except ValueError as error:  # rows of different lengths
@@ -252,6 +259,16 @@ def _check_range(
         kind = "whole numbers " if whole else ""
         remedy = f"{kind}{lowest:g} to {highest:g}"
     raise ValueError(f"{name} holds {array[~is_right].flat[0]}; give {remedy}")
+
+
+def _refuse_masked(name: str, values: object) -> None:
+    """Refuse an array with masked elements, whose mask NumPy drops otherwise."""
+    if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
+        count = int(np.ma.count_masked(values))
+        raise ValueError(
+            f"{name} has {count} masked elements; give array.filled(VALUE) with the "
+            "value that they shall have"
+        )
 
 
 def _refuse_flags(name: str, values: ArrayLike, remedy: str) -> None:

@@ -2,7 +2,7 @@
 
 import inspect
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from numbers import Integral
 from pathlib import Path
@@ -87,6 +87,7 @@ def _check_reward_function(function: object) -> None:
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):  # some functions written in C have none
+        _check_by_call(function)
         return
     try:
         signature.bind((0, 0), 0, (0, 0), None)
@@ -94,6 +95,18 @@ def _check_reward_function(function: object) -> None:
         raise ValueError(
             f"the reward function takes {signature} ({error}); {remedy}"
         ) from None
+
+
+def _check_by_call(function: Callable[..., object]) -> None:
+    """Raise a ValueError unless a function returns a reward for a collision."""
+    try:
+        reward = function((0, 0), 0, (0, 0), EpisodeEnd.COLLIDED)
+    except TypeError as error:
+        raise ValueError(
+            f"the reward function is {function!r} ({error}); give a function (cell, "
+            "action, next_cell, outcome)"
+        ) from None
+    _as_reward(reward)
 
 
 def _as_reward(value: object) -> float:

@@ -125,6 +125,7 @@ class Trainer:
         self.updates = 0
         self.episodes = 0
         self._new_episodes: list[Episode] = []  # that no progress has reported yet
+        self.last_progress: Progress | None = None  # that `run` has yielded
 
         weight_seed, *generator_seeds = np.random.SeedSequence(self.seed).spawn(4)
         # They draw initial cells, actions, and batches.
@@ -243,13 +244,14 @@ class Trainer:
         """Return the present progress, with the new episodes."""
         episodes = tuple(self._new_episodes)
         self._new_episodes.clear()
-        return Progress(
+        self.last_progress = Progress(
             step=self.steps,
             updates=self.updates,
             episodes=episodes,
             epsilon=self.epsilon,
             learning_rate=self.learning_rate,
         )
+        return self.last_progress
 
     def _play(self, last_step: int) -> None:
         """Make some steps in compiled code, and the updates that fall due.

@@ -132,7 +132,7 @@ class TrainingRecord:
         """Add the episodes of a progress; return an evaluation if one was due.
 
         Call this at once with all that `Trainer.run` yields: a progress of another step
-        than the trainer's is a ValueError. One that was added before is ignored.
+        or another trainer is a ValueError. One that was added before is ignored.
         """
         if not isinstance(progress, Progress):
             raise ValueError(
@@ -142,6 +142,11 @@ class TrainingRecord:
             raise ValueError(
                 f"the progress is of step {progress.step}, and the trainer at step "
                 f"{self.trainer.steps}; give what this trainer's run yields, at once"
+            )
+        if progress != self.trainer.last_progress:
+            raise ValueError(
+                f"the progress of step {progress.step} is another trainer's; give what "
+                "this trainer's run yields"
             )
         if progress.step <= self._last_step:
             return None

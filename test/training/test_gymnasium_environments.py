@@ -294,6 +294,14 @@ def test_a_reward_function_takes_four_arguments(make: Any, function: Any) -> Non
         make(ENVIRONMENT, reward=function)
 
 
+@pytest.mark.parametrize("function", [max, iter, zip, dict, getattr])
+def test_a_function_of_c_that_is_no_reward_is_refused(
+    small: Scenario, function: Any
+) -> None:
+    with pytest.raises(ValueError, match=r"the reward function .*; give a "):
+        GridEnvironment(small, reward=function)
+
+
 @pytest.mark.parametrize(
     "scenario", ["nope", "no/such.yaml", Path("nope.yaml"), "~x/y"]
 )

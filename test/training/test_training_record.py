@@ -195,6 +195,10 @@ def test_a_record_takes_its_own_trainer_and_progress_alone(small: Scenario) -> N
     other = Trainer([small], PARAMETERS, seed=1)
     with pytest.raises(ValueError, match="of step 100, and the trainer at step 0"):
         record.add(next(other.run(every=100)))
+    for _ in trainer.run(100):
+        pass
+    with pytest.raises(ValueError, match="of step 100 is another trainer's; give what"):
+        record.add(other.last_progress)  # type: ignore[arg-type]
     for progress in trainer.run():
         record.add(progress)
         record.add(progress)  # is ignored
