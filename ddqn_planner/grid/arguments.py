@@ -264,7 +264,7 @@ def _check_range(
 def _refuse_masked(name: str, values: object) -> None:
     """Refuse an array with masked elements, whose mask NumPy drops otherwise."""
     if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
-        count = int(np.ma.count_masked(values))
+        count = np.count_nonzero(np.ma.getmaskarray(values))
         raise ValueError(
             f"{name} has {count} masked elements; give array.filled(VALUE) with the "
             "value that they shall have"
