@@ -67,6 +67,19 @@ class QField(Field[Known]):
         self.goal = cell_inside(goal, self.q.shape[1:], "the goal")
         self.goals: Goals = (self.goal,)
 
+    def __repr__(self) -> str:
+        """Return the size of the map, the goals and the move rule in one line."""
+        height, width = self._shape
+        goals = ", ".join(map(str, self.goals))
+        name = "goal" if len(self.goals) == 1 else "goals"
+        size = f"{width} x {height} cells"
+        return f"QField({size}, {name} {goals}, {self.move_rule.value})"
+
+    @property
+    def _shape(self) -> tuple[int, ...]:
+        """(H, W) of the map."""
+        return self.q.shape[1:]
+
     @cached_property
     def value(self) -> NDArray[np.float32]:
         """(H, W) float32: the greatest Q of a legal move; at the goal, of all cells."""
@@ -225,6 +238,11 @@ class DistanceField(QField):
     def __reduce__(self) -> tuple[object, ...]:
         """Return how a copy is made: it grows anew."""
         return DistanceField, (self.goals, self.grid, self.costs, self.move_rule)
+
+    @property
+    def _shape(self) -> tuple[int, ...]:
+        """(H, W) of the map; Q itself may not be computed yet."""
+        return self.grid.occupancy.shape
 
     def _goals_alone(self) -> Known:
         """Return what is known before any growth: the goals alone are open."""

@@ -199,6 +199,25 @@ class Plan:
             if isinstance(value, np.ndarray):
                 value.flags.writeable = False
 
+    def __repr__(self) -> str:
+        """Return the path's ends and length, or why there is none, in one line."""
+        if self.status is not PlanStatus.SUCCEEDED:
+            return f"{type(self).__name__}({self.status.name}: {self.reason})"
+        parts = [self._path_in_words(), f"length {self.length:.2f}"]
+        if self.cost is not None:
+            parts.append(f"cost {self.cost:.2f}")
+        if self.method is not PlanMethod.GREEDY:
+            parts.append(self.method.value)
+        return f"{type(self).__name__}({', '.join(parts)})"
+
+    def _path_in_words(self) -> str:
+        """Return how many cells the path has, and its ends."""
+        if not len(self.path):
+            return "0 cells"
+        start = tuple(self.path[0].tolist())
+        goal = tuple(self.path[-1].tolist())
+        return f"{len(self.path)} cells from {start} to {goal}"
+
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Plan) and self._identity() == other._identity()
 
@@ -228,7 +247,7 @@ class Plan:
         return path_length(self.path)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PosePlan(Plan):
     """A path for a robot with a body and a heading.
 
@@ -253,6 +272,10 @@ class PosePlan(Plan):
     def length(self) -> float:
         """Length of the origin's way in cells."""
         return self.driven
+
+    def _path_in_words(self) -> str:
+        """Return how many poses the path has, and what is proved of its cost."""
+        return f"{len(self.poses)} poses, bound {self.bound:.3g}"
 
     def _identity(self) -> tuple[object, ...]:
         return *super()._identity(), self.poses.tobytes(), self.bound

@@ -66,6 +66,14 @@ class Planner:
         # Here alone is the space of paths chosen: poses for a model that knows a body.
         self._finder: PathFinder[Any, Any] = self.pose_planner or self.cell_planner
 
+    def __repr__(self) -> str:
+        """Return the network and its training in one line."""
+        model = self.metadata
+        return (
+            f"Planner(network {model.network}, {model.move_rule.value}, trained for "
+            f"{model.steps:,} steps with seed {model.seed})"
+        )
+
     @classmethod
     def load(cls, model: str | Path) -> Planner:
         """Load a shipped model by its name (``"any_map"``), or a file by its path.

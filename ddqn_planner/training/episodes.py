@@ -50,6 +50,14 @@ class Progress(NamedTuple):
     epsilon: float  # ε, the probability of a random action
     learning_rate: float
 
+    def __repr__(self) -> str:
+        """Return all but the episodes, of which there may be hundreds."""
+        return (
+            f"Progress(step={self.step}, updates={self.updates}, "
+            f"{len(self.episodes)} episodes, epsilon={self.epsilon:.3g}, "
+            f"learning_rate={self.learning_rate:.3g})"
+        )
+
 
 def open_record(path: Path, episodes: int) -> Appender:
     """Open the ``episodes.csv`` at `path` to append to it; a missing file is made.

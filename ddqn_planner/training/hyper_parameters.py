@@ -92,6 +92,15 @@ class HyperParameters:
     max_episode_steps: int = _number(200, "ours: steps that end an episode", 1, 10**6)
     environments: int = _number(1, "ours: environments stepped at once", 1, 4096)
 
+    def __repr__(self) -> str:
+        """Return the Python code that makes it: all values but the defaults."""
+        values = [
+            f"{entry.name}={getattr(self, entry.name)!r}"
+            for entry in fields(self)
+            if getattr(self, entry.name) != entry.default
+        ]
+        return f"HyperParameters({', '.join(values)})"
+
     def learning_rate_at(self, step: int) -> float:
         """Return the learning rate at an environment step: it falls exponentially."""
         share: float = min(step / self.steps, 1.0)

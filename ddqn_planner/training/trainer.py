@@ -157,6 +157,17 @@ class Trainer:
                 self.learned, self.average, self.environment, self.replay, self.next_q
             )
 
+    def __repr__(self) -> str:
+        """Return how far the training has come, and of what, in one line."""
+        height, width = self.environment.shape
+        maps = len(self.scenarios)
+        return (
+            f"{type(self).__name__}(step {self.steps:,} of {self.parameters.steps:,}, "
+            f"{self.episodes:,} episodes, network {self.parameters.network}, "
+            f"{maps} {'map' if maps == 1 else 'maps'} of {width} x {height} cells, "
+            f"seed {self.seed})"
+        )
+
     def _initial_network(self, seed: int) -> QNetwork:
         """Return the network that the parameters name, with random weights."""
         network_class = NETWORKS[self.parameters.network]

@@ -122,6 +122,14 @@ class TrainingRecord:
         self._begin = time.monotonic() - seconds
         self.evaluate()
 
+    def __repr__(self) -> str:
+        """Return how many evaluations it has, and the last one, in one line."""
+        point = self.curve[-1]
+        return (
+            f"TrainingRecord({len(self.curve)} evaluations; step {point.step:,}: "
+            f"{point.solved:,} of {point.starts:,} starts solved)"
+        )
+
     @property
     def optimum(self) -> float:
         """The least cost of a path from the given start to the goal."""
