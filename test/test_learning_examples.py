@@ -1,6 +1,7 @@
 import importlib
 import re
 import sys
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -10,8 +11,9 @@ import single_file_ddqn
 import torch
 from single_file_ddqn import PaperReward, QNetwork, ReplayBuffer, double_dqn_loss
 
+from ddqn_planner import Planner
 from ddqn_planner.gymnasium_registration import ENVIRONMENT
-from ddqn_planner.training import HyperParameters, Scenario
+from ddqn_planner.training import HyperParameters, Scenario, TrainingRecord
 from ddqn_planner.training.double_dqn import (
     NextQ,
     Transitions,
@@ -72,6 +74,66 @@ def test_the_single_file_runs(
     monkeypatch.setattr(sys, "argv", ["single_file_ddqn.py", *options])
     single_file_ddqn.main()
     assert re.match(r"step 40: \d+ of 287 starts solved", capsys.readouterr().out)
+
+
+@pytest.fixture(scope="module")
+def programs() -> list[str]:
+    """Return the programs of docs/training.md."""
+    page = (Path(__file__).resolve().parents[1] / "docs" / "training.md").read_text()
+    return re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
+
+
+def test_the_own_map_of_the_page_is_trained_and_saved(
+    programs: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (program,) = (text for text in programs if "TrainingRecord" in text)
+    brief = program.replace("steps=20_000", "steps=600, filters=1")
+    assert brief != program
+    pictures: list[str] = []  # which other tests draw
+    for name in ("save_picture", "save_film"):
+        monkeypatch.setattr(TrainingRecord, name, lambda _, path: pictures.append(path))
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(brief, names)
+    assert pictures == ["own_map.png", "own_map.gif"]
+    assert [point.step for point in names["record"].curve] == [0, 200, 400, 600]
+    scenario = names["scenario"]
+    planner = Planner.load("own_map.safetensors")
+    planner.plan(scenario.grid, scenario.start, scenario.goal)
+
+
+def test_the_own_reward_of_the_page_is_that_of_the_shortest_path(
+    programs: list[str],
+) -> None:
+    (program,) = (text for text in programs if "def reward" in text)
+    names: dict[str, Any] = {}
+    exec(program, names)
+    environment = names["env"]
+    environment.reset(options={"start": (16, 19)})
+    east = 0
+    _, reward, terminated, _, info = environment.step(east)
+    assert (reward, terminated, info["outcome"]) == (100, True, "reached_goal")
+
+
+def test_the_own_network_of_the_page_learns_in_the_single_file(
+    programs: list[str],
+) -> None:
+    (program,) = (text for text in programs if "class QNetwork" in text)
+    names = dict(vars(single_file_ddqn))
+    exec(program, names)
+    torch.manual_seed(0)
+    online, target = (names["QNetwork"](6, 7) for _ in range(2))
+    replay = ReplayBuffer(1, (6, 7))
+    observation = np.ones((6, 7), np.float32)
+    replay.add(observation, 3, 1.0, observation, False)
+    batch = replay.sample(1, np.random.default_rng(0))
+    before: Any = double_dqn_loss(online, target, replay, batch, gamma=0.9)
+    before.backward()
+    with torch.no_grad():
+        for weight in online.parameters():
+            weight -= 1e-3 * weight.grad
+    after = double_dqn_loss(online, target, replay, batch, gamma=0.9)
+    assert 0 < after < before
 
 
 def test_the_example_of_stable_baselines_3_says_what_to_install(

@@ -107,6 +107,13 @@ def test_a_release_gives_its_version_to_all(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_few_pages_of_the_docs_have_no_picture() -> None:
+    pages = runpy.run_path(str(ROOT / "tools" / "pages.py"))["pages_without_picture"]()
+    assert "install.md" in pages
+    assert "training.md" not in pages
+    assert len(pages) <= 5
+
+
 def test_the_page_on_pypi_has_full_addresses(wheel: Path) -> None:
     with ZipFile(wheel) as archive:
         (name,) = (name for name in archive.namelist() if name.endswith("/METADATA"))

@@ -174,6 +174,18 @@ def test_a_training_is_seen_saved_resumed_and_replayed(
     assert user.call("stop") == "no training was running"
 
 
+def test_a_map_that_is_too_large_is_told_before_the_training(
+    user: Trainee, tmp_path: FilePath
+) -> None:
+    user.configure(tmp_path / "run", steps=2, filters=1, learning_starts=1)
+    large = np.zeros((81, 81), np.int8)
+    user.client.publish("map", map_message(large, GridMap(large > 0)), LATCHED)
+    user.node.wait_for_log("map of 81 x 81 cells")
+    user.call("start")
+    warning = "a map of 81 x 81 cells is too large for the paper's network, .*any_map"
+    user.node.wait_for_log(rf"(?s){warning}.*training in {tmp_path}")
+
+
 def test_episodes_are_drawn_on_their_own_map(user: Trainee, tmp_path: FilePath) -> None:
     user.configure(tmp_path / "run", **ENDLESS, replay_period=0.001)
 
