@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     )
     from ddqn_planner.training.checkpoint import CheckpointError
     from ddqn_planner.training.one_map import train
+    from ddqn_planner.training.robot import train_robot
     from ddqn_planner.version import __version__
 
 __all__ = [
@@ -55,6 +56,7 @@ __all__ = [
     "load_map",
     "simplify",
     "train",
+    "train_robot",
 ]
 
 _MODULES = {
@@ -80,6 +82,7 @@ _MODULES = {
     "load_map": "grid",
     "simplify": "planning",
     "train": "training.one_map",
+    "train_robot": "training.robot",
 }
 __getattr__, __dir__ = imported_at_first_use(__name__, _MODULES)
 

@@ -27,8 +27,16 @@ BRIEF = HyperParameters(steps=300, filters=4, learning_starts=50)
 PACKAGES = (ddqn_planner, training)
 MODULES_WITH_EXAMPLES = (
     "grid.grid_map",
+    "grid.inflation",
+    "grid.moves",
+    "model.certificate",
     "planning.field",
+    "planning.planner",
+    "planning.segments",
+    "training.gymnasium_environments",
+    "training.hyper_parameters",
     "training.one_map",
+    "training.scenario",
     "training.trainer",
 )
 

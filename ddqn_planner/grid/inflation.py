@@ -67,6 +67,15 @@ def inflate(
     ------
     ValueError
         If the radius or the weight is out of its range, or the map is none.
+
+    Examples
+    --------
+    >>> from ddqn_planner import GridMap, inflate
+    >>> grid = GridMap([[0, 0, 0, 0, 1]], resolution=0.1)
+    >>> inflate(grid, robot_radius=0.15).occupancy.astype(int)
+    array([[0, 0, 0, 1, 1]])
+    >>> inflate(grid, robot_radius=0.15, clearance_weight=1)
+    GridMap(5 x 1 cells of 0.1 m, origin (0, 0, 0), 3 free, with cost, obstacles)
     """
     check_grid(grid)
     largest, remedy = sys.float_info.max, "metres, finite and 0 or more"

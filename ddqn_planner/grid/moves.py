@@ -35,7 +35,20 @@ BIT_OF_STEP = (1 << ACTION_OF_STEP).astype(np.uint8)
 
 
 class MoveRule(Choice):
-    """Which diagonal moves are legal between free cells of the map."""
+    """Which diagonal moves are legal between free cells of the map.
+
+    Examples
+    --------
+    >>> from ddqn_planner import GridMap, MoveRule
+    >>> MoveRule("robot_safe") is MoveRule.ROBOT_SAFE
+    True
+    >>> grid = GridMap([[0, 1], [0, 0]])  # cell (1, 0) is occupied
+    >>> north_east, x, y = 1, 0, 0
+    >>> for rule in MoveRule:
+    ...     print(rule.value, grid.legal_moves(rule)[north_east, y, x])
+    robot_safe False
+    corner_cutting True
+    """
 
     ROBOT_SAFE = "robot_safe"
     """A diagonal move needs both side cells free, as in the MovingAI benchmark."""

@@ -104,6 +104,14 @@ def certify(
     cells of a 3x3 patch are occupied, under a rule. It is proved if it is right for all
     costs of the free cells, and whichever of them are unknown. Decisions under each of
     the `move_rules` are tried.
+
+    Examples
+    --------
+    >>> from ddqn_planner import Planner
+    >>> from ddqn_planner.model.certificate import certify
+    >>> certificate = certify(Planner.load("any_map").network)
+    >>> certificate.proved, certificate.wrong
+    (True, 0)
     """
     # Shapes: N = 512 patches, Q = the N patches of the first rule, then of the next, P
     # = patterns: those of the Q patches whose centre is free. A = 8 actions, I =

@@ -131,6 +131,14 @@ class QField(Field[Known]):
 
         Its path, or its status without one, is that of `greedy_path`. A start outside
         the map is a ValueError.
+
+        Examples
+        --------
+        >>> from ddqn_planner import Planner, load_map
+        >>> grid = load_map("dilemma")
+        >>> field = Planner.load("any_map").q_field(grid, (17, 19), "corner_cutting")
+        >>> field.rollout((6, 6))
+        Plan(19 cells from (6, 6) to (17, 19), length 22.97)
         """
         outcome = self.greedy_path(start, straight)
         if isinstance(outcome, PlanStatus):

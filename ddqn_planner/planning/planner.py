@@ -46,6 +46,13 @@ class Planner:
     network : QNetwork
     metadata : ModelMetadata
         Its move rule is the default of `plan` and `q_field`.
+
+    Examples
+    --------
+    >>> from ddqn_planner import Planner, load_map
+    >>> planner = Planner.load("any_map")
+    >>> planner.plan(load_map("dilemma"), start=(6, 6), goal=(17, 19))
+    Plan(23 cells from (6, 6) to (17, 19), length 25.31)
     """
 
     def __init__(self, network: QNetwork, metadata: ModelMetadata) -> None:
@@ -98,6 +105,14 @@ class Planner:
 
         The move rule is by default the one that the model was trained for. A goal that
         is not free, or a map of a size that the model cannot plan on, is a ValueError.
+
+        Examples
+        --------
+        >>> from ddqn_planner import Planner, load_map
+        >>> grid = load_map("dilemma")
+        >>> field = Planner.load("any_map").q_field(grid, (17, 19), "corner_cutting")
+        >>> field.q.shape, field.value.shape
+        ((8, 20, 20), (20, 20))
         """
         check_grid(grid)
         goal = as_cell(goal, "the goal")
@@ -164,6 +179,16 @@ class Planner:
         ValueError
             If the tolerance or the radius is negative or NaN, the start or the goal is
             no pair of whole numbers, or there is no such move rule or method.
+
+        Examples
+        --------
+        >>> from ddqn_planner import Planner, load_map
+        >>> planner, grid = Planner.load("any_map"), load_map("dilemma")
+        >>> plan = planner.plan(grid, (6, 6), (17, 19), "corner_cutting")
+        >>> plan.cells[:3], round(plan.length, 2)
+        (((6, 6), (5, 7), (4, 8)), 22.97)
+        >>> planner.plan(grid, (6, 6), (99, 19)).reason
+        'the goal lies outside the map'
         """
         return self._answer(
             grid,
@@ -199,6 +224,13 @@ class Planner:
             As for `plan`.
         goals : sequence of (x, y)
             At least one, in any order. No goal moves: there is no tolerance.
+
+        Examples
+        --------
+        >>> from ddqn_planner import Planner, load_map
+        >>> planner, grid = Planner.load("any_map"), load_map("dilemma")
+        >>> planner.plan_nearest(grid, (6, 6), [(17, 19), (8, 11)]).goal
+        (8, 11)
         """
         return self._answer(
             grid,
@@ -232,6 +264,14 @@ class Planner:
         goals : sequence of (x, y)
             At least one. If no path leads to one of them, the plan's goal is that one,
             and its status tells why there is no path.
+
+        Examples
+        --------
+        >>> from ddqn_planner import Planner, load_map
+        >>> planner, grid = Planner.load("any_map"), load_map("dilemma")
+        >>> plan = planner.plan_through(grid, (6, 6), [(8, 11), (17, 19)])
+        >>> plan.cells.index((8, 11)), plan.goal
+        (10, (17, 19))
         """
         plans: list[Plan] = []
         cells = _cells_of_goals(goals)

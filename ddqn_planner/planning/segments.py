@@ -59,6 +59,14 @@ def simplify(
     ------
     ValueError
         If a cell is no cell of the map, or there is no such move rule.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ddqn_planner import GridMap, simplify
+    >>> grid = GridMap(np.zeros((3, 4)))
+    >>> simplify([(0, 0), (1, 1), (2, 1), (3, 2)], grid, "robot_safe")
+    ((0, 0), (3, 2))
     """
     check_grid(grid)
     path = cells_inside(cells, grid.occupancy.shape)

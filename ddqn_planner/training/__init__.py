@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     )
     from ddqn_planner.training.hyper_parameters import HyperParameters
     from ddqn_planner.training.one_map import train
+    from ddqn_planner.training.robot import RobotTrainer, train_robot
     from ddqn_planner.training.run import TrainingRun
     from ddqn_planner.training.scenario import Scenario, map_scenario, paper_scenario
     from ddqn_planner.training.trainer import Trainer
@@ -39,6 +40,7 @@ __all__ = [
     "GridVectorEnvironment",
     "HyperParameters",
     "Progress",
+    "RobotTrainer",
     "Scenario",
     "Snapshot",
     "Trainer",
@@ -51,6 +53,7 @@ __all__ = [
     "paper_scenario",
     "random_scenarios",
     "train",
+    "train_robot",
 ]
 
 _MODULES = {
@@ -66,6 +69,7 @@ _MODULES = {
     "GridVectorEnvironment": "environment",
     "HyperParameters": "hyper_parameters",
     "Progress": "episodes",
+    "RobotTrainer": "robot",
     "Scenario": "scenario",
     "Snapshot": "training_record",
     "Trainer": "trainer",
@@ -78,5 +82,6 @@ _MODULES = {
     "paper_scenario": "scenario",
     "random_scenarios": "any_map",
     "train": "one_map",
+    "train_robot": "robot",
 }
 __getattr__, __dir__ = imported_at_first_use(__name__, _MODULES)

@@ -288,6 +288,16 @@ class GridEnvironment(gymnasium.Env[Observations, np.int64]):
     Information
         ``cell`` and ``goal``, (x, y); ``action_mask``, (8,) bool: the legal moves;
         ``outcome``: None, or ``reached_goal``, ``collided`` or ``out_of_steps``.
+
+    Examples
+    --------
+    >>> from ddqn_planner.training import GridEnvironment
+    >>> environment = GridEnvironment()  # the paper's map
+    >>> observation, info = environment.reset(options={"start": (16, 19)})
+    >>> east = 0
+    >>> _, reward, terminated, truncated, info = environment.step(east)
+    >>> terminated, info["outcome"]
+    (True, 'reached_goal')
     """
 
     metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]

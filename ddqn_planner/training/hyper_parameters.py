@@ -18,7 +18,17 @@ def _choice(*choices: str, source: str) -> Any:
 
 @dataclass(frozen=True)
 class HyperParameters:
-    """The paper's Table 1, and our values where it gives none."""
+    """The paper's Table 1, and our values where it gives none.
+
+    Examples
+    --------
+    >>> from ddqn_planner.training import HyperParameters
+    >>> parameters = HyperParameters(steps=20_000, target="dqn")
+    >>> parameters
+    HyperParameters(target='dqn', steps=20000)
+    >>> parameters.gamma, parameters.learning_rate_at(step=20_000)
+    (0.95, 0.0005)
+    """
 
     # p_r = 0 switches off improvement 1 (initialisation), alpha = beta = 0 switches off
     # improvement 2 (reward).

@@ -6,11 +6,12 @@ from pathlib import Path
 from typing import Final, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.grid import GridMap, MoveRule
 from ddqn_planner.grid.arguments import as_seed, as_whole
 from ddqn_planner.model import ModelMetadata, RobotNetwork
+from ddqn_planner.planning import Planner
 from ddqn_planner.robot.body_certificate import BodyCertificate
 from ddqn_planner.robot.footprint import read_footprint
 from ddqn_planner.robot.motions import (
@@ -33,6 +34,8 @@ from ddqn_planner.version import __version__
 
 Floats: TypeAlias = NDArray[np.float32]
 Integers: TypeAlias = NDArray[np.int64]
+# A radius, points (x, y), or the text of either, see `read_footprint`.
+Footprint: TypeAlias = str | float | ArrayLike
 
 # Dimensions: B = a batch, U units, V cells of a unit's view and a last place for all
 # cells outside it, N headings, K primitives of each heading (a heading with fewer has
@@ -79,7 +82,7 @@ class RobotTrainer:
 
     def __init__(
         self,
-        footprint: str | None,
+        footprint: Footprint | None,
         motion: str | None,
         turning_radius: float,
         resolution: float,
@@ -383,6 +386,70 @@ class RobotTrainer:
             )
             self._return_SCK[number] = return_1CK[0]
             self._q_SCK[number] = q_1CK[0]
+
+
+def train_robot(
+    footprint: Footprint,
+    motion: str | None = None,
+    *,
+    turning_radius: float = 0.0,
+    resolution: float = 0.05,
+    lattice: str | Path | None = None,
+    padding: float = 0.0,
+    seed: int = 0,
+    steps: int = ROBOT.steps,
+) -> Planner:
+    """Train the model of a robot with a body and a heading until it is proved.
+
+    This is ``ddqn-planner train-robot`` as a call. The same arguments give the same
+    model. `Planner.plan_poses` plans with the result, and `Planner.save` saves it.
+
+    Parameters
+    ----------
+    footprint : number, sequence of points, or str
+        The body in metres around the robot's origin: a radius, at least three points
+        (x, y), or a text of either as in Nav2.
+    motion : str, optional
+        ``"differential"``, ``"ackermann"`` or ``"omnidirectional"``.
+    turning_radius : float
+        Of the tightest bends, in metres; ackermann needs it.
+    resolution : float
+        Metres per cell of the maps.
+    lattice : path, optional
+        A file of Nav2's lattice generator, in place of these three.
+    padding : float
+        Metres by which the body counts as larger: room for a controller.
+    seed : int
+        Of all random draws: 0 to 2^63 - 1.
+    steps : int
+        Transitions after which to give up.
+
+    Raises
+    ------
+    ValueError
+        If an argument is wrong, or the model is not proved after the steps.
+    ModuleNotFoundError
+        If torch is missing, the extra "train" of the package.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ddqn_planner import GridMap, train_robot
+    >>> planner = train_robot(0.1, "differential", resolution=0.25)
+    >>> grid = GridMap(np.zeros((20, 30)), resolution=0.25)
+    >>> planner.plan_poses(grid, start=(1, 1, 0), goal=(5, 3, 0)).status.name
+    'SUCCEEDED'
+    """
+    trainer = RobotTrainer(
+        footprint, motion, turning_radius, resolution, lattice, seed, padding
+    )
+    *_, certificate = trainer.run(steps)
+    if not certificate.proved:
+        raise ValueError(
+            f"after {trainer.steps:,} steps the model is {certificate}; give more "
+            "steps, or another seed or resolution"
+        )
+    return Planner(trainer.network, trainer.metadata())
 
 
 def _read_motions(

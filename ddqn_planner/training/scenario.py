@@ -12,7 +12,18 @@ from ddqn_planner.grid.map_file import map_path
 
 @dataclass(frozen=True)
 class Scenario:
-    """A map with a start and a goal; a ValueError unless a path joins them."""
+    """A map with a start and a goal; a ValueError unless a path joins them.
+
+    Examples
+    --------
+    >>> from ddqn_planner import load_map
+    >>> from ddqn_planner.training import Scenario
+    >>> Scenario(load_map("dilemma"), start=(6, 6), goal=(17, 19)).move_rule.value
+    'corner_cutting'
+    >>> Scenario(load_map("dilemma"), start=(6, 6), goal=(6, 6))
+    Traceback (most recent call last):
+    ValueError: start and goal are both (6, 6); give two different cells
+    """
 
     grid: GridMap
     start: Cell

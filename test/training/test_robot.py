@@ -1,5 +1,6 @@
 """A simulated robot bumps into obstacles, and learns its body until it is proved."""
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ import pytest
 
 from ddqn_planner.model import RobotNetwork, load_model, model_bytes
 from ddqn_planner.robot.footprint import swept_cells
-from ddqn_planner.training.robot import RobotTrainer
+from ddqn_planner.training.robot import RobotTrainer, train_robot
 
 TINY: Any = (
     "[[0.34, 0.09], [-0.09, 0.09], [-0.09, -0.09], [0.34, -0.09]]",
@@ -58,12 +59,21 @@ def test_the_command_trains_a_robot_that_is_proved(
 
 
 def test_a_concave_body_ahead_of_its_origin_is_learned() -> None:
-    trainer = RobotTrainer(FORK, "ackermann", 0.3, 0.25, None, 0)
-    *_, certificate = trainer.run(4_000_000)
-    assert certificate.proved
-    expected = swept_cells(trainer.network.footprint, trainer.network.motions)
-    np.testing.assert_array_equal(trainer.network.swept(), expected)
+    options: Any = {"motion": "ackermann", "turning_radius": 0.3, "resolution": 0.25}
+    planner = train_robot(json.loads(FORK), **options)
+    network = planner.network
+    assert isinstance(network, RobotNetwork)
+    expected = swept_cells(network.footprint, network.motions)
+    np.testing.assert_array_equal(network.swept(), expected)
     assert not expected[0, expected.shape[1] // 2, expected.shape[2] // 2]
+
+
+def test_a_robot_that_is_not_proved_is_no_planner() -> None:
+    footprint, motion, turning_radius, resolution, _ = TINY
+    options: Any = {"turning_radius": turning_radius, "resolution": resolution}
+    reason = "after 10 steps the model is not proved: .*; give more steps, or"
+    with pytest.raises(ValueError, match=reason):
+        train_robot(footprint, motion, **options, steps=10)
 
 
 def test_the_same_seed_trains_the_same_model() -> None:
