@@ -34,8 +34,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command with arguments, by default those of the process.
 
     Returns the exit code: 0 if the command did its work, 1 without a path or a proof, 2
-    for bad input or a missing library, 130 after Ctrl-C, and 143 if SIGTERM stopped a
-    training.
+    for bad input or a missing library, 130 after Ctrl-C. A training that another signal
+    stopped returns 128 and the number of the signal.
     """
     # NumPy is not yet imported. For small products one thread is as fast as several,
     # and on a busy machine several are ten times as slow.

@@ -18,7 +18,17 @@ import pytest
 from PIL import Image
 
 import ddqn_planner
-from ddqn_planner import Experience, GridMap, Planner, QField, load_map, train, training
+from ddqn_planner import (
+    Experience,
+    GridMap,
+    Planner,
+    PlanStatus,
+    PosePlan,
+    QField,
+    load_map,
+    train,
+    training,
+)
 from ddqn_planner.grid import shortest_distances
 from ddqn_planner.interrupts import interrupts_wait
 from ddqn_planner.training import HyperParameters, Scenario, Trainer, TrainingRecord
@@ -215,20 +225,20 @@ def test_a_map_describes_itself_in_one_line() -> None:
 
 def test_what_a_notebook_shows_is_one_short_line(small: Scenario) -> None:
     grid = load_map("dilemma")
-    planner, car = Planner.load("any_map"), Planner.load("car")
+    planner = Planner.load("any_map")
     field = planner.q_field(grid, (17, 19), "corner_cutting")
     trainer = Trainer([small], HyperParameters(steps=200))
     record = TrainingRecord(trainer)
     point = record.curve[-1]
     progress = next(trainer.run(every=100))
-    room = GridMap(np.zeros((60, 60)), 0.05)
+    poses = PosePlan(PlanStatus.SUCCEEDED, poses=np.zeros((41, 3)), driven=20.0)
     shown = [
         (planner, "Planner(network any_map, robot_safe, trained for 1,536,000 steps"),
         (field, "QField(20 x 20 cells, goal (17, 19), corner_cutting)"),
         (QField((1, 2), field.q, field.legal), "QField(20 x 20 cells, goal (1, 2), "),
         (field.rollout((6, 6)), "Plan(19 cells from (6, 6) to (17, 19), length 22.97)"),
         (planner.plan(grid, (6, 6), (99, 0)), "Plan(GOAL_OUTSIDE_MAP: the goal lies "),
-        (car.plan_poses(room, (1, 1, 0), (2, 1, 0)), "PosePlan(41 poses, bound 1, "),
+        (poses, "PosePlan(41 poses, bound 1, length 20.00)"),
         (trainer, f"Trainer(step 100 of 200, {trainer.episodes} episodes, network "),
         (trainer.parameters, "HyperParameters(steps=200)"),
         (HyperParameters(), "HyperParameters()"),

@@ -1,12 +1,14 @@
 """Options of the commands that train into a folder, and such a training."""
 
+import os
 import signal
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ddqn_planner.commands.options import Option, add_options
 from ddqn_planner.files import check_writable
@@ -17,6 +19,11 @@ from ddqn_planner.training.scenario import Scenario
 
 if TYPE_CHECKING:
     from ddqn_planner.training.run import TrainingRun
+
+
+# Ctrl-C, the end of a service, and the end of a terminal.
+STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+STANDARD_ERROR: Final = 2  # its file descriptor
 
 
 def add_training_options(
@@ -44,8 +51,8 @@ def opened_training(
 ) -> Iterator["TrainingRun"]:
     """Open the run in the folder ``--out``, for a block that trains.
 
-    Within the block, SIGINT and SIGTERM request the run to stop. After it, an error
-    tells if the last save failed.
+    Within the block, STOP_SIGNALS request the run to stop. After it, an error tells if
+    the last save failed.
 
     Parameters
     ----------
@@ -68,12 +75,22 @@ def opened_training(
     with TrainingRun(options.out, make_scenarios(), parameters, options.seed) as run:
         # Python's own handler would raise an exception within a step. The run looks at
         # its requests between two steps.
-        for number in (signal.SIGINT, signal.SIGTERM):
-            earlier_handler = signal.signal(number, run.stop_by_signal)
-            run.callback(signal.signal, number, earlier_handler)
+        for number in STOP_SIGNALS:
+            earlier_handler = signal.getsignal(number)
+            if earlier_handler is not signal.SIG_IGN:  # as nohup has it
+                signal.signal(number, partial(_stop, run))
+                run.callback(signal.signal, number, earlier_handler)
         yield run
     if run.save_error:
         raise OSError(run.save_error)
+
+
+def _stop(run: "TrainingRun", number: int, _: object) -> None:
+    """Request a run to stop, and say so: the present step may compile for long."""
+    run.stop_by_signal(number)
+    # Not `print`, which the signal may have interrupted. The terminal may be gone.
+    with suppress(OSError):
+        os.write(STANDARD_ERROR, b"\nddqn-planner: stopping after the present step\n")
 
 
 def exit_code_of(run: "TrainingRun") -> int:

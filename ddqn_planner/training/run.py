@@ -77,8 +77,8 @@ class TrainingRun(WorkFolder):
         """Whether the training has reached its last step."""
         return self.trainer.steps >= self.trainer.parameters.steps
 
-    def stop_by_signal(self, number: int, _: object = None) -> None:
-        """Request the run to stop: a handler of the signal `number`."""
+    def stop_by_signal(self, number: int) -> None:
+        """Request the run to stop, as the signal `number` has come."""
         self.requests.add("stop")
         self.stop_signal = number
 
