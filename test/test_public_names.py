@@ -36,6 +36,7 @@ from ddqn_planner.training import HyperParameters, Scenario, Trainer, TrainingRe
 BRIEF = HyperParameters(steps=300, filters=4, learning_starts=50)
 PACKAGES = (ddqn_planner, training)
 MODULES_WITH_EXAMPLES = (
+    "experience.experience",
     "grid.grid_map",
     "grid.inflation",
     "grid.moves",
