@@ -124,7 +124,8 @@ load: setup
 soak: setup
 	$(BIN)/python experiments/soak.py $(MINUTES)
 
-# These train the shipped models from nothing: the one for any map, and the paper's network.
+# These train the shipped models from nothing: the one for any map, the paper's network, and,
+# without torch, two robots.
 model: $(VENV)/train
 	$(BIN)/ddqn-planner train-any-map --seed 0 --out runs/any_map
 	cp runs/any_map/model.safetensors models/any_map.safetensors
@@ -135,7 +136,7 @@ model-dilemma: $(VENV)/train
 
 ROBOT := $(BIN)/ddqn-planner train-robot --resolution 0.05 --seed 0
 
-robots: $(VENV)/train
+robots: $(VENV)/base
 	$(ROBOT) --motion differential --out models/differential_robot.safetensors \
 		--footprint '[[0.45, 0.3], [-0.45, 0.3], [-0.45, -0.3], [0.45, -0.3]]'
 	$(ROBOT) --motion ackermann --turning-radius 0.8 --out models/car.safetensors \

@@ -29,9 +29,9 @@ from ddqn_planner.training.environment import (
     paper_scenario,
 )
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.propagation import value_iteration
 from ddqn_planner.training.run import TrainingRun
 from ddqn_planner.training.trainer import Trainer
+from ddqn_planner.training.value_iteration import value_iteration
 
 SCENARIO: Final = paper_scenario()
 MOVE_RULE: Final = SCENARIO.move_rule  # by it the paper's 22.97 is the shortest path

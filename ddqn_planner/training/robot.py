@@ -29,7 +29,7 @@ from ddqn_planner.training.double_dqn import (
 )
 from ddqn_planner.training.exploring_starts import initial_cells
 from ddqn_planner.training.hyper_parameters import HyperParameters
-from ddqn_planner.training.propagation import value_iteration
+from ddqn_planner.training.value_iteration import value_iteration
 from ddqn_planner.version import __version__
 
 Floats: TypeAlias = NDArray[np.float32]
@@ -428,8 +428,6 @@ def train_robot(
     ------
     ValueError
         If an argument is wrong, or the model is not proved after the steps.
-    ModuleNotFoundError
-        If torch is missing, the extra "train" of the package.
 
     Examples
     --------

@@ -13,7 +13,7 @@ from ddqn_planner.grid import (
     neighbours,
     shortest_distances,
 )
-from ddqn_planner.training.propagation import value_iteration
+from ddqn_planner.training.value_iteration import value_iteration
 
 
 def settled(
