@@ -20,6 +20,7 @@ from ddqn_planner.experience.places import NOISE, Float32, Float64, Int64
 from ddqn_planner.experience.posterior import Posterior
 from ddqn_planner.experience.prior import Prior
 from ddqn_planner.experience.visits import (
+    UNSEEN,
     Limits,
     Poses,
     Visits,
@@ -60,7 +61,7 @@ LOG_RANGE = -math.log(MAX_SLOWNESS), math.log(MAX_SLOWNESS)
 
 LATEST = 1e12  # seconds of a clock: a pose of a later time is not believed
 # Times the nominal speed: a robot that usually drives faster is not believed.
-MAX_MEDIAN_FACTOR = 10.0
+MAX_MEDIAN_FACTOR = 4.0
 # Times the usual speed: a faster move is not believed.
 MAX_SPEED_FACTOR = 3
 # Of the log speed: the steps in which the fastest move that a map knows of changes.
@@ -109,7 +110,7 @@ class Experience:
     ----------
     nominal_speed : float
         Metres per second in the open, 0.001 to 1,000: a first guess, see
-        `learned_speed`. A drive whose median speed is more than 10 times the nominal
+        `learned_speed`. A drive whose median speed is more than 4 times the nominal
         speed teaches nothing, nor does a drive that is never faster than a hundredth of
         the nominal speed.
     robot_width : float
@@ -208,7 +209,7 @@ class Experience:
         limits = Limits(
             window=window,
             speed=self.learned_speed,
-            max_speed=max(self.max_speed, MAX_SPEED_FACTOR * usual_speed),
+            max_speed=self._max_speed(usual_speed),
             max_pause=self.max_pause,
         )
         visits = visits_of(poses, self.evidence.side, limits)
@@ -243,9 +244,17 @@ class Experience:
                 f"the times are up to {elapsed.max():.3g} s apart; give at most "
                 f"{self.max_pause:g}"
             )
-        fastest = float((np.hypot(step[:, 0], step[:, 1]) / elapsed).max())
-        if fastest > self.max_speed:
+        metres = np.hypot(step[:, 0], step[:, 1])
+        fastest = float((metres / elapsed).max())
+        max_speed = self._max_speed()
+        if fastest > max_speed:
             return self._wrong_speed(fastest, "at", "greater")
+        longest = float(metres.max())
+        if longest > max_speed * UNSEEN:
+            return (
+                f"the poses are up to {longest:.3g} m apart; give poses at most "
+                f"{max_speed * UNSEEN:.3g} m apart"
+            )
         from_start = poses.position - poses.position[0]
         extent = float(np.hypot(from_start[:, 0], from_start[:, 1]).max())
         return f"the robot comes no farther than {extent:.2g} m; give a longer drive"
@@ -315,10 +324,14 @@ class Experience:
                 f"the other experience has {changed}; give those of one kind of robot"
             )
 
-    @property
-    def max_speed(self) -> float:
-        """The speed up to which a robot is believed, metres per second."""
-        return MAX_SPEED_FACTOR * max(self.nominal_speed, self.learned_speed)
+    def _max_speed(self, usual_speed: float = 0.0) -> float:
+        """Return the speed up to which a robot is believed, metres per second.
+
+        `usual_speed` is that of the drive, metres per second. However fast earlier
+        drives were, the result is at most 12 times the nominal speed.
+        """
+        usual = max(self.nominal_speed, self.learned_speed, usual_speed)
+        return MAX_SPEED_FACTOR * min(usual, MAX_MEDIAN_FACTOR * self.nominal_speed)
 
     @property
     def learned_speed(self) -> float:

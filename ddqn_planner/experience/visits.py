@@ -28,6 +28,8 @@ STAND = 1.5
 CORRECTION = 0.25
 # Metres. After a longer jump, poses are not believed.
 RELOCATION = 1.0
+# Seconds between two poses for which a robot may have driven straight on.
+UNSEEN = 3.0
 # Seconds over which a robot whose pose is not believed counts as driving on.
 MEMORY = 60.0
 
@@ -260,7 +262,8 @@ def _believed_parts(poses: Poses, limits: Limits) -> Iterator[Poses]:
     time, position = poses
     elapsed = np.diff(time)  # (N - 1,): seconds from each pose to the next one
     step: Float64 = np.diff(position, axis=0)  # metres
-    is_jump = np.hypot(step[:, 0], step[:, 1]) > limits.max_speed * elapsed + CORRECTION
+    reachable = limits.max_speed * np.minimum(elapsed, UNSEEN) + CORRECTION  # metres
+    is_jump = np.hypot(step[:, 0], step[:, 1]) > reachable
     is_pause = elapsed > limits.max_pause
     is_cut = is_jump | is_pause | (elapsed <= 0)
     first_poses = np.flatnonzero(is_cut) + 1  # of all parts but the first
