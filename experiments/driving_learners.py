@@ -11,12 +11,9 @@ from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import cg
 
 from ddqn_planner import Experience, GridMap
-from ddqn_planner.experience import Learned
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
-from ddqn_planner.training.prior_training import prior_of
 
 WINDOW: Final = 0.5  # seconds over which poses are averaged
-MORE_PLACES: Final = 1.1  # times as many as the last time teach the prior anew
 SIDE: Final = 0.25  # metres: the side of a place, as of `Experience`
 VISIT_NOISE: Final = 0.1  # variance of the log slowness of a visit
 # Of the field: its precision between neighbours, and toward 0.
@@ -100,25 +97,7 @@ class MarkovField:
         )
 
 
-class TaughtExperience(Experience):
-    """A learner that trains its prior as often as `trainer_node` does."""
-
-    def __init__(self, grid: GridMap) -> None:
-        super().__init__(SPEED)
-        self.grid = grid
-        self.taught_places = 0  # places when the prior was trained last
-
-    def record(self, seconds: Any, positions: Any) -> Learned:
-        """Learn from a drive."""
-        learned = super().record(seconds, positions)
-        places = len(self.evidence.places)
-        if places > self.taught_places and places >= MORE_PLACES * self.taught_places:
-            self.taught_places = places
-            self.prior = prior_of(self.grid, self.evidence.places, self.prior)
-        return learned
-
-
 LEARNERS: Final[dict[str, Callable[[GridMap], Any]]] = {
-    "experience": TaughtExperience,
+    "experience": lambda _: Experience(SPEED),
     "Markov field": MarkovField,
 }

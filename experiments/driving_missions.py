@@ -15,7 +15,6 @@ from random_maps import Random
 
 from ddqn_planner import Experience, Planner, inflate, load_map
 from ddqn_planner.grid import Cell
-from ddqn_planner.training.prior_training import prior_of
 
 MOVED_AT: Final = 100
 """The mission before which all that is slow moves, in jobs where it moves."""
@@ -110,7 +109,7 @@ def _taught_prior(job: Job, kind: str) -> Any:
     teacher = Experience(worlds.SPEED)
     world = world_of(lesson)
     run_in(lesson, world, "teacher", teacher)
-    return prior_of(world.grid, teacher.evidence.places, teacher.prior)
+    return teacher.prior_of(world.grid)
 
 
 def run_in(job: Job, world: World, name: str, learner: Any) -> Result:

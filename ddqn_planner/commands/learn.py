@@ -17,7 +17,7 @@ from ddqn_planner.files import (
     write_atomically,
 )
 from ddqn_planner.grid import GridMap, read_map_file
-from ddqn_planner.resources import find_map, with_remedy
+from ddqn_planner.resources import find_map
 
 OPTIONS = (
     Option(
@@ -153,7 +153,7 @@ def _read_drives(
 def _teach(
     experience: Experience, drives: Sequence[Drive], grid: GridMap, out: Path
 ) -> None:
-    """Let an experience learn from drives on a map, and train its prior.
+    """Let an experience learn from drives on a map.
 
     A ValueError if no drive taught anything: its text says that the file `out`, which
     the caller writes later, is unchanged.
@@ -168,9 +168,3 @@ def _teach(
         raise ValueError(
             f"no drive taught anything, and {out} is as before; {reasons[0]}"
         )
-    try:
-        from ddqn_planner.training.prior_training import prior_of  # needs torch
-    except ImportError as error:
-        print(f"the map's prior is not trained: {with_remedy(error)}")
-        return
-    experience.prior = prior_of(grid, experience.evidence.places, experience.prior)

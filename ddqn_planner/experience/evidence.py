@@ -9,10 +9,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.experience.places import COLUMNS, NOISE, Float64, Int64, Places
-from ddqn_planner.experience.population import KNOWN_WEIGHT, population_of
+from ddqn_planner.experience.places import (
+    COLUMNS,
+    KNOWN_WEIGHT,
+    Float64,
+    Int64,
+    Places,
+)
 from ddqn_planner.experience.posterior import NO_PLACE, Posterior
-from ddqn_planner.experience.prior import Prior
+from ddqn_planner.experience.prior import FEATURES
 from ddqn_planner.experience.visits import Visits
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
@@ -36,9 +41,7 @@ SURPRISE_QUANTILE = 0.95
 # The share of all evidence that remains after a change: other places may have changed.
 SHARE_AFTER_CHANGE = 0.01
 
-MOST_PASSAGES = 20.0  # a wait is the mean over about so many passages
-# A passage counts for the waits up to so many sides of a place away.
-NEAR_WAIT = 4
+MOST_PASSAGES = 50.0  # a wait is the mean over about so many passages
 
 # A drive through fewer places says little about how sure expected times are.
 FEWEST_VISITS = 8
@@ -91,7 +94,8 @@ class Evidence:
 
     def forget(self) -> None:
         """Forget all that was learned: places, errors, the prior and the posterior."""
-        self.prior: Prior | None = None  # predicts the slowness of places from the map
+        # (FEATURES,): by how much features of other maps raised the log slowness.
+        self.prior = np.zeros(FEATURES)
         self.driven = 0.0  # seconds
         self.places = Places.none()
         self._row_of_square: dict[Square, int] = {}  # of `places`
@@ -100,11 +104,7 @@ class Evidence:
         self.errors = deque[float](maxlen=LAST_DRIVES)
         self.surprises = deque[float](maxlen=LAST_DRIVES)
         self.posterior: Posterior | None = None  # over the last map
-        self._fit()
-
-    def _fit(self) -> None:
-        """Set `population`, the distribution of slowness over all places."""
-        self.population = population_of(self.places)
+        self.levels = self.places.levels()
 
     def add(self, visits: Visits) -> None:
         """Learn from a drive: its V visits of places and its W waits.
@@ -126,49 +126,38 @@ class Evidence:
             self.surprises.append(largest)
             if has_changed:
                 self.places.fade(SHARE_AFTER_CHANGE)
-        np.add.at(self.places.waited, rows_of_waits, visits.waits.seconds)
         self._add_visits(visits, rows, log)
-        self._limit_sums_of_waits(rows_of_waits)
+        np.add.at(self.places.waited, rows_of_waits, visits.waits.seconds)
+        self._limit_sums_of_waits()
         self.driven += visits.total_seconds
         self.places.fade(0.5 ** (visits.total_seconds / self.half_life))
-        self._fit()
+        self.levels = self.places.levels()
 
     def _add_visits(self, visits: Visits, rows: Int64, log: Float64) -> None:
-        """Add the visits of a drive to the sums of their places.
+        """Add the visits of a drive, without its waits, to the sums of their places.
 
-        Parameters
-        ----------
-        visits : Visits
-            V visits; the waits of the drive have been added before.
-        rows, log : (V,) int64, (V,) float64
-            The row in `places` of each visit, and its log slowness.
+        `rows` and `log` are (V,): the row in `places` of each visit, and its log
+        slowness.
         """
-        places = self.places
-        # A visit is a passage only near a place where a robot has waited before: so the
-        # seconds waited, over the passages, are the mean wait.
-        position_of_waits = places.position[places.waited > 0]  # (P, 2)
-        away = visits.position[:, None] - position_of_waits  # (V, P, 2)
-        distance = np.hypot(away[..., 0], away[..., 1])  # (V, P): metres
-        distance_to_wait = distance.min(axis=1, initial=np.inf)  # (V,)
-        passes_wait = distance_to_wait <= NEAR_WAIT * self.side
         weight = visits.metres / self.side  # (V,)
-        # A drive may visit a place several times.
-        np.add.at(places.weight, rows, weight)
-        np.add.at(places.sum_of_slowness, rows, weight * np.exp(log))
-        np.add.at(places.sum_of_log, rows, weight * log)
-        np.add.at(places.sum_of_squares, rows, weight * log**2)
-        np.add.at(places.passages, rows, weight * passes_wait)
+        seen = Places(
+            weight=weight,
+            sum_of_slowness=weight * np.exp(log),
+            sum_of_log=weight * log,
+            sum_of_squares=weight * log**2,
+            passages=weight * visits.is_on_way,
+            waited=np.zeros(len(weight)),
+            position=visits.position,
+        )
+        self.places.add(rows, seen)
 
-    def _limit_sums_of_waits(self, rows_of_waits: Int64) -> None:
+    def _limit_sums_of_waits(self) -> None:
         """Let each place have at most MOST_PASSAGES, so that the last ones count most.
 
-        Sums of passages and of waited seconds shrink alike. In the rows `rows_of_waits`
-        (W,) of `places` the robot has just waited: it has passed there at least once.
+        Sums of passages and of waited seconds shrink alike: the mean wait stays.
         """
         places = self.places
-        places.passages[rows_of_waits] = np.maximum(places.passages[rows_of_waits], 1)
         excess = np.maximum(places.passages / MOST_PASSAGES, 1)  # 1: not too many
-        # Both sums are divided by the same factor, so that the mean wait stays.
         places.passages /= excess
         places.waited /= excess
 
@@ -188,17 +177,16 @@ class Evidence:
         visits = np.flatnonzero(weight >= KNOWN_WEIGHT)  # (K,): those of known places
         known_rows = rows[visits]
         known_weight = weight[visits]
-        # (K,): the mean log slowness that was seen before at each of these places.
-        mean_log = self.places.sum_of_log[known_rows] / known_weight
-        difference = log[visits] - mean_log
-        # (K,): the variance of the difference over NOISE, that of one visit.
-        variance = 1 + 1 / known_weight
+        # (K,): beyond the mean log slowness that was seen before at each of the places.
+        difference = log[visits] - self.places.mean_log()[known_rows]
+        # (K,): the variance of that difference.
+        variance = self.places.noise()[known_rows] * (1 + 1 / known_weight)
         part_count = max(1, len(visits) // PLACES_OF_PART)
         surprises = []
         for part in np.array_split(np.arange(len(visits)), part_count):
             if len(part) < PLACES_OF_PART / 2:
                 continue
-            variance_of_mean = NOISE * variance[part].mean() / len(part)
+            variance_of_mean = variance[part].mean() / len(part)
             deviation = math.sqrt(variance_of_mean + PART_NOISE**2)
             mean_difference = abs(float(difference[part].mean()))
             surprises.append(mean_difference / deviation)
@@ -217,7 +205,7 @@ class Evidence:
         """Return the row in `places` of each position: (N,) int64.
 
         `position` is (N, 2), x and y in metres. Places that are new are added, with
-        sums of 0 and the log slowness that the prior predicts for them.
+        sums of 0.
         """
         squares = np.floor(position / self.side).astype(np.int64)
         rows = np.empty(len(squares), np.int64)
@@ -228,11 +216,7 @@ class Evidence:
                 self._row_of_square[square] = len(self._row_of_square)
                 first_in_new.append(index)
             rows[index] = self._row_of_square[square]
-        new_position = position[first_in_new]
-        predicted = np.zeros(len(new_position))
-        if self.posterior is not None:
-            predicted = self.posterior.predicted_at(new_position)
-        self.places.append(predicted, new_position)
+        self.places.append(position[first_in_new])
         return rows
 
     def _add_error_of_expected_time(self, visits: Visits) -> None:
@@ -255,7 +239,7 @@ class Evidence:
         # The slowness of a place includes the waits that are expected there.
         expected_seconds = nominal_seconds * posterior.slowness[places]  # (K,)
         deviation = posterior.deviation_of(expected_seconds, places)
-        seconds = visits.seconds[is_on_map].sum() + visits.waits.seconds.sum()
+        seconds = visits.total_seconds - visits.seconds[~is_on_map].sum()
         log_of_ratio = math.log(seconds / float(expected_seconds.sum()))
         self.errors.append(log_of_ratio / deviation)
 
@@ -280,41 +264,27 @@ class Evidence:
         if posterior is None or not _has_cells_of(posterior.grid, grid):
             posterior = Posterior(grid, self.side, self.nominal_speed)
         posterior.grid = grid
-        posterior.update(self.places, self.population, self.prior)
+        posterior.update(self.places, self.levels.open_log, self.prior)
         self.posterior = posterior
         return posterior
 
     def merge(self, other: Evidence) -> None:
         """Add all that other evidence has seen to this evidence.
 
-        Evidence without a prior takes the prior of `other`. The predictions that came
-        from the prior of `other` are shifted by the level of this evidence's prior
-        minus the level of that prior, see `use_prior`.
+        Evidence without a prior takes the prior of `other`.
         """
-        self.use_prior(other.prior if self.prior is None else self.prior)
-        shift = _level_of(self.prior) - _level_of(other.prior)
-        count_before = len(self.places)
+        if not self.prior.any():
+            self.prior = other.prior
         rows = self._find_or_add_rows(other.places.position)  # of each place of `other`
-        # No row is there twice, as both divide the world into the same squares.
-        places = self.places
-        places.add(rows, other.places)
-        is_new = rows >= count_before
-        places.predicted[rows[is_new]] = other.places.predicted[is_new] + shift
+        self.places.add(rows, other.places)
         self.errors += other.errors
         self.surprises += other.surprises
         self.driven += other.driven
-        self._fit()
+        self.levels = self.places.levels()
 
-    def use_prior(self, prior: Prior | None) -> None:
-        """Predict with another prior, or with none.
-
-        The level of a prior is the mean log slowness of the places that have taught it.
-        The predictions stored for known places move by the difference of both levels,
-        so that a level which these places have taught does not count twice.
-        """
-        self.places.predicted += _level_of(prior) - _level_of(self.prior)
+    def use_prior(self, prior: Float64) -> None:
+        """Expect what other maps have shown, (FEATURES,)."""
         self.prior = prior
-        self._fit()
 
     def restore(
         self,
@@ -349,7 +319,7 @@ class Evidence:
         self.driven = float(driven)
         self.errors = deque(errors.tolist(), LAST_DRIVES)
         self.surprises = deque(surprises.tolist(), LAST_DRIVES)
-        self._fit()
+        self.levels = self.places.levels()
 
 
 def _has_cells_of(grid: GridMap, other: GridMap) -> bool:
@@ -359,11 +329,6 @@ def _has_cells_of(grid: GridMap, other: GridMap) -> bool:
         and grid.origin == other.origin
         and np.array_equal(grid.occupancy, other.occupancy)
     )
-
-
-def _level_of(prior: Prior | None) -> float:
-    """Return the mean log slowness that a prior has learned; 0 without a prior."""
-    return 0.0 if prior is None else float(prior.level)
 
 
 def _is_consistent(

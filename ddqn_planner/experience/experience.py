@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.experience.evidence import FARTHEST, Evidence
 from ddqn_planner.experience.places import NOISE, Float32, Float64, Int64
-from ddqn_planner.experience.posterior import Posterior
-from ddqn_planner.experience.prior import Prior
+from ddqn_planner.experience.posterior import VARIANCE, Posterior
+from ddqn_planner.experience.prior import FEATURES
 from ddqn_planner.experience.visits import (
     UNSEEN,
     Limits,
@@ -44,7 +44,6 @@ MAX_FILE_BYTES = 2**27  # a larger file is refused before it is read
 VERSION = 4  # 2 was never released
 FIRST_VERSION = 1  # until 0.4.0
 LOG_VERSION = 3  # until 0.5.0, with the logarithms of slowness alone
-PRIOR = "prior_"  # before the names of its arrays in a file
 EXPERIENCE = "experience.npz"  # the name of the file in a folder
 SPEEDS = 0.001, 1000.0  # metres per second
 WIDTHS = 0.01, 100.0  # metres
@@ -58,6 +57,8 @@ OPTIONS = {
 
 LEAST_WEIGHT = 1e-9  # of places of old files: others have the log slowness 0
 LOG_RANGE = -math.log(MAX_SLOWNESS), math.log(MAX_SLOWNESS)
+
+MOST_OF_PRIOR = 1e3  # of a coefficient: no map is so slow
 
 LATEST = 1e12  # seconds of a clock: a pose of a later time is not believed
 # Times the nominal speed: a robot that usually drives faster is not believed.
@@ -336,16 +337,32 @@ class Experience:
     @property
     def learned_speed(self) -> float:
         """Metres per second in the open, as drives show; at first the nominal speed."""
-        return self.nominal_speed / math.exp(self.evidence.population.open_log)
+        return self.nominal_speed / math.exp(self.evidence.levels.open_log)
 
     @property
-    def prior(self) -> Prior | None:
-        """What predicts the slowness of places from the map; None without a prior."""
+    def prior(self) -> Float64:
+        """By how much each feature of other maps raised the log slowness: (7,).
+
+        It counts as far as it predicts the places that were driven since. Zeros say
+        nothing; a ValueError if it is set to anything but seven finite numbers.
+        """
         return self.evidence.prior
 
     @prior.setter
-    def prior(self, prior: Prior | None) -> None:
-        self._learn(partial(Evidence.use_prior, prior=prior))
+    def prior(self, prior: ArrayLike) -> None:
+        coefficients = numbers(
+            "the prior",
+            prior,
+            (FEATURES,),
+            between=(-MOST_OF_PRIOR, MOST_OF_PRIOR),
+            whole=False,
+            remedy="what `prior_of` returns",
+        )
+        self._learn(partial(Evidence.use_prior, prior=coefficients.astype(np.float64)))
+
+    def prior_of(self, grid: GridMap) -> Float64:
+        """Return the prior that the places driven on a map give other maps: (7,)."""
+        return self.evidence.posterior_over(grid).coefficients
 
     def take_posterior_from(self, older: Experience) -> None:
         """Take the posterior that older experience has solved, which then has none.
@@ -375,18 +392,17 @@ class Experience:
             is the expected time.
         """
         share = as_number("exploration", exploration, 0, 10, "0 to 10")
-        population = self.evidence.population
         posterior = self.evidence.posterior_over(grid)
         # The log slowness of the fastest place, 0 or less, rounded to steps: all fields
         # have to be made anew when it changes.
-        steps = math.floor(population.fastest_log / FAST_STEP + 0.5)
+        steps = math.floor(self.evidence.levels.fastest_log / FAST_STEP + 0.5)
         fastest = FAST_STEP * min(0, steps)
         expected = self._timed(grid, posterior, "expected", 0.0, fastest)
         if not share:
             return expected
         # The bold map: each of P places is faster by one standard deviation of its log
         # slowness. The largest deviation is rounded up to steps.
-        deviation = math.sqrt(population.variance) * posterior.unknown  # (P,)
+        deviation = math.sqrt(VARIANCE) * posterior.unknown  # (P,)
         largest_deviation = deviation.max(initial=0)
         largest = FAST_STEP * math.ceil(largest_deviation / FAST_STEP)
         bold = self._timed(grid, posterior, "bold", deviation, fastest - largest)
@@ -437,7 +453,7 @@ class Experience:
         """
         posterior = self.evidence.posterior_over(grid)
         unknown = posterior.to_cells(posterior.unknown.astype(np.float32), occupied=1)
-        return math.sqrt(self.evidence.population.variance) * unknown
+        return math.sqrt(VARIANCE) * unknown
 
     def expected_time(self, grid: GridMap, cells: Cells) -> ExpectedTime:
         """Return the time that a path takes, with an interval of 90 %.
@@ -555,10 +571,8 @@ class Experience:
             "driven": evidence.driven,  # seconds
             "errors": evidence.errors,  # (D,): of the last D drives, as the surprises
             "surprises": evidence.surprises,
+            "prior": evidence.prior,  # (FEATURES,)
         }
-        if evidence.prior is not None:
-            for name, array in evidence.prior._asdict().items():
-                arrays[PRIOR + name] = array
         content = io.BytesIO()
         np.savez(content, **arrays)
         return content.getvalue()
@@ -601,13 +615,8 @@ class Experience:
         errors = arrays.get("errors", nothing).astype(np.float64)
         surprises = arrays.get("surprises", nothing).astype(np.float64)
         experience.evidence.restore(table, driven, errors, surprises)
-        prior = {
-            name.removeprefix(PRIOR): array
-            for name, array in arrays.items()
-            if name.startswith(PRIOR)
-        }
-        if prior:
-            experience.evidence.prior = Prior.from_arrays(prior)
+        # Older files have no prior, or a network, which is left out.
+        experience.prior = arrays.get("prior", np.zeros(FEATURES))
         return experience
 
     @classmethod

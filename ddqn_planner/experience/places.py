@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,20 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
-NOISE = 0.1  # variance of the log slowness of one visit
+# The variance of the log slowness of one visit, assumed from so many visits of all
+# places; and the visits of a place from which the variance of all is assumed there.
+NOISE = 0.1
+ASSUMED_VISITS = 8.0
+ASSUMED_VISITS_OF_PLACE = 4.0
+LEAST_NOISE = 0.03  # visits that are all alike were of one path through the place
+
+KNOWN_WEIGHT = 0.7  # of a place's visits, from which the place is known
+# Fewer known places say nothing about the robot's speed in the open.
+SURE_PLACES = 20
+OPEN_QUANTILE = 0.25  # of the log slowness of places
+FASTEST_QUANTILE = 0.05
+
+LEAST_WEIGHT = 1e-9  # places with less have no visit
 
 # The sums of `Places`, in the order of the columns in files.
 SUMS = (
@@ -25,6 +39,13 @@ SUMS = (
 COLUMNS = len(SUMS) + 2  # of the table in which files hold places
 
 
+class Levels(NamedTuple):
+    """The log slowness in the open, and where the robot is fastest."""
+
+    open_log: float
+    fastest_log: float
+
+
 @dataclass
 class Places:
     """Sums of what was seen at N places; all but the positions fade with time."""
@@ -35,11 +56,10 @@ class Places:
     sum_of_slowness: Float64
     sum_of_log: Float64  # of the logarithm of the slowness
     sum_of_squares: Float64  # of the square of that logarithm
-    passages: Float64  # (N,): the weight of the visits that could have had a wait
-    waited: Float64  # (N,): seconds
+    # (N,): the weight of the visits of drives that neither began nor ended there
+    passages: Float64
+    waited: Float64  # (N,): seconds that robots stood in these passages
     position: Float64  # (N, 2): x and y of the first visit, metres
-    # (N,): log slowness, from the prior before the first visit; files do not hold it
-    predicted: Float64
 
     @classmethod
     def none(cls) -> Places:
@@ -49,8 +69,9 @@ class Places:
     @classmethod
     def from_table(cls, table: Float64) -> Places:
         """Return the places in the rows of a table, (N, 8): the columns of `table`."""
-        *sums, x, y = table.T.copy()
-        return cls(*sums, np.column_stack([x, y]), np.zeros(len(table)))
+        columns = table.T.copy()
+        sums = dict(zip(SUMS, columns[:-2], strict=True))
+        return cls(**sums, position=np.ascontiguousarray(columns[-2:].T))
 
     def table(self) -> Float64:
         """Return the places as the rows of a table, (N, 8), which files hold.
@@ -66,24 +87,68 @@ class Places:
     def __len__(self) -> int:
         return len(self.weight)
 
-    def append(self, predicted: Float64, position: Float64) -> None:
+    def append(self, position: Float64) -> None:
         """Add M places that were not seen yet, with sums of 0.
 
-        `predicted` (M,) is the log slowness that the prior predicts, and `position`
-        (M, 2) x and y of the first visit, in metres.
+        `position` is (M, 2), x and y of the first visit, in metres.
         """
-        nothing = np.zeros(len(predicted))
         for name, values in zip(SUMS, self.sums(), strict=True):
-            setattr(self, name, np.append(values, nothing))
-        self.predicted = np.append(self.predicted, predicted)
+            setattr(self, name, np.append(values, np.zeros(len(position))))
         self.position = np.concatenate([self.position, position])
 
     def add(self, rows: Int64, other: Places) -> None:
-        """Add the sums of other places to those in some rows, (M,), each row once."""
+        """Add the sums of M other places to those in some rows, (M,).
+
+        A row may be there several times.
+        """
         for values, more in zip(self.sums(), other.sums(), strict=True):
-            values[rows] += more
+            np.add.at(values, rows, more)
 
     def fade(self, share: float) -> None:
         """Multiply all sums of what was seen with `share`, 0 to 1."""
         for values in self.sums():
             values *= share
+
+    def is_known(self) -> NDArray[np.bool_]:
+        """Return of which places enough was seen: (N,)."""
+        return self.weight >= KNOWN_WEIGHT
+
+    def mean_log(self) -> Float64:
+        """Return the mean of the log slowness of the visits: (N,), 0 without visits."""
+        return self.sum_of_log / np.maximum(self.weight, LEAST_WEIGHT)
+
+    def log_of_mean(self) -> Float64:
+        """Return the logarithm of the mean slowness: (N,), 0 without visits.
+
+        It is more than `mean_log`, the more the visits of a place differ.
+        """
+        has_visits = self.weight > LEAST_WEIGHT
+        mean = np.ones(len(self))
+        np.divide(self.sum_of_slowness, self.weight, out=mean, where=has_visits)
+        return np.log(mean)
+
+    def noise(self) -> Float64:
+        """Return the variance of the log slowness of one visit of each place: (N,).
+
+        It is estimated from the visits of the place, and as far as they are few, from
+        those of all places.
+        """
+        freedom = np.maximum(self.weight - 1, 0)
+        squares = self.sum_of_squares - self.sum_of_log * self.mean_log()
+        squares = np.where(freedom > 0, np.maximum(squares, 0), 0)
+        total = ASSUMED_VISITS * NOISE + squares.sum()
+        noise_of_all = total / (ASSUMED_VISITS + freedom.sum())
+        assumed = ASSUMED_VISITS_OF_PLACE * noise_of_all
+        noise = (assumed + squares) / (ASSUMED_VISITS_OF_PLACE + freedom)
+        return np.maximum(noise, LEAST_NOISE)
+
+    def levels(self) -> Levels:
+        """Return how slow the robot is in the open, and where it is fastest.
+
+        With few known places, both are the nominal speed.
+        """
+        log = self.log_of_mean()[self.is_known()]
+        if len(log) < SURE_PLACES:
+            return Levels(0.0, 0.0)
+        open_log, fastest_log = np.quantile(log, (OPEN_QUANTILE, FASTEST_QUANTILE))
+        return Levels(float(open_log), float(fastest_log))

@@ -9,9 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place
-from ddqn_planner.experience.places import NOISE, Float32, Float64, Int64, Places
-from ddqn_planner.experience.population import FEW_PLACES, Population
-from ddqn_planner.experience.prior import Prior, map_features
+from ddqn_planner.experience.places import (
+    COLUMNS,
+    NOISE,
+    OPEN_QUANTILE,
+    SURE_PLACES,
+    Float32,
+    Float64,
+    Int64,
+    Places,
+)
+from ddqn_planner.experience.prior import FEATURES, map_features, regression
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
 
@@ -23,8 +31,14 @@ STEPS = np.minimum(STEPS, MAX_SLOWNESS).astype(np.float32)
 # Of the log slowness: no place is farther from the solution of the equations.
 ACCURACY = 0.01
 OVER_RELAXATION = 1.4  # of the solver: neighbours agree sooner
-# Around each place, so many passages without a wait are assumed.
-WAIT_PLACES = 0.1
+# Of the log slowness of places.
+VARIANCE = 1.0
+# Neighbours are alike: so many places of a path tell as much of other places as one
+# place alone.
+ALIKE_PLACES = 8.0
+ASSUMED_PASSAGES = 2.0  # of each place, without a wait
+# A straight path through a place leads to so many ends of ways of two links or less.
+WAYS_AROUND = 11.0
 # Standard deviations of the log time of a drive: on known places, and what is added on
 # places that nobody drove.
 DRIVE_NOISE = 0.05
@@ -65,15 +79,6 @@ class Equations(NamedTuple):
     tolerance: Float64  # (P,): up to which the square of a residual counts as 0
 
 
-class SumsOnMap(NamedTuple):
-    """The sums of `Places`, by the P places of a map: (P,) each."""
-
-    weight: Float64
-    sum_of_log: Float64
-    passages: Float64
-    waited: Float64
-
-
 class Posterior:
     """The posterior of each place of a map: a connected part of a block of free cells.
 
@@ -96,10 +101,15 @@ class Posterior:
     known, unknown : (P,) float64
         The share of each place's log slowness that was seen, and the share of its
         standard deviation that remains.
-    mean : (P,) float64
-        The expected log slowness, without waits.
+    expected, mean : (P,) float64
+        The log slowness, without waits, that is expected before the first visit of a
+        place and of those near it, and after the visits.
+    excess : (P,) float64
+        The standard deviation of one visit's log slowness beyond the usual one.
     slowness : (P,) float64
         The expected seconds over those at nominal speed, with waits.
+    coefficients : (FEATURES,) float64
+        By how much each feature of the map raises the log slowness.
     """
 
     def __init__(self, grid: GridMap, side: float, nominal_speed: float) -> None:
@@ -133,8 +143,9 @@ class Posterior:
         # (P, 2), the solutions of two systems of equations: the log slowness that was
         # seen beyond the expected one, and the share that is known.
         self._solution = np.zeros((count, 2))
-        self._prior: Prior | None = None
-        self._predicted = np.zeros(count)  # log slowness, by the prior
+        x, y = self._middle_cells.T
+        self._features = map_features(grid)[y, x].astype(np.float64)  # (P, FEATURES)
+        self.coefficients = np.zeros(FEATURES)
         self._painted: dict[str, Painted] = {}
 
     def deviation_of(self, seconds: Float64, places: Int64) -> float:
@@ -146,8 +157,10 @@ class Posterior:
             The expected seconds of each part of the path, and the number of its place.
         """
         # The mean over the time of the path: 0 if all is known, 1 if nothing.
-        unknown = float(seconds @ self.unknown[places] / seconds.sum())
-        return math.hypot(DRIVE_NOISE, UNKNOWN_NOISE * unknown)
+        share = seconds / seconds.sum()
+        unknown = float(share @ self.unknown[places])
+        excess = float(share @ self.excess[places])
+        return math.hypot(DRIVE_NOISE, UNKNOWN_NOISE * unknown, excess)
 
     def places_at(self, position: Float64) -> Int64:
         """Return the number of the nearest place to each position: (N,).
@@ -160,63 +173,52 @@ class Posterior:
         y = cells[:, 1]
         return np.where(is_inside, self._nearest_place[y, x], NO_PLACE)
 
-    def predicted_at(self, position: Float64) -> Float64:
-        """Return the log slowness that the prior predicts at each position: (N,).
-
-        `position` is (N, 2), x and y in metres. Without a prior, and off the map, the
-        prediction is 0.
-        """
-        # NO_PLACE is the index of the last value.
-        predicted = np.append(self._predicted, 0.0)
-        return predicted[self.places_at(position)]
-
-    def update(
-        self, places: Places, population: Population, prior: Prior | None
-    ) -> None:
+    def update(self, places: Places, open_log: float, prior: Float64) -> None:
         """Compute `known`, `unknown`, `mean` and `slowness` of each of P places.
-
-        `mean` is the expected log slowness, the logarithm of the time in a place over
-        that at nominal speed; `slowness` is that ratio, with waits. `known` is the
-        share of the log slowness that was seen, and `unknown` the share of its standard
-        deviation that remains.
 
         Parameters
         ----------
         places : Places
             What was seen at places of the world.
-        population : Population
-            The distribution of the log slowness of places.
-        prior : Prior or None
-            Predicts the log slowness of places from the map.
+        open_log : float
+            The log slowness in the open, where few places of this map are known.
+        prior : (FEATURES,) float64
+            By how much features of other maps raised the log slowness.
         """
-        self._predict(prior)
-        expected = population.level + population.prior_weight * self._predicted  # (P,)
         sums = self._sums_of(places)
-        self._solve(sums, expected, population.variance)
-        seen_beyond_expected = self._solution[:, 0]
+        log = sums.log_of_mean()  # (P,)
+        noise = sums.noise()  # (P,)
+        self.coefficients = self._regression(sums, log, noise, prior)
+        self.expected = self._features @ self.coefficients
+        known_beyond = (log - self.expected)[sums.is_known()]
+        if len(known_beyond) >= SURE_PLACES:
+            self.expected += np.quantile(known_beyond, OPEN_QUANTILE)
+        else:
+            self.expected += open_log
+        self._solve(sums.weight / noise, log - self.expected)
         self.known: Float64 = np.clip(self._solution[:, 1], 0, 1)
         self.unknown = np.sqrt(1 - self.known)
-        surplus = population.surplus * (1 - self.known)
-        self.mean = expected + seen_beyond_expected + surplus
+        self.mean = self.expected + self._solution[:, 0]
+        self.excess = np.sqrt(np.maximum(noise - NOISE, 0))
         self.slowness = np.exp(self.mean)
         if sums.waited.any():
-            waits = self._waits(sums.passages, sums.waited)
-            self.slowness += self.nominal_speed * waits
+            self.slowness += self.nominal_speed * self._waits(sums)
 
-    def _predict(self, prior: Prior | None) -> None:
-        """Set the log slowness that a prior predicts, unless it is the last prior."""
-        if prior is self._prior:
-            return
-        self._prior = prior
-        if prior is None:
-            self._predicted[:] = 0
-        else:
-            x = self._middle_cells[:, 0]
-            y = self._middle_cells[:, 1]
-            self._predicted[:] = prior.log_slowness(map_features(self.grid)[y, x])
+    def _regression(
+        self, sums: Places, log: Float64, noise: Float64, prior: Float64
+    ) -> Float64:
+        """Return by how much features of this map raise the log slowness: (FEATURES,).
 
-    def _sums_of(self, places: Places) -> SumsOnMap:
-        """Return, for each of the map's P places, the sums of what was seen there.
+        `sums` are of the map's P places; `log` and `noise` (P,) are their log slowness
+        and the variance of one visit. `prior` (FEATURES,) is from other maps.
+        """
+        driven = sums.weight > 0
+        visits = sums.weight[driven] / noise[driven]  # the inverse variance of the mean
+        weight = 1 / (1 / VARIANCE + 1 / visits) / ALIKE_PLACES
+        return regression(self._features[driven], log[driven], weight, prior)
+
+    def _sums_of(self, places: Places) -> Places:
+        """Return what was seen at each of the map's P places.
 
         `places` are N squares of the world, aligned with the axes of its frame. The
         map's places are blocks of cells of the same size, from the map's corner on. A
@@ -225,23 +227,11 @@ class Posterior:
         """
         nearest_place = self.places_at(places.position)  # (N,)
         is_on_map = nearest_place != NO_PLACE
-        place_of_square = nearest_place[is_on_map]  # (M,)
-        count = len(self._middle_cells)  # P
+        table = np.zeros((len(self._middle_cells), COLUMNS))  # (P, COLUMNS)
+        np.add.at(table, nearest_place[is_on_map], places.table()[is_on_map])
+        return Places.from_table(table)
 
-        def summed(values: Float64) -> Float64:
-            """Return the sums (P,) of the values (N,) of squares."""
-            sums = np.bincount(place_of_square, values[is_on_map], count)
-            # Without any square on the map, the sums are integers.
-            return sums.astype(np.float64)
-
-        return SumsOnMap(
-            weight=summed(places.weight),
-            sum_of_log=summed(places.sum_of_log),
-            passages=summed(places.passages),
-            waited=summed(places.waited),
-        )
-
-    def _solve(self, sums: SumsOnMap, expected: Float64, variance: float) -> None:
+    def _solve(self, visits: Float64, log: Float64) -> None:
         """Solve the equations of the Gaussian Markov random field over the P places.
 
         Changes `_solution` (P, 2) from the last solution to the new one. Its first
@@ -250,12 +240,10 @@ class Posterior:
 
         Parameters
         ----------
-        sums : SumsOnMap
-            What was seen at each place of the map.
-        expected : (P,) float64
-            The log slowness of each place that is expected without any visit.
-        variance : float
-            The variance of the log slowness of places.
+        visits : (P,) float64
+            The inverse variance of the log slowness that was seen at each place.
+        log : (P,) float64
+            That log slowness, less the expected one.
         """
         # Neighbours are linked with the strength 1, and each place is drawn to 0 with
         # the strength kappa. On such a lattice the values have about the variance
@@ -263,64 +251,41 @@ class Posterior:
         # added to the argument.
         kappa = (self._spacing / CORRELATION) ** 2
         variance_of_lattice = math.log1p(32 / kappa) / (4 * math.pi)
-        # Each visit draws its place to the log slowness that was seen, with the
-        # strength `scale`: so the field has the given variance, and a visit has NOISE.
-        scale = variance / variance_of_lattice / NOISE
-        visits = scale * sums.weight  # (P,): the strength of all visits of each place
-        # Half of the noise is added, as the mean of its exponential is more than 1.
-        seen = scale * (sums.sum_of_log + sums.weight * NOISE / 2)  # (P,)
-        right = np.column_stack([seen - visits * expected, visits])  # (P, 2)
+        # All is scaled so that the field has the variance VARIANCE.
+        strength = VARIANCE / variance_of_lattice * visits  # (P,)
+        right = np.column_stack([strength * log, strength])  # (P, 2)
         # If the solution is off by the same error everywhere, the residuals are that
-        # error times `kappa + visits`, and they are larger for larger errors. So
+        # error times `kappa + strength`, and they are larger for larger errors. So
         # residuals up to this product prove that no place is off by more than ACCURACY.
-        largest_residual = ACCURACY * (kappa + visits)  # (P,)
+        largest_residual = ACCURACY * (kappa + strength)  # (P,)
         equations = Equations(
             first_link=self._links.indptr,
             neighbour=self._links.indices,
             strength=self._links.data,
-            diagonal=kappa + self._strength_of_links + visits,
+            diagonal=kappa + self._strength_of_links + strength,
             tolerance=largest_residual**2,
         )
         _relax(equations, right, self._solution)
 
-    def _waits(self, passages: Float64, waited: Float64) -> Float64:
+    def _waits(self, sums: Places) -> Float64:
         """Return the seconds that a robot waits per metre through each place: (P,).
 
-        They are the seconds waited around the place, over the metres driven around it.
-        So a path that passes beside the place where robots stood has the same wait.
-
-        Parameters
-        ----------
-        passages : (P,) float64
-            How often robots passed each place; a passage is a side of a place long.
-        waited : (P,) float64
-            The seconds that robots waited at each place, in all passages.
+        They are the mean seconds of a passage, with some passages without a wait
+        assumed. A path that passes beside the place where robots stood has the same
+        wait: the sums are those around a place.
         """
-        reach = round(2 * self.side / self._spacing)  # links: two sides of a place
-        seconds_around = self._mean_around(waited, reach)
-        passages_around = self._mean_around(passages, reach)
-        waits = seconds_around / (passages_around + WAIT_PLACES) / self.side
-        # Robots wait in unknown places, too: they wait there for the mean of known
-        # places. One place of long waits says nothing of other places, so the
-        # surroundings of the longest wait do not count.
-        is_longest_wait = np.zeros(len(waits))
-        is_longest_wait[waited.argmax()] = 1
-        is_elsewhere = self._mean_around(is_longest_wait, 2 * reach) == 0
-        waits_elsewhere = float(waits @ (self.known * is_elsewhere))
-        mean_wait = waits_elsewhere / (FEW_PLACES + float(self.known.sum()))
-        waits_in_unknown: Float64 = mean_wait * (1 - self.known)
-        return waits + waits_in_unknown
+        seconds = self._sum_around(sums.waited)
+        passages = self._sum_around(sums.passages) + WAYS_AROUND * ASSUMED_PASSAGES
+        return seconds / passages / self.side
 
-    def _mean_around(self, values: Float64, reach: int) -> Float64:
-        """Return for each place a weighted mean of the values around it: (P,).
+    def _sum_around(self, values: Float64) -> Float64:
+        """Return for each place a weighted sum of the values around it: (P,).
 
-        `values` (P,) are those of places. The mean is over the places up to `reach`
-        links away, of which none is behind a wall.
+        `values` (P,) are those of places. The sum is over all ways of two links or less
+        from the place, of which none leads through a wall.
         """
-        # Each round takes the mean of a place and its neighbours: four in the open.
-        for _ in range(reach):
-            sum_of_neighbours = self._links @ values
-            values = (values + sum_of_neighbours) / 5
+        for _ in range(2):
+            values = values + self._links @ values
         return values
 
     def paint(self, name: str, optimism: Float64 | float, fastest: float) -> Float32:

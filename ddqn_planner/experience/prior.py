@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
-
 import numpy as np
-from numpy.typing import NDArray
 
-from ddqn_planner.experience.places import Float32
+from ddqn_planner.experience.places import Float32, Float64
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.inflation import clearance
@@ -17,11 +13,19 @@ FEATURES = 7
 REACH = 3.0  # metres: what is farther away says nothing
 NARROW = 0.7, 1.2, 2.0  # metres: free widths up to which a passage counts as narrow
 STEEPNESS = 7  # of the step from narrow to wide passages
-UNUSUAL = 3.0  # standard deviations: features are no farther off than those of training
+# A feature whose deviation is 1 raises the log slowness by 0, with this inverse
+# variance; and it is taken to vary at least so much.
+RIDGE = 1.25
+LEAST_VARIANCE = 0.01
+# Of what older coefficients predict, this share is expected to be right, with this
+# inverse variance.
+SHARE_OF_OLDER = 0.5
+PENALTY_OF_OLDER = 1.0
+LEAST_WEIGHT = 1e-9  # in place of a sum of 0 that divides
 
 
 def map_features(grid: GridMap) -> Float32:
-    """Return what a map says of the surroundings of each of its cells, for a `Prior`.
+    """Return what a map says of the surroundings of each of its cells.
 
     Beyond the border of `grid` stands a wall. Cells that are occupied only because of
     the robot's body count as free.
@@ -80,60 +84,34 @@ def _free_widths(occupied: Occupancy, resolution: float) -> Float32:
     return np.asarray(np.minimum(metres, 2 * REACH))
 
 
-class Prior(NamedTuple):
-    """A network that predicts the log slowness of places from their F features.
+def regression(
+    features: Float64, log: Float64, weight: Float64, older: Float64
+) -> Float64:
+    """Return by how much each feature of a map raises the log slowness: (FEATURES,).
 
-    It has two layers of H units.
+    It is a ridge regression in which a prediction by older coefficients is one feature
+    more: so those that predict the places count, and those that do not are replaced.
+
+    Parameters
+    ----------
+    features : (M, FEATURES) float64
+        The features of driven places, as `map_features` returns them.
+    log, weight : (M,) float64
+        The log slowness of each place, of any level, and its inverse variance.
+    older : (FEATURES,) float64
+        Coefficients from other maps, or zeros.
     """
-
-    mean: Float32  # (F,) of the features in training
-    scale: Float32  # (F,): their standard deviations
-    level: Float32  # (): the mean log slowness in training
-    direct: Float32  # (F,): what each feature adds beside the layers
-    weights_1: Float32  # (F, H)
-    bias_1: Float32  # (H,)
-    weights_2: Float32  # (H, H)
-    bias_2: Float32  # (H,)
-    weights_3: Float32  # (H,)
-    # (N, F + 4): x, y, features, log slowness and weight of places, from which the next
-    # training learns, too
-    replay: Float32
-
-    def log_slowness(self, features: Float32) -> Float32:
-        """Return the log slowness (...,) predicted for places with features (..., F).
-
-        The features are those of `map_features`.
-        """
-        deviations = (features - self.mean) / self.scale
-        x = np.clip(deviations, -UNUSUAL, UNUSUAL)
-        hidden_1 = np.tanh(x @ self.weights_1 + self.bias_1)
-        hidden_2 = np.tanh(hidden_1 @ self.weights_2 + self.bias_2)
-        return np.asarray(self.level + x @ self.direct + hidden_2 @ self.weights_3)
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Prior:
-        """Return the prior whose fields are arrays of the same names.
-
-        A ValueError if the arrays cannot be those of a prior.
-        """
-        try:
-            prior = cls(
-                *(
-                    arrays[name].astype(np.float32, casting="same_kind")
-                    for name in cls._fields
-                )
-            )
-            # Arrays whose shapes do not fit raise a ValueError here.
-            prediction = prior.log_slowness(np.zeros(FEATURES, dtype=np.float32))
-        except (KeyError, TypeError, ValueError):
-            raise ValueError("its prior cannot be true") from None
-        is_possible = (
-            prediction.shape == ()
-            and prior.replay.shape[1:] == (FEATURES + 4,)
-            and all(np.isfinite(array).all() for array in prior)
-            and (prior.scale > 0).all()
-            and (prior.replay[:, -1] >= 0).all()
-        )
-        if not is_possible:
-            raise ValueError("its prior cannot be true")
-        return prior
+    design = np.column_stack([features, features @ older])  # (M, FEATURES + 1)
+    total = max(float(weight.sum()), LEAST_WEIGHT)
+    design -= weight @ design / total
+    variance = weight @ design**2 / total  # (FEATURES + 1,)
+    penalty = RIDGE * np.maximum(variance, LEAST_VARIANCE)
+    penalty[-1] = PENALTY_OF_OLDER
+    assumed = np.zeros(FEATURES + 1)
+    assumed[-1] = SHARE_OF_OLDER
+    weighted = design.T * weight  # (FEATURES + 1, M)
+    precision = weighted @ design + np.diag(penalty)
+    right = weighted @ (log - weight @ log / total) + penalty * assumed
+    solution: Float64 = np.linalg.solve(precision, right)
+    share_of_older = float(solution[-1])
+    return solution[:-1] + share_of_older * older

@@ -8,6 +8,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ddqn_planner.experience.places import Float64, Int64
 
@@ -24,6 +25,7 @@ BEND_OF_NOISE = 2.88
 STAND_DISTANCE = 0.1  # metres within which a robot stands
 # Metres. A robot that drives leaves a place before it could have driven so far.
 STAND = 1.5
+END = 2.0  # metres from the first and the last pose: there a wait is none on the way
 # Metres by which a localisation may correct a pose at once: the drive continues.
 CORRECTION = 0.25
 # Metres. After a longer jump, poses are not believed.
@@ -64,21 +66,27 @@ class Visits(NamedTuple):
     position: Float64  # (V, 2): metres, where the robot passed the place
     seconds: Float64  # (V,): that the robot drove in the place, without waits
     metres: Float64  # (V,): that the robot drove in the place
+    is_on_way: NDArray[np.bool_]  # (V,): whether it is not near an end of the drive
     # The waits of the drive. A robot waits for what is ahead of it, often where routes
     # part: a wait has the position to which the robot drove next, so that no other
-    # route is charged.
+    # route is charged. Waits near an end of the drive are no waits on the way: there a
+    # robot docks, or waits for its next task, which says nothing of who passes by.
     waits: SecondsAt
+    seconds_at_ends: float  # that the robot waited near the ends of the drive
 
     @property
     def total_seconds(self) -> float:
         """The seconds of the drive, with its waits."""
-        return float(self.seconds.sum() + self.waits.seconds.sum())
+        seconds = self.seconds.sum() + self.waits.seconds.sum()
+        return float(seconds) + self.seconds_at_ends
 
     @classmethod
     def of_wait(cls, x: float, y: float, seconds: float) -> Visits:
         """Return a wait of some seconds at x and y, in metres, and no driven place."""
         waits = SecondsAt(np.array([[x, y]]), np.array([seconds]))
-        return cls(np.zeros((0, 2)), np.zeros(0), np.zeros(0), waits)
+        nothing = np.zeros(0)
+        is_on_way = np.zeros(0, np.bool_)
+        return cls(np.zeros((0, 2)), nothing, nothing, is_on_way, waits, 0.0)
 
 
 class Limits(NamedTuple):
@@ -127,7 +135,8 @@ def visits_of(poses: Poses, side: float, limits: Limits) -> Visits:
     is_possible = step_length <= limits.max_speed * steps.seconds
     possible_steps = SecondsAt(steps.position[is_possible], steps.seconds[is_possible])
     waits = SecondsAt.joined(waits_of_parts)
-    return _visits_of_steps(possible_steps, step_length, side, waits)
+    ends = poses.position[[0, -1]]
+    return _visits_of_steps(possible_steps, step_length, side, waits, ends)
 
 
 def _seconds_stood(time: Float64, spots: Int64, speed: float) -> Float64:
@@ -151,7 +160,11 @@ def _seconds_stood(time: Float64, spots: Int64, speed: float) -> Float64:
 
 
 def _visits_of_steps(
-    steps: SecondsAt, step_length: float, side: float, waits: SecondsAt
+    steps: SecondsAt,
+    step_length: float,
+    side: float,
+    waits: SecondsAt,
+    ends: Float64,
 ) -> Visits:
     """Return the visits of a drive: steps in a row that lie in the same place are one.
 
@@ -164,7 +177,9 @@ def _visits_of_steps(
     side : float
         The side of a place, which is a square; metres.
     waits : SecondsAt
-        The waits of the drive, which the result holds unchanged.
+        The waits of the drive.
+    ends : (2, 2) float64
+        The first and the last position of the drive, metres.
     """
     place = np.floor(steps.position / side)  # (N, 2): x and y of each place, in sides
     # A visit begins where a step lies in another place than the step before it. NaN
@@ -175,12 +190,24 @@ def _visits_of_steps(
     # (N, 3): x, y and the seconds of each step; (V, 3): their sums over each visit.
     rows = np.column_stack([steps.position, steps.seconds])
     sums = np.add.reduceat(rows, first_steps)
+    position = sums[:, :2] / step_count[:, None]
+    is_wait_on_way = _is_away(waits.position, ends)
     return Visits(
-        position=sums[:, :2] / step_count[:, None],
+        position=position,
         seconds=sums[:, 2],
         metres=step_length * step_count,
-        waits=waits,
+        is_on_way=_is_away(position, ends),
+        waits=SecondsAt(waits.position[is_wait_on_way], waits.seconds[is_wait_on_way]),
+        seconds_at_ends=float(waits.seconds[~is_wait_on_way].sum()),
     )
+
+
+def _is_away(position: Float64, ends: Float64) -> NDArray[np.bool_]:
+    """Return which positions (N, 2) are farther than END from both ends (2, 2)."""
+    offset = position[:, None] - ends  # (N, 2, 2): metres from each end
+    distance: Float64 = np.hypot(offset[..., 0], offset[..., 1])  # (N, 2)
+    nearest: Float64 = distance.min(axis=1)
+    return nearest > END
 
 
 def speeds_of(poses: Poses, window: float) -> Float64:

@@ -1,6 +1,5 @@
 """A learner from drives: those of the node's robot, or of a fleet."""
 
-import copy
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -9,7 +8,6 @@ import numpy as np
 from action_msgs.msg import GoalStatus, GoalStatusArray
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import OccupancyGrid
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
 
@@ -19,8 +17,6 @@ from ddqn_planner.experience.drives import (
     DriveRecorder,
     read_drives,
 )
-from ddqn_planner.experience.places import Places
-from ddqn_planner.experience.prior import Prior
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.clocks import STEADY
 from ddqn_planner.nodes.conversions import occupancy_message
@@ -38,8 +34,6 @@ NAVIGATION = "navigate_to_pose/_action/status"
 SLOWEST = 10.0  # the slowness that ``~/slowness`` shows as 100
 # Of the logarithm of a speed: where drives differ more, the nominal speed is wrong.
 WRONG_SPEED = np.log(1.5)
-# With so many times the places of the last time, the prior is trained again.
-MORE_PLACES = 1.1
 REPLAY_STRIDE = 5  # poses; a replay of all poses would take long
 LOOK_UP_PERIOD = 0.05  # seconds
 NOT_RECORDING = "no drives are being recorded; call ~/start first"
@@ -182,12 +176,6 @@ class Driving:
             DrivingRobot(node, frames, name, self._on_drive) for name in names
         ]
         self._is_speed_wrong = False  # whether the last warning of it still holds
-        # Places with evidence when the training of the prior last began.
-        self._places_of_prior = 0
-        group = MutuallyExclusiveCallbackGroup()  # the callback awaits the worker
-        self._prior_timer = node.create_timer(
-            1.0, self.train_prior, group, clock=STEADY
-        )
         node.create_timer(1.0, self._on_second, clock=STEADY)
         self.start()
 
@@ -236,10 +224,10 @@ class Driving:
         experience = folder.experience
         # The log slowness is 0 where the robot drives at the nominal speed, and below 0
         # where it is faster.
-        population = experience.evidence.population
-        is_faster = population.open_log < -WRONG_SPEED
+        levels = experience.evidence.levels
+        is_faster = levels.open_log < -WRONG_SPEED
         # Many places may be slow. If even the fastest places are, the robot is slow.
-        is_slower = population.fastest_log > WRONG_SPEED
+        is_slower = levels.fastest_log > WRONG_SPEED
         is_wrong = is_faster or is_slower
         if is_wrong and not self._is_speed_wrong:
             speeds = (
@@ -248,49 +236,6 @@ class Driving:
             )
             self._node.get_logger().warning(f"{speeds}; set it before you learn anew")
         self._is_speed_wrong = is_wrong
-
-    async def train_prior(self) -> None:
-        """Train the prior in the worker, if drives have shown a tenth more places.
-
-        A timer calls this each second. The new prior is saved.
-        """
-        map_in_frame = self._node.map
-        folder = self._folder
-        if map_in_frame is None or folder is None:
-            return
-        evidence = folder.experience.evidence
-        places = len(evidence.places)
-        if not self._is_prior_due(places):
-            return
-        self._places_of_prior = places
-        seed: int = self._node.value("seed")
-        try:
-            # A copy of the places, as drives change them meanwhile.
-            prior: Prior | None = await self._node.worker.call(
-                _trained_prior,
-                map_in_frame.grid,
-                copy.deepcopy(evidence.places),
-                evidence.prior,
-                seed,
-            )
-        except Exception as error:  # the node must survive
-            if isinstance(error, ImportError):
-                self._node.destroy_timer(self._prior_timer)
-            reason = f"the prior was not trained: {explained(error)}"
-            self._node.get_logger().warning(reason)
-            return
-        # Meanwhile the drives may have been forgotten, or another folder begun.
-        evidence = folder.experience.evidence
-        if folder is self._folder and len(evidence.places) >= places:
-            folder.experience.prior = prior
-            folder.try_to_save()
-
-    def _is_prior_due(self, places: int) -> bool:
-        """Return whether to train the prior; `places` is the number of known places."""
-        if places == 0:
-            return False
-        was_forgotten = places < self._places_of_prior
-        return was_forgotten or places >= MORE_PLACES * self._places_of_prior
 
     def _show_slowness(self) -> None:
         """Publish the slowness on the map if it has changed and somebody subscribes.
@@ -415,15 +360,3 @@ class Driving:
         for robot in self.robots:
             self._lines |= robot.describe()
         return self._lines
-
-
-def _trained_prior(
-    grid: GridMap, places: Places, older: Prior | None, seed: int
-) -> Prior | None:
-    """Return a prior that was trained on the places of a map, see `prior_of`.
-
-    It has learned from the places of the `older` prior, too. The worker calls this.
-    """
-    from ddqn_planner.training.prior_training import prior_of  # it imports torch
-
-    return prior_of(grid, places, older, seed)

@@ -167,12 +167,11 @@ def unsure_at(experience: Experience, x: float, y: float) -> float:
 
 def test_what_is_slow_in_one_direction_alone_is_no_change() -> None:
     experience = driven(*[straight((2, 2), (12, 2), 3)] * 3)
-    before = unsure_at(experience, 7, 2)
     for number in range(40):
         experience.apply(HALL)  # so that it learns how sure expected times are
         up, down = straight((2, 8), (12, 8), 4), straight((12, 8), (2, 8))
         experience.record(*(up if number % 4 else down))
-    assert unsure_at(experience, 7, 2) < 1.5 * before
+    assert unsure_at(experience, 7, 2) < 0.2
 
 
 def test_where_parts_of_drives_often_surprise_a_surprise_is_no_change() -> None:
@@ -191,10 +190,9 @@ def test_where_parts_of_drives_often_surprise_a_surprise_is_no_change() -> None:
         experience.apply(HALL)
         if number == 20:
             experience.record(*straight((2, 9.5), (12, 9.5)))
-            before = unsure_at(experience, 7, 9.5)
         experience.record(*drive(4 if number % 4 == 0 else 1))
         experience = Experience.from_bytes(experience.to_bytes())
-    assert unsure_at(experience, 7, 9.5) < 1.5 * before
+    assert unsure_at(experience, 7, 9.5) < 0.5
 
 
 def waited(seconds: float, x: float = 7.0) -> Poses:
@@ -214,7 +212,7 @@ def often_driven() -> Experience:
 
 
 @given(st.floats(6, 80), st.integers(1, 4))
-def test_a_wait_is_added_to_each_passage_as_the_mean_of_its_seconds(
+def test_the_mean_wait_of_passages_is_added_to_each_passage(
     often_driven: Experience, seconds: float, passages_without_wait: int
 ) -> None:
     wall = HALL.occupancy.copy()
@@ -230,7 +228,8 @@ def test_a_wait_is_added_to_each_passage_as_the_mean_of_its_seconds(
         experience.record(*waited(seconds if has_wait else 0))
     waits = len(range(0, 10, passages_without_wait + 1))
     cost = planner.plan(experience.apply(grid), *ends).cost
-    assert cost - usual == pytest.approx(seconds * waits / 10, rel=0.15)
+    # Twenty passages, and two that are assumed.
+    assert cost - usual == pytest.approx(seconds * waits / 22, rel=0.25)
 
 
 def test_a_wait_is_not_spread_along_the_way_or_to_other_ways() -> None:
@@ -273,24 +272,54 @@ def test_a_wait_beside_a_wall_costs_nothing_behind_it() -> None:
     assert at(HALL, experience.slowness(HALL), 5, 5.4) > 10
 
 
-def test_where_robots_wait_at_several_places_waits_are_expected_elsewhere_too() -> None:
-    open_way, one, other = (
-        driven(*[drive] * 4).slowness(HALL)[:10].mean()
-        for drive in (waited(0.0), waited(20.0), waited(20.0, 4.0))
-    )
-    several = driven(*[waited(20.0), waited(20.0, 4.0)] * 2).slowness(HALL)[:10].mean()
-    assert one == pytest.approx(open_way, rel=0.02)
-    assert other == pytest.approx(open_way, rel=0.02)
-    assert several > 1.1 * open_way
+def test_waits_say_nothing_of_the_places_elsewhere() -> None:
+    without_waits = driven(*[waited(0.0)] * 4).slowness(HALL)[:10]  # far from them
+    with_waits = driven(*[waited(20.0), waited(20.0, 4.0)] * 2).slowness(HALL)[:10]
+    np.testing.assert_allclose(with_waits, without_waits, rtol=0.05)
 
 
-def test_two_waits_close_by_say_nothing_of_the_places_elsewhere() -> None:
-    open_way = driven(*[waited(0.0)] * 4)
-    queue = driven(*[waited(20.0), waited(19.0, 7.5)] * 2)
-    elsewhere = np.s_[:10]  # rows of the hall, far from the drives
-    without_waits = open_way.slowness(HALL)[elsewhere].mean()
-    with_waits = queue.slowness(HALL)[elsewhere].mean()
-    assert with_waits == pytest.approx(without_waits, rel=0.02)
+def test_a_wait_near_an_end_of_a_drive_is_not_charged_to_who_passes() -> None:
+    experience = driven(*[waited(40.0, x) for x in (3.0, 11.0)] * 10)
+    without_waits = driven(*[waited(0.0)] * 20)
+    for x in (3.0, 11.0):
+        expected = at(HALL, without_waits.slowness(HALL), x, 5)
+        assert at(HALL, experience.slowness(HALL), x, 5) < 1.2 * expected
+
+
+def test_a_wait_that_is_over_is_forgotten_within_some_passages() -> None:
+    seconds, position = straight((2, 5), (12, 5))
+    waiting = seconds + np.where(position[:, 0] > 7, 30.0, 0.0)
+    experience = driven(*[(waiting, position)] * 60, half_life=1e9)
+    before = at(HALL, experience.slowness(HALL), 7.1, 5)
+    for _ in range(60):
+        experience.record(seconds, position)
+    assert before > 8
+    assert at(HALL, experience.slowness(HALL), 7.1, 5) < 0.4 * before
+
+
+def test_one_wait_after_many_passages_hardly_costs_anything() -> None:
+    experience = driven(*[waited(0.0)] * 100)
+    ends = [HALL.world_to_cell(x, 5.0) for x in (2.5, 11.5)]
+    before = experience.expected_time(HALL, ends).seconds
+    experience.record(*waited(70.0))
+    assert experience.expected_time(HALL, ends).seconds < 1.4 * before
+
+
+def test_the_interval_of_drives_that_differ_holds_them() -> None:
+    fast, slow = straight((2, 5), (12, 5)), straight((2, 5), (12, 5), 4)
+    experience = driven(*[fast, slow] * 20)
+    ends = [HALL.world_to_cell(x, 5.0) for x in (2.1, 11.9)]
+    expected = experience.expected_time(HALL, ends)
+    assert expected.low < 20
+    assert expected.high > 80
+    assert expected.seconds == pytest.approx(50, rel=0.1)
+
+
+def test_a_fast_stretch_does_not_raise_the_speed_in_the_open() -> None:
+    x = np.linspace(2, 12, 201)
+    slowness = np.where((x > 6) & (x < 7.5), 0.25, 1.0)
+    experience = driven(*[uneven(x, slowness)] * 4)
+    assert experience.learned_speed == pytest.approx(0.5, rel=0.1)
 
 
 def test_a_failure_costs_as_a_wait_and_is_forgotten_where_the_robot_succeeds() -> None:

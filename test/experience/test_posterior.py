@@ -7,9 +7,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ddqn_planner import GridMap
-from ddqn_planner.experience.places import NOISE, Places
-from ddqn_planner.experience.population import Population
-from ddqn_planner.experience.posterior import Posterior
+from ddqn_planner.experience.places import Places
+from ddqn_planner.experience.posterior import VARIANCE, Posterior
+from ddqn_planner.experience.prior import FEATURES
 
 SIDE = 0.25
 """Metres of a cell, and of a place."""
@@ -20,13 +20,16 @@ def random_places(random: np.random.Generator, free_cells: np.ndarray) -> Places
     count = random.integers(0, len(free_cells) + 1)
     cells = random.permutation(free_cells)[:count]
     places = Places.none()
-    places.append(np.zeros(count), (cells + 0.5) * SIDE)
+    places.append((cells + 0.5) * SIDE)
     places.weight += random.exponential(3, count) * random.integers(0, 2, count)
-    places.sum_of_log += places.weight * random.normal(1, 1, count)
+    log = random.normal(1, 1, count)
+    places.sum_of_slowness += places.weight * np.exp(log)
+    places.sum_of_log += places.weight * log
+    places.sum_of_squares += places.weight * (log**2 + random.exponential(0.1, count))
     return places
 
 
-def precision_of_map(free: np.ndarray, variance: float) -> np.ndarray:
+def precision_of_map(free: np.ndarray) -> np.ndarray:
     """The inverse covariance of the F free cells of a map, (F, F), before any visit."""
     count = np.count_nonzero(free)
     number = np.full(free.shape, -1)
@@ -38,7 +41,7 @@ def precision_of_map(free: np.ndarray, variance: float) -> np.ndarray:
     adjacency[cell[are_free], neighbour[are_free]] = 1
     adjacency += adjacency.T
     precision = np.diag(adjacency.sum(axis=1) + SIDE**2) - adjacency
-    return precision * np.log1p(32 / SIDE**2) / (4 * np.pi) / variance
+    return precision * np.log1p(32 / SIDE**2) / (4 * np.pi) / VARIANCE
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0, 0.6))
@@ -54,23 +57,19 @@ def test_the_posterior_is_that_of_a_gaussian_markov_random_field(
     posterior = Posterior(GridMap(occupancy, SIDE), SIDE, nominal_speed=0.5)
     for _ in range(2):  # the second time beginning with the first solution
         places = random_places(random, free_cells)
-        level, variance, surplus = random.uniform([-1, 0.05, 0], [1, 2, 0.5])
-        population = Population(level, 0, variance, surplus, 0, 0)
-        posterior.update(places, population, prior=None)
+        level = random.uniform(-1, 1)
+        posterior.update(places, level, prior=np.zeros(FEATURES))
 
-    weight = np.zeros(occupancy.shape)
-    sum_of_log = np.zeros(occupancy.shape)
+    visits = np.zeros(occupancy.shape)
+    log = np.zeros(occupancy.shape)
     column, row = np.floor(places.position / SIDE).astype(int).T
-    weight[row, column] = places.weight
-    sum_of_log[row, column] = places.sum_of_log
-    visits = weight[free]  # (F,), as the following arrays
-    # Half of the noise is added, as the mean of its exponential is more than 1.
-    seen = sum_of_log[free] + visits * (NOISE / 2 - level)
-    precision = precision_of_map(free, variance) + np.diag(visits / NOISE)
-    expected_known = np.linalg.solve(precision, visits / NOISE)
-    beyond_level = np.linalg.solve(precision, seen / NOISE)
-    expected_mean = level + beyond_level + surplus * (1 - expected_known)
+    visits[row, column] = places.weight / places.noise()
+    log[row, column] = places.log_of_mean()
+    expected = posterior.expected[posterior.place[free]]  # (F,), as the following
+    precision = precision_of_map(free) + np.diag(visits[free])
+    expected_known = np.linalg.solve(precision, visits[free])
+    beyond = np.linalg.solve(precision, visits[free] * (log[free] - expected))
 
     place = posterior.place[free]  # of each free cell
     np.testing.assert_allclose(posterior.known[place], expected_known, atol=0.01)
-    np.testing.assert_allclose(posterior.mean[place], expected_mean, atol=0.02)
+    np.testing.assert_allclose(posterior.mean[place], expected + beyond, atol=0.02)

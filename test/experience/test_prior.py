@@ -2,12 +2,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from experience.straight_drives import HALL, driven, straight
+from experience.straight_drives import at, driven, straight
 from hypothesis import given
+from hypothesis import strategies as st
+from random_maps import generate_map
 from strategies import occupancies
 
-from ddqn_planner import Experience, GridMap, inflate
-from ddqn_planner.experience.prior import FEATURES, Prior, map_features
+from ddqn_planner import GridMap, inflate
+from ddqn_planner.experience.prior import FEATURES, map_features, regression
 
 
 @given(occupancies)
@@ -59,101 +61,94 @@ def test_a_robots_body_moves_no_wall() -> None:
     assert (map_features(inflate(grid, 0.5)) == map_features(grid)).all()
 
 
-def some_prior() -> Prior:
-    random, units = np.random.default_rng(0), 3
-    layers = (FEATURES, units), units, (units, units), units, units
-    shapes = FEATURES, FEATURES, (), FEATURES, *layers, (7, FEATURES + 4)
-    return Prior(
-        *(np.abs(random.normal(size=shape)).astype(np.float32) for shape in shapes)
-    )
+def rooms(seed: int) -> np.ndarray:
+    """The features of 600 free cells of rooms."""
+    random = np.random.default_rng(seed)
+    occupancy = generate_map("rooms", (40, 40), random).repeat(2, 0).repeat(2, 1)
+    features = map_features(GridMap(occupancy, 0.25))[~occupancy]
+    return random.permutation(features)[:600].astype(np.float64)
 
 
-def test_a_prior_survives_as_arrays() -> None:
-    prior, features = some_prior(), np.ones((2, 3, FEATURES), dtype=np.float32)
-    again = Prior.from_arrays(prior._asdict())
-    assert again.log_slowness(features).dtype == np.float32
-    assert all(
-        np.array_equal(one, other) for one, other in zip(prior, again, strict=True)
-    )
+def by_clearance(features: np.ndarray) -> np.ndarray:
+    """Log slowness that a map's walls govern alone."""
+    return np.log(1 + 3 * np.exp(-features[:, 2] / 0.5))
 
 
-def test_without_its_prior_an_experience_is_as_before() -> None:
-    experience = driven(straight((2, 5), (12, 5), 3))
-    before = experience.slowness(HALL).copy()
-    experience.prior = some_prior()
-    assert np.abs(experience.slowness(HALL) / before - 1).max() > 0.5
-    experience.prior = None
-    np.testing.assert_allclose(experience.slowness(HALL), before, rtol=0.02)
+def share_foretold(coefficients: np.ndarray, features: np.ndarray) -> float:
+    """R² of the log slowness by clearance, up to its mean."""
+    truth = by_clearance(features)
+    return float(1 - (features @ coefficients - truth).var() / truth.var())
 
 
-def test_what_was_predicted_of_places_stays_with_them_after_a_merge() -> None:
-    hall = GridMap(np.zeros((40, 60), dtype=bool), 0.25)
-    prior = some_prior()
-
-    def with_prior() -> Experience:
-        experience = Experience(0.5)
-        experience.prior = prior
-        experience.apply(hall)
-        experience.record(*straight((2, 2), (12, 2), 2))
-        return experience
-
-    def without_prior() -> Experience:
-        experience = Experience(0.5)
-        experience.record(*straight((2, 8), (12, 8), 4))
-        return experience
-
-    nothing = Experience(0.5)
-    nothing.merge(with_prior())
-    assert nothing.to_bytes() == with_prior().to_bytes()
-    # Both know the same, whichever takes the other's places.
-    one = without_prior()
-    one.merge(with_prior())
-    other = with_prior()
-    other.merge(without_prior())
-    np.testing.assert_allclose(one.slowness(hall), other.slowness(hall), rtol=1e-3)
+NOTHING = np.zeros(FEATURES)
 
 
-def test_a_merge_keeps_its_own_prior_and_counts_each_level_but_once() -> None:
-    hall = GridMap(np.zeros((40, 60), dtype=bool), 0.25)
-    other = Experience(0.5)
-    other.prior = some_prior()
-    other.apply(hall)
-    other.record(*straight((2, 2), (12, 2), 2))
-    higher = some_prior()._replace(level=np.float32(2.0))
-    own = Experience(0.5)
-    own.prior = higher
-    own.merge(other)
-    other.prior = higher
-    assert own.to_bytes() == other.to_bytes()
-    # As if the prior had had this level when the places were predicted.
-    always = Experience(0.5)
-    always.prior = higher
-    always.apply(hall)
-    always.record(*straight((2, 2), (12, 2), 2))
-    np.testing.assert_allclose(own.slowness(hall), always.slowness(hall), rtol=1e-3)
+@given(st.integers(0, 99), st.integers(-5, 5))
+def test_what_walls_govern_is_foretold_on_another_map(seed: int, level: int) -> None:
+    random = np.random.default_rng(seed)
+    features = rooms(seed)
+    log = by_clearance(features) + level + random.normal(0, 0.3, 600)
+    coefficients = regression(features, log, random.uniform(0.1, 0.2, 600), NOTHING)
+    assert share_foretold(coefficients, rooms(seed + 1)) > 0.75
 
 
-def test_places_unlike_all_known_ones_are_foretold_as_the_least_unlike() -> None:
-    unlike, most_unlike = np.full((2, FEATURES), [[1e3], [1e9]], dtype=np.float32)
-    assert some_prior().log_slowness(unlike) == some_prior().log_slowness(most_unlike)
-
-
-@pytest.mark.parametrize("name", Prior._fields)
-def test_what_is_no_prior_is_refused(name: str) -> None:
-    arrays = some_prior()._asdict()
-    bad = [
-        np.concatenate([np.atleast_1d(arrays[name])] * 2, axis=-1),
-        np.full_like(arrays[name], np.nan),
-        arrays[name].astype(complex),
-        np.array("prior"),
+def test_few_places_say_little_and_none_says_nothing() -> None:
+    features = rooms(0)
+    log = by_clearance(features)
+    shares = [
+        share_foretold(
+            regression(features[:count], log[:count], np.full(count, 0.1), NOTHING),
+            features,
+        )
+        for count in (0, 20, 600)
     ]
-    if name in (
-        "scale",
-        "replay",
-    ):  # neither a scale nor the weight of a place is negative
-        bad.append(-arrays[name])
-    for value in bad:
-        with pytest.raises(ValueError, match="cannot be true"):
-            Prior.from_arrays({**arrays, name: value})
-    with pytest.raises(ValueError, match="cannot be true"):
-        Prior.from_arrays({key: arrays[key] for key in arrays if key != name})
+    assert shares[0] == 0
+    assert shares == sorted(shares)
+
+
+def test_an_older_prior_helps_at_once_and_one_of_the_opposite_law_is_replaced() -> None:
+    features, truth = rooms(0), by_clearance(rooms(0))
+    weight = np.full(600, 0.15)
+    right = regression(features, truth, weight, NOTHING)
+    few, many = slice(0, 30), slice(0, 300)
+
+    def share(older: np.ndarray, part: slice) -> float:
+        learned = regression(features[part], truth[part], weight[part], older)
+        return share_foretold(learned, rooms(1))
+
+    assert share(right, few) > share(NOTHING, few)
+    assert share(-right, few) < share(NOTHING, few)
+    assert share(-right, many) > 0.8
+    assert share(-right, many) > share(NOTHING, many) - 0.05
+
+
+def walled() -> GridMap:
+    """A hall of which a wall divides the lower half into narrow lanes."""
+    occupancy = np.zeros((40, 120), dtype=np.bool_)
+    occupancy[20:40:4] = True
+    return GridMap(occupancy, 0.25)
+
+
+def test_where_narrow_lanes_were_slow_others_are_expected_to_be() -> None:
+    grid = walled()
+    lanes = [straight((1, y), (26, y), 4, rate=2) for y in (5.6, 6.6)]
+    open_ways = [straight((1, y), (26, y), rate=2) for y in (1.0, 2.0, 3.0)]
+    experience = driven(*[*lanes, *open_ways] * 2)
+    slowness = experience.slowness(grid)
+    assert at(grid, slowness, 14, 8.6) > 2
+    assert at(grid, slowness, 14, 4) < 1.5
+    on_another = driven()
+    on_another.prior = experience.prior_of(grid)
+    turned = GridMap(grid.occupancy.T, 0.25)
+    slowness = on_another.slowness(turned)
+    assert at(turned, slowness, 8.6, 14) > 1.4 * at(turned, slowness, 4, 14)
+    again = type(experience).from_bytes(on_another.to_bytes())
+    np.testing.assert_array_equal(again.prior, on_another.prior)
+
+
+@pytest.mark.parametrize(
+    "prior", [np.zeros(3), np.full(FEATURES, np.nan), ["a"] * FEATURES, 1e9]
+)
+def test_what_is_no_prior_is_refused(prior: object) -> None:
+    with pytest.raises(ValueError, match="prior"):
+        driven().prior = prior  # type: ignore[assignment]

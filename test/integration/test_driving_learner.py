@@ -53,32 +53,6 @@ def drive(driving: Driving, y: float, metres: float, speed: float = SPEED) -> No
     robot.recorder.end()
 
 
-def test_the_prior_is_trained_again_when_drives_have_shown_a_tenth_more_places(
-    driving: Driving, tmp_path: Path
-) -> None:
-    file = tmp_path / "experience.npz"
-
-    def is_trained() -> bool:
-        """Look for new places as the node does each second; training saves."""
-        before = file.stat().st_mtime_ns
-        wait_for_end(driving.train_prior())
-        return file.stat().st_mtime_ns > before
-
-    assert not is_trained()  # without a drive
-    drive(driving, y=5.0, metres=20.0)
-    assert is_trained()
-    assert not is_trained()
-    drive(driving, y=8.0, metres=1.5)
-    assert not is_trained()
-    drive(driving, y=11.0, metres=2.0)
-    assert is_trained()
-    assert not is_trained()
-    driving.forget()
-    assert not is_trained()
-    drive(driving, y=5.0, metres=2.0)
-    assert is_trained()
-
-
 def test_a_wrong_nominal_speed_is_warned_of_each_time_it_shows(
     driving: Driving, capfd: pytest.CaptureFixture[str]
 ) -> None:
