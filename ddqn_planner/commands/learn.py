@@ -142,10 +142,9 @@ def _read_drives(
             topic=options.topic,
             frame=options.frame,
             robot_frame=options.robot_frame,
+            on_damage=print,
         )
         print(f"{path}: {recording.source}")
-        for words in recording.damage:
-            print(words)
         drives += recording.drives
     return drives
 

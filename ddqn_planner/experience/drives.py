@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ddqn_planner.experience.evidence import FARTHEST
 from ddqn_planner.experience.experience import (
     EXPERIENCE,
     LATEST,
@@ -39,9 +40,12 @@ LOCK = "driving.lock"  # a folder with this file belongs to a robot's drives
 
 HEADER = b"episode,outcome,start_time,seconds,metres,samples\r\n"
 NUMBER = rb"-?\d{1,12}(?:\.\d{1,9})?"  # below `LATEST`
+SAMPLE = rb"%b:%b:%b" % ((NUMBER,) * 3)
+# One blank between samples: else a row could be divided in too many ways to try.
 ROW = re.compile(
-    rb"(?P<number>\d{1,18}),(?P<outcome>[a-z_]{1,20}),(?P<start>%b),%b,%b,"
-    rb"(?P<samples>(?:%b:%b:%b ?)+)\r\n" % ((NUMBER,) * 6)
+    rb"(?P<number>\d{1,18}),(?P<outcome>[a-z_]{1,20}),"
+    rb"(?P<start>%b),(?P<seconds>%b),(?P<metres>%b),(?P<samples>%b(?: %b)*)\r\n"
+    % (NUMBER, NUMBER, NUMBER, SAMPLE, SAMPLE)
 )
 
 # A sample is recorded this many metres, or seconds, after the last one.
@@ -55,6 +59,7 @@ SHORTEST = 0.5  # metres: a robot that went no farther away has not driven
 MOST_SAMPLES = 2000
 # Seconds back by which a clock begins anew: a bag loops, a simulator is reset.
 JUMP = 1.0
+ROUNDING = 0.002  # seconds: files have milliseconds
 # A drive's length joins means over so many seconds that lie so many metres apart.
 WINDOW = 0.5
 STEP = 0.25
@@ -132,21 +137,45 @@ class Drive(NamedTuple):
         return f"{columns}\r\n".encode()
 
 
-def read_drives(path: str | Path) -> Iterator[Drive]:
+def read_drives(
+    path: str | Path, on_refused: Callable[[str], object] = lambda reason: None
+) -> Iterator[Drive]:
     """Yield the drives of the ``episodes.csv`` at `path`.
 
-    Rows that are no drive are left out. An OSError says why the file cannot be read.
+    A row that is no drive that a recorder wrote is left out: `on_refused` is called
+    with the number of the row, and the reason. An OSError says why the file cannot be
+    read.
     """
-    outcomes = {end.value.encode(): end for end in DriveEnd}
-    for line in read_rows(as_path(path)):
-        row = ROW.fullmatch(line)
-        if row is None or row["outcome"] not in outcomes:
+    for number, line in enumerate(read_rows(as_path(path)), 1):
+        if line == HEADER:
             continue
-        numbers = [sample.split(b":") for sample in row["samples"].split()]
-        samples = np.array(numbers, dtype=np.float64)  # (N, 3): seconds, x, y
-        # The file has seconds from the start of the drive.
-        seconds = samples[:, 0] + float(row["start"])
-        yield Drive(outcomes[row["outcome"]], seconds, samples[:, 1:])
+        try:
+            yield _drive_in(line)
+        except ValueError as error:
+            on_refused(f"row {number} of {path} is left out: {error}")
+
+
+def _drive_in(line: bytes) -> Drive:
+    """Return the drive in a row of ``episodes.csv``; a ValueError if it has none."""
+    row = ROW.fullmatch(line)
+    if row is None:
+        raise ValueError("it is incomplete, or has other columns")
+    outcome = DriveEnd(row["outcome"].decode())
+    sample_count = row["samples"].count(b" ") + 1
+    if sample_count > MOST_SAMPLES:
+        raise ValueError(f"it has {sample_count} samples, more than {MOST_SAMPLES}")
+    numbers = [sample.split(b":") for sample in row["samples"].split(b" ")]
+    samples = np.array(numbers, dtype=np.float64)  # (N, 3): seconds, x, y
+    elapsed = samples[:, 0]  # (N,): from the start of the drive
+    seconds = float(row["seconds"])
+    if abs(elapsed[-1] - seconds) > ROUNDING:
+        raise ValueError(f"it takes {seconds:g} s, but ends after {elapsed[-1]:g} s")
+    if (np.diff(elapsed, prepend=0) < -JUMP).any():
+        raise ValueError("its times run backwards")
+    positions = samples[:, 1:]
+    if (np.abs(positions) > FARTHEST).any():
+        raise ValueError(f"it has positions beyond {FARTHEST:g} m")
+    return Drive(outcome, elapsed + float(row["start"]), positions)
 
 
 class DriveRecorder:

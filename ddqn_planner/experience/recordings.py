@@ -2,7 +2,7 @@
 
 import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from io import TextIOWrapper
 from pathlib import Path
 from typing import NamedTuple
@@ -34,7 +34,6 @@ class Recording(NamedTuple):
 
     source: str  # what the poses come from, in words
     drives: list[Drive]
-    damage: Sequence[str] = ()  # what could not be read, with the reasons
 
 
 def read_recording(
@@ -44,6 +43,7 @@ def read_recording(
     topic: str = "",
     frame: str = "map",
     robot_frame: str = "",
+    on_damage: Callable[[str], object] = lambda reason: None,
 ) -> Recording:
     """Return the drives that a recording on a map holds.
 
@@ -58,6 +58,8 @@ def read_recording(
         Of bags: the topic of poses or transforms, by default the one with most
         poses; the map's frame; and the robot's frame, by default any that ends in
         ``base_link``.
+    on_damage : function of a str
+        It is called with the reason for each part that cannot be read or believed.
 
     Raises
     ------
@@ -65,15 +67,16 @@ def read_recording(
         If nothing can be learned from the recording, with the reason.
     """
     if path.name == RECORD:
-        recording = Recording(RECORD, list(read_drives(path)))
+        recording = Recording(RECORD, list(read_drives(path, on_damage)))
     elif (path / RECORD).is_file():
-        recording = Recording(RECORD, list(read_drives(path / RECORD)))
+        recording = Recording(RECORD, list(read_drives(path / RECORD, on_damage)))
     elif path.suffix.lower() == ".csv":
         recording = _divided_into_drives(path, path.name, read_csv(path))
     else:
         poses = read_bag(path, topic, frame, robot_frame)
+        for reason in poses.damage:
+            on_damage(reason)
         recording = _divided_into_drives(path, poses.source, poses.samples)
-        recording = recording._replace(damage=poses.damage)
     if not recording.drives:
         raise ValueError(f"{path} holds no drive; drive on")
     _check_on_map(path, recording.drives, grid)

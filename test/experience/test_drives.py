@@ -6,11 +6,16 @@ import math
 import os
 from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import pytest
 from experience.straight_drives import straight
+from hypothesis import given
+from hypothesis import strategies as st
 from limits import files_no_longer_than
+from map_files import save_map
 
 from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience import ExperienceFileError
@@ -240,12 +245,23 @@ def test_a_row_that_a_crash_cut_is_left_out_and_the_others_stay(
         b"3,arrived,0.0,1.0,1.0,nan:1:1\r\n",
         b"3,flew,0.0,1.0,1.0,0:1:1 1:1:1\r\n",
         b"3,arrived,0.0,1.0,1.0,0:1:1 1:1:99999999999999999\r\n",
+        b"3,arrived,0.0,1.0,1.0,0:1:1 1:1:99999999999\r\n",
+        b"3,arrived,0.0,-9.0,1.0,0:1:1 -9:1:2\r\n",
+        b"3,arrived,0.0,1.0,1.0,0:1:1 900:1:2\r\n",  # a wait longer than the drive
+        b"3,arrived,0.0,1.0,1.0,0:1:1 9:1:2 1:1:2\r\n",
+        b"3,arrived,0.0,1.0,1.0," + b"0:1:1 " * 2000 + b"1:1:2\r\n",
+        # It could be divided into samples in 4**99 ways.
+        b"3,arrived,0.0,1.0,1.0,1111:1" + b":1111:1" * 99 + b"x\r\n",
         b"\xff\x00\r\n",
     ],
 )
 def test_a_row_of_something_else_is_left_out(tmp_path: Path, row: bytes) -> None:
     with record(tmp_path, 1).record_path.open("ab") as file:
         file.write(row + b"4,stopped,0.0,1.0,1.0,0:1:1 1:1:2\r\n")
+    refused: list[str] = []
+    assert len([*read_drives(tmp_path / "episodes.csv", refused.append)]) == 2
+    assert len(refused) == row.count(b"\n")
+    assert all("row 3 of " in reason for reason in refused[:1])
     assert recorded(tmp_path) == ["arrived", "stopped"]
     assert record(tmp_path, 1).drives == 5
     assert recorded(tmp_path) == ["arrived", "stopped", "arrived"]
@@ -336,3 +352,41 @@ def test_a_drive_knows_how_far_it_was_and_counts_no_noise() -> None:
         robot.recorder.add(now, *at)
     robot.recorder.end()
     assert robot.drives == []
+
+
+def test_forged_rows_are_named_and_leave_the_rest(tmp_path: Path, console: Any) -> None:
+    save_map(GRID, tmp_path / "map.yaml")
+    folder = record(tmp_path / "drives", 2)
+    with folder.record_path.open("ab") as file:
+        # 200 km in 40 s, and a clock that tells of more seconds than the drive has.
+        samples = b" ".join(b"%d:%d:5" % (t, 5000 * t) for t in range(41))
+        file.write(b"3,arrived,0.0,40.0,200000.0," + samples + b"\r\n")
+        file.write(b"4,arrived,0.0,1.0,1.0,0:1:1 1000000:1:2\r\n")
+    learn = "learn", folder.folder, "--map", tmp_path / "map.yaml"
+    printed = console(*learn, "--out", tmp_path / "new.npz").out
+    assert "row 5 of " in printed
+    assert "it takes 1 s, but ends after 1e+06 s" in printed
+    assert "drive 3 taught nothing: the robot moves at 5e+03 m/s" in printed
+    before = Experience.load(folder.experience_path)
+    after = Experience.load(tmp_path / "new.npz")
+    assert len(after.evidence.places) == pytest.approx(
+        len(before.evidence.places), rel=0.05
+    )
+
+
+DIGITS = st.sampled_from(["0", "1", "-7", "2.5", "40", "1e9", "nan", "999999999999"])
+FIELDS = st.sampled_from([",", ":", " ", "arrived", "aborted", "\r\n", "\n", ""])
+
+
+@given(st.lists(st.one_of(DIGITS, FIELDS), max_size=80).map("".join))
+def test_whatever_a_record_holds_its_drives_can_be_learned_from(text: str) -> None:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "episodes.csv"
+        path.write_bytes(b"1,arrived,0.0,1.0,1.0,0:1:1 1:1:2\r\n" + text.encode())
+        experience = Experience(0.5)
+        drives = list(read_drives(path))
+    assert drives
+    for drive in drives:
+        drive.teach(experience)
+        assert np.isfinite(drive.positions).all()
+    assert Experience.from_bytes(experience.to_bytes())
