@@ -7,7 +7,7 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TextIO
 
 from ddqn_planner.commands.options import (
     Option,
@@ -66,12 +66,7 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
         # With --json, the object alone goes to stdout.
         output = sys.stderr if options.json else sys.stdout
         print(training.description, file=output, flush=True)
-        curve_file = CurveFile(training.folder / CURVE, training.saved_at)
-        training.callback(curve_file.close)
-        record = TrainingRecord(training.trainer, earlier_curve=curve_file.earlier)
-        watcher = _Watcher(record, curve_file, _event_files(options, training))
-        train_with_bar(training, watcher)
-        watcher.finish()
+        record = _train_and_record(options, training)
     if options.json:
         print(json.dumps(_entries(options, training, record), allow_nan=False))
     else:
@@ -79,6 +74,23 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
     if not training.is_complete:
         print(stop_report(training), file=output, flush=True)
     # After the results: to draw takes seconds, which Ctrl-C may cut off.
+    _draw(options, record, output)
+    return exit_code_of(training)
+
+
+def _train_and_record(options: Namespace, training: "TrainingRun") -> TrainingRecord:
+    """Train, and return the record, which continues that of an earlier process."""
+    curve_file = CurveFile(training.folder / CURVE, training.saved_at)
+    training.callback(curve_file.close)
+    record = TrainingRecord(training.trainer, earlier_curve=curve_file.earlier)
+    watcher = _Watcher(record, curve_file, _event_files(options, training))
+    train_with_bar(training, watcher)
+    watcher.finish()
+    return record
+
+
+def _draw(options: Namespace, record: TrainingRecord, output: TextIO) -> None:
+    """Save the picture and the film that the options ask for; tell so on `output`."""
     if options.picture:
         record.save_picture(options.picture)
         print(f"saved {options.picture}", file=output)
@@ -86,7 +98,6 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
         print(f"drawing {len(record.snapshots)} frames", file=output, flush=True)
         record.save_film(options.film)
         print(f"saved {options.film}", file=output)
-    return exit_code_of(training)
 
 
 def _check_outputs(options: Namespace, map_file: MapFile) -> None:
