@@ -104,13 +104,17 @@ class PoseField(Field[Search]):
             aim=NOWHERE,
             world=world,
         )
-        goals = self.goals
-        goal_numbers = pose_space.number_of_state(
-            goals[:, 0], goals[:, 1], goals[:, 2], world
-        )
+        goal_numbers = self._goal_numbers()
         search.mark[goal_numbers] = wavefront.OPEN
         search.touched[goal_numbers >> pose_space.TILE_BITS] = True
         return search
+
+    def _goal_numbers(self) -> NDArray[np.int64]:
+        """Return the numbers of the goals' states, (N,)."""
+        x, y, heading = self.goals.T
+        numbers: NDArray[np.int64]
+        numbers = pose_space.number_of_state(x, y, heading, self.world)
+        return numbers
 
     @property
     def nbytes(self) -> int:
@@ -144,7 +148,7 @@ class PoseField(Field[Search]):
                     return None
                 if self._should_look_at_map():
                     has_no_path = self._proved_bound() == math.inf
-                    if has_no_path and not self._can_leave():
+                    if has_no_path and not self._may_reach_goal():
                         return math.inf
                     # Finer tiles give better lower bounds: a new round begins.
                     aim = self.known.aim
@@ -252,15 +256,22 @@ class PoseField(Field[Search]):
             return 1.0
         return cost / self._lower_bound if self._lower_bound > 0 else math.inf
 
-    def _can_leave(self) -> bool:
-        """Return whether primitives lead from the start to `UNGUIDED` states."""
+    def _may_reach_goal(self) -> bool:
+        """Return whether primitives lead from the start to a goal, or to many states.
+
+        The start may lie in a small closed room, with some of the goals or without any.
+        If primitives lead to `UNGUIDED` states, the search tells whether these have a
+        path.
+        """
         search = self.known
         start = search.aim.start_number
         # Not the field's own marks: these are of states to which the start leads.
         mark = _untouched(search.mark.size, np.uint8)
         queue = np.empty(UNGUIDED, np.int64)
         count = pose_space.count_reachable(start, mark, queue, self.world)
-        return bool(count == queue.size)
+        is_in_small_room = count < queue.size
+        is_goal_reached = (mark[self._goal_numbers()] == wavefront.OPEN).any()
+        return bool(is_goal_reached or not is_in_small_room)
 
     def with_look_at_map(self, aim: Aim, shift: int) -> Aim:
         """Return an aim with lower bounds of the cost to its start, found on tiles.
