@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
-import copy
-import io
 import math
 import reprlib
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
-from zlib import crc32
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ddqn_planner.experience.evidence import FARTHEST, Evidence
-from ddqn_planner.experience.places import NOISE, Float32, Float64, Int64
+from ddqn_planner.experience.evidence import Evidence
+from ddqn_planner.experience.experience_file import (
+    MAX_FILE_BYTES,
+    Content,
+    changes_from_bytes,
+    changes_to_bytes,
+    content_from_bytes,
+    content_to_bytes,
+)
+from ddqn_planner.experience.fleet import Change, Fleet, Version
+from ddqn_planner.experience.places import FARTHEST, Float32, Float64, Int64
 from ddqn_planner.experience.posterior import VARIANCE, Posterior
 from ddqn_planner.experience.prior import FEATURES
 from ddqn_planner.experience.visits import (
@@ -40,10 +46,6 @@ from ddqn_planner.grid.arguments import (
 from ddqn_planner.grid.grid_map import Exploration
 from ddqn_planner.grid.moves import cells_along
 
-MAX_FILE_BYTES = 2**27  # a larger file is refused before it is read
-VERSION = 4  # 2 was never released
-FIRST_VERSION = 1  # until 0.4.0
-LOG_VERSION = 3  # until 0.5.0, with the logarithms of slowness alone
 EXPERIENCE = "experience.npz"  # the name of the file in a folder
 SPEEDS = 0.001, 1000.0  # metres per second
 WIDTHS = 0.01, 100.0  # metres
@@ -55,11 +57,9 @@ OPTIONS = {
     "max_pause": (0.1, 1e6, "seconds"),
 }
 
-LEAST_WEIGHT = 1e-9  # of places of old files: others have the log slowness 0
-LOG_RANGE = -math.log(MAX_SLOWNESS), math.log(MAX_SLOWNESS)
-
 MOST_OF_PRIOR = 1e3  # of a coefficient: no map is so slow
-
+LONGEST_NAME = 100  # characters
+RECENT_CHANGES = 64  # that `changes_since` remembers
 LATEST = 1e12  # seconds of a clock: a pose of a later time is not believed
 # Times the nominal speed: a robot that usually drives faster is not believed.
 MAX_MEDIAN_FACTOR = 4.0
@@ -120,6 +120,10 @@ class Experience:
         Seconds of driving, 1 to 1e12, after which evidence counts half.
     max_pause : float
         Seconds, 0.1 to 1e6. A longer stand is no wait on the way, and is left out.
+    robot : str
+        A name of the robot whose drives are recorded, for people. Two experiences are
+        of two robots, also if both have the same name or none; but copies, as of a
+        file, are of one robot.
 
     Examples
     --------
@@ -146,6 +150,7 @@ class Experience:
         robot_width: float = 0.5,
         half_life: float = 36_000.0,
         max_pause: float = 90.0,
+        robot: str = "",
     ) -> None:
         """Begin without evidence.
 
@@ -157,22 +162,40 @@ class Experience:
         self.robot_width = _as_option("robot_width", robot_width)
         self.half_life = _as_option("half_life", half_life)
         self.max_pause = _as_option("max_pause", max_pause)
-        self.evidence = Evidence(self.nominal_speed, self.robot_width, self.half_life)
-        # The file in which this experience was saved or from which it was loaded, and
-        # the checksum of its content then.
+        self.evidence = Evidence(
+            self.nominal_speed, self.robot_width, self.half_life, _as_name(robot)
+        )
+        # The file in which this experience was saved or from which it was loaded, the
+        # evidence that the file had of each robot then, and the changes since then.
         self._saved_path: Path | None = None
-        self._saved_checksum = 0
-        # All that was learned since then: functions that change evidence.
-        self._unsaved: list[Callable[[Evidence], None]] = []
+        self._saved_versions: dict[str, Version] = {}
+        self._unsaved: list[Change] = []
+        # The last changes, each with the state of the fleet before.
+        self._recent = deque[tuple[int, Change]](maxlen=RECENT_CHANGES)
+
+    @property
+    def robot(self) -> str:
+        """The name of the robot whose drives are recorded."""
+        return self._fleet.own.robot
+
+    @property
+    def _fleet(self) -> Fleet:
+        return self.evidence.fleet
 
     @property
     def options(self) -> dict[str, float]:
-        """The parameters of `__init__` by their names, in the order of OPTIONS."""
+        """The numbers that `__init__` takes, by name, in the order of OPTIONS."""
         return {name: getattr(self, name) for name in OPTIONS}
 
     def forget(self) -> None:
-        """Forget all that was learned."""
-        self._learn(Evidence.forget)
+        """Forget all that was learned.
+
+        The evidence of this robot is forgotten wherever this experience is merged. The
+        evidence of another robot returns if it is merged again.
+        """
+        self.evidence.forget()
+        self._unsaved = []
+        self._recent.clear()
 
     def record(self, seconds: ArrayLike, positions: ArrayLike) -> Learned:
         """Learn from a drive, or a part of one.
@@ -221,7 +244,7 @@ class Experience:
         if fastest < self.nominal_speed / MAX_SLOWNESS:
             reason = self._wrong_speed(fastest, "at most at", "less")
             return Learned(0, 0.0, reason, is_possible=False)
-        self._learn(partial(Evidence.add, visits=visits))
+        self._learn(visits)
         return Learned(places, visits.total_seconds)
 
     def _why_nothing(self, poses: Poses, count: int) -> str:
@@ -287,23 +310,27 @@ class Experience:
         )
         x, y = point.tolist()
         visits = Visits.of_wait(x, y, self.max_pause)
-        self._learn(partial(Evidence.add, visits=visits))
+        self._learn(visits)
 
-    def _learn(self, change: Callable[[Evidence], None]) -> None:
-        """Change the evidence, and remember the change for the next `save`.
+    def _learn(self, visits: Visits) -> None:
+        """Add visits to the evidence, and remember the change.
 
-        `change` is a function that changes evidence. If another process has saved to
-        the same file meanwhile, `save` applies the change to what that process saved.
+        If another process saves to the same file, `save` needs the changes; messages
+        to others tell of them, too.
         """
-        change(self.evidence)
+        state = self.state
+        change = self.evidence.add(visits)
+        self._recent.append((state, change))
         if self._saved_path is not None:
             self._unsaved.append(change)
 
     def merge(self, other: Experience) -> None:
-        """Learn all that another experience of a robot of this kind has learned.
+        """Take what another experience knows of each robot, where that is newer.
 
-        The experience `other` is copied. Merge each experience once: what is merged
-        twice counts twice.
+        So the evidence of all robots counts, and each drive counts once: it does not
+        matter how often, in which order and over which other robots experience is
+        merged. If two copies of one robot's experience were continued, the one with
+        more drives counts.
 
         Raises
         ------
@@ -311,8 +338,9 @@ class Experience:
             If the two experiences have different parameters.
         """
         self._check_kind(other)
-        # The other experience may learn more before this change is saved.
-        self._learn(partial(Evidence.merge, other=copy.deepcopy(other.evidence)))
+        self._fleet.merge(other.evidence.fleet.members)
+        self.evidence.sum_up()
+        self._recent.clear()
 
     def _check_kind(self, other: Experience) -> None:
         """Raise a ValueError unless another experience has the same parameters."""
@@ -346,7 +374,7 @@ class Experience:
         It counts as far as it predicts the places that were driven since. Zeros say
         nothing; a ValueError if it is set to anything but seven finite numbers.
         """
-        return self.evidence.prior
+        return self._fleet.prior
 
     @prior.setter
     def prior(self, prior: ArrayLike) -> None:
@@ -358,7 +386,9 @@ class Experience:
             whole=False,
             remedy="what `prior_of` returns",
         )
-        self._learn(partial(Evidence.use_prior, prior=coefficients.astype(np.float64)))
+        own = self._fleet.own
+        self._fleet.own = own.with_prior(coefficients.astype(np.float64))
+        self._recent.clear()
 
     def prior_of(self, grid: GridMap) -> Float64:
         """Return the prior that the places driven on a map give other maps: (7,)."""
@@ -522,8 +552,8 @@ class Experience:
     def save(self, path: str | Path) -> None:
         """Save to the file at `path`; an OSError leaves an old file unchanged.
 
-        What other processes have saved to the file is kept: their evidence is joined
-        with that of this experience. Delete the file to begin anew.
+        What other processes have saved to the file is merged with this experience.
+        Delete the file to begin anew.
 
         Raises
         ------
@@ -534,48 +564,87 @@ class Experience:
         with locked(path):
             if path.exists():
                 self._join_content_of(path)
-            content = self.to_bytes()
-            write_atomically(path, content)
+            write_atomically(path, self.to_bytes())
+        self._remember_saved(path)
+
+    def _remember_saved(self, path: Path) -> None:
+        """Remember that the file at `path` holds this experience."""
         self._saved_path = path
-        self._saved_checksum = crc32(content)
+        self._saved_versions = self._fleet.versions
         self._unsaved = []
 
     def _join_content_of(self, path: Path) -> None:
-        """Replace the evidence by that of a file, joined with what was learned here.
+        """Merge what other processes have saved to a file.
 
         If this experience was last saved to the file at `path` or loaded from it, only
-        what was learned since then is joined; with any other file, all evidence is.
-        Nothing changes if no other process has saved to the file since.
+        evidence that is newer than the file's evidence then is merged. So what was
+        forgotten since does not return.
         """
-        checksum = crc32(read_file(path, MAX_FILE_BYTES))
-        is_own_file = path == self._saved_path
-        if is_own_file and checksum == self._saved_checksum:
-            return  # nobody else has saved to the file
         saved = Experience.load(path)
         saved._check_kind(self)
-        if is_own_file:
-            for change in self._unsaved:
-                change(saved.evidence)
-        else:
-            saved.merge(self)
-        saved.take_posterior_from(self)
-        self.evidence = saved.evidence
+        known_versions = self._saved_versions if path == self._saved_path else {}
+        news = [
+            evidence
+            for evidence in saved.evidence.fleet.members
+            if evidence.version != known_versions.get(evidence.identity)
+        ]
+        if not news:
+            return
+        own = self._fleet.own.identity
+        was_continued = any(evidence.identity == own for evidence in news)
+        if was_continued and own in known_versions and self._unsaved:
+            # Two processes have continued the same evidence.
+            self._fleet.separate(self._unsaved)
+        self._fleet.merge(news)
+        self.evidence.sum_up()
+        self._recent.clear()
+
+    @property
+    def state(self) -> int:
+        """A checksum of the evidence, equal where the same evidence is known."""
+        return self._fleet.state
+
+    def changes_since(self, state: int) -> bytes | None:
+        """Return the changes since a state, for `apply_changes` of a copy.
+
+        None if they are not known: then the copy needs `to_bytes`. That is so if too
+        much was changed, or if anything was merged or forgotten.
+        """
+        if state == self.state:
+            return changes_to_bytes(state, [])
+        states = [before for before, _ in self._recent]
+        if state not in states:
+            return None
+        changes = [change for _, change in self._recent]
+        return changes_to_bytes(state, changes[states.index(state) :])
+
+    def apply_changes(self, data: bytes) -> bool:
+        """Change this copy of an experience as `changes_since` tells.
+
+        Returns whether that was possible; False if changes before these are missing.
+
+        Raises
+        ------
+        ExperienceFileError
+            If the bytes are broken, or no changes.
+        """
+        try:
+            state, changes = changes_from_bytes(data, self.evidence.side)
+        except Exception as error:  # of many kinds
+            raise ExperienceFileError(f"no changes of experience: {error}") from error
+        if state != self.state:
+            return False
+        for change in changes:
+            self._fleet.add(change)
+        self.evidence.sum_up()
+        return True
 
     def to_bytes(self) -> bytes:
         """Return all that was learned as bytes, an .npz file of named arrays."""
-        evidence = self.evidence
-        arrays: dict[str, Any] = {
-            "version": VERSION,
-            "options": list(self.options.values()),
-            "evidence": evidence.places.table(),  # (N, 8)
-            "driven": evidence.driven,  # seconds
-            "errors": evidence.errors,  # (D,): of the last D drives, as the surprises
-            "surprises": evidence.surprises,
-            "prior": evidence.prior,  # (FEATURES,)
-        }
-        content = io.BytesIO()
-        np.savez(content, **arrays)
-        return content.getvalue()
+        own = self._fleet.own
+        others = [robot for robot in self._fleet.members if robot is not own]
+        options = list(self.options.values())
+        return content_to_bytes(Content(options, [own, *others]))
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Experience:
@@ -586,37 +655,17 @@ class Experience:
         ExperienceFileError
             If the bytes are broken, or no experience.
         """
-        # Broken bytes make zipfile and NumPy raise many kinds of errors.
         try:
-            return cls._from_arrays(_arrays_in(data))
-        except Exception as error:
+            content = content_from_bytes(data)
+            options = dict(zip(OPTIONS, content.options, strict=True))
+            experience = cls(**options)
+        except Exception as error:  # of many kinds
             raise ExperienceFileError(f"no experience: {error}") from error
-
-    @classmethod
-    def _from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Experience:
-        """Return the experience that a file holds.
-
-        `arrays` are those of the file, by name. A ValueError, KeyError or TypeError if
-        they cannot be those of an experience.
-        """
-        version = int(arrays["version"])
-        if version not in (FIRST_VERSION, LOG_VERSION, VERSION):
-            raise ValueError(f"it has version {version}, not {VERSION}")
-        options = dict(zip(OPTIONS, arrays["options"].tolist(), strict=True))
-        experience = cls(**options)
-        table = arrays["evidence"].astype(np.float64)
-        driven = arrays["driven"].astype(np.float64)
-        if version == FIRST_VERSION:
-            table = _without_dates(table, float(driven), experience.half_life)
-        if version != VERSION:
-            table = _with_sums(table)
-        # The first files have neither errors nor surprises.
-        nothing = np.zeros(0)
-        errors = arrays.get("errors", nothing).astype(np.float64)
-        surprises = arrays.get("surprises", nothing).astype(np.float64)
-        experience.evidence.restore(table, driven, errors, surprises)
-        # Older files have no prior, or a network, which is left out.
-        experience.prior = arrays.get("prior", np.zeros(FEATURES))
+        own, *others = content.members
+        evidence = experience.evidence
+        evidence.fleet = Fleet(own)
+        evidence.fleet.merge(others)
+        evidence.sum_up()
         return experience
 
     @classmethod
@@ -639,8 +688,7 @@ class Experience:
                 f"{path}: cannot be read ({reason}); give a file that "
                 "`Experience.save` wrote, or delete it to begin anew"
             ) from error
-        experience._saved_path = path.absolute()
-        experience._saved_checksum = crc32(content)
+        experience._remember_saved(path.absolute())
         return experience
 
 
@@ -648,6 +696,14 @@ def _as_option(name: str, value: Any) -> float:
     """Return the value of one of the OPTIONS; a ValueError if it is out of range."""
     lowest, highest, unit = OPTIONS[name]
     return as_number(name, value, lowest, highest, f"{unit}, {lowest:g} to {highest:g}")
+
+
+def _as_name(robot: str) -> str:
+    """Return the name of a robot; a ValueError if it is no name."""
+    if not isinstance(robot, str) or len(robot) > LONGEST_NAME:
+        remedy = f"give a name of up to {LONGEST_NAME} characters, or ''"
+        raise ValueError(f"robot is {reprlib.repr(robot)}; {remedy}")
+    return robot
 
 
 def _possible(time: Float64, position: Float64) -> Poses:
@@ -664,57 +720,3 @@ def _possible(time: Float64, position: Float64) -> Poses:
     position = position[is_possible]
     is_new = np.diff(time, prepend=np.nan) != 0
     return Poses(time[is_new], position[is_new])
-
-
-def _arrays_in(data: bytes) -> dict[str, NDArray[Any]]:
-    """Return the arrays in the bytes of an .npz file, by name; nothing is unpickled."""
-    with np.lib.npyio.NpzFile(io.BytesIO(data)) as file:
-        # A small file can claim arrays of any size.
-        size = sum(entry.file_size for entry in file.zip.infolist())
-        if size > MAX_FILE_BYTES:
-            raise ValueError(f"it unpacks to {size} bytes, over {MAX_FILE_BYTES}")
-        return dict(file)
-
-
-def _without_dates(table: Float64, driven: float, half_life: float) -> Float64:
-    """Return the table of a file of version 1 as one of version 3, (N, 7).
-
-    Parameters
-    ----------
-    table : (N, 6) float64
-        The columns are weight, sum of the log slowness, failures, x, y, and the seconds
-        that were driven before the last visit.
-    driven, half_life : float
-        Seconds.
-    """
-    weight = table[:, 0]
-    sum_of_log = table[:, 1]
-    driven_before = table[:, 5]
-    half_lives = (driven - driven_before) / half_life  # since the last visit
-    remaining = 0.5**half_lives
-    nothing = np.zeros((len(table), 3))  # no passages, waits and predictions
-    return np.column_stack(
-        [weight * remaining, sum_of_log * remaining, nothing, table[:, 3:5]]
-    )
-
-
-def _with_sums(table: Float64) -> Float64:
-    """Return the table of a file of version 3 as a table of today, (N, 8).
-
-    Its visits are assumed to differ by NOISE, and to have passed where robots wait.
-
-    Parameters
-    ----------
-    table : (N, 7) float64
-        The columns are weight, sum of the log slowness, the weight of passages since a
-        robot first waited near, the seconds waited, a prediction, and x and y.
-    """
-    weight, sum_of_log, passages, waited, _, x, y = table.T
-    mean_log = sum_of_log / np.maximum(weight, LEAST_WEIGHT)
-    # The mean of a lognormal, and the squares that give the variance NOISE.
-    slowness = np.exp(np.clip(mean_log, *LOG_RANGE) + NOISE / 2)
-    variance = NOISE * np.maximum(weight - 1, 0)
-    squares = sum_of_log * mean_log + variance
-    most_passages = np.maximum(passages, weight)
-    columns = weight, weight * slowness, sum_of_log, squares, most_passages, waited
-    return np.column_stack([*columns, x, y])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,9 @@ from numpy.typing import NDArray
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
+UInt8 = NDArray[np.uint8]
 
 # The variance of the log slowness of one visit, assumed from so many visits of all
 # places; and the visits of a place from which the variance of all is assumed there.
@@ -36,7 +39,12 @@ SUMS = (
     "passages",
     "waited",
 )
-COLUMNS = len(SUMS) + 2  # of the table in which files hold places
+# Metres from the origin of the map. A place farther away is not believed.
+FARTHEST = 1e7
+MOST_PASSAGES = 50.0  # a wait is the mean over about so many passages
+OFFSETS = 256  # steps of a position within its square
+NO_ROW = -1  # in arrays of rows: a square that was not seen
+NO_KEY = np.iinfo(np.int64).min  # of no square
 
 
 class Levels(NamedTuple):
@@ -46,9 +54,9 @@ class Levels(NamedTuple):
     fastest_log: float
 
 
-@dataclass
-class Places:
-    """Sums of what was seen at N places; all but the positions fade with time."""
+@dataclass(frozen=True)
+class Sums:
+    """Sums of what was seen at N places, which fade with time."""
 
     # (N,): the sum of the weights of all visits; a visit of a side's length weighs 1
     weight: Float64
@@ -59,55 +67,13 @@ class Places:
     # (N,): the weight of the visits of drives that neither began nor ended there
     passages: Float64
     waited: Float64  # (N,): seconds that robots stood in these passages
-    position: Float64  # (N, 2): x and y of the first visit, metres
 
-    @classmethod
-    def none(cls) -> Places:
-        """Return no places."""
-        return cls.from_table(np.zeros((0, COLUMNS)))
-
-    @classmethod
-    def from_table(cls, table: Float64) -> Places:
-        """Return the places in the rows of a table, (N, 8): the columns of `table`."""
-        columns = table.T.copy()
-        sums = dict(zip(SUMS, columns[:-2], strict=True))
-        return cls(**sums, position=np.ascontiguousarray(columns[-2:].T))
-
-    def table(self) -> Float64:
-        """Return the places as the rows of a table, (N, 8), which files hold.
-
-        The columns are those of SUMS, and x and y of the first visit, in metres.
-        """
-        return np.column_stack([*self.sums(), self.position])
-
-    def sums(self) -> tuple[Float64, ...]:
-        """Return what fades with time: an array (N,) for each name in SUMS."""
-        return tuple(getattr(self, name) for name in SUMS)
+    def sums(self) -> dict[str, Float64]:
+        """Return the sums by their names, in the order of SUMS: (N,) each."""
+        return {name: getattr(self, name) for name in SUMS}
 
     def __len__(self) -> int:
         return len(self.weight)
-
-    def append(self, position: Float64) -> None:
-        """Add M places that were not seen yet, with sums of 0.
-
-        `position` is (M, 2), x and y of the first visit, in metres.
-        """
-        for name, values in zip(SUMS, self.sums(), strict=True):
-            setattr(self, name, np.append(values, np.zeros(len(position))))
-        self.position = np.concatenate([self.position, position])
-
-    def add(self, rows: Int64, other: Places) -> None:
-        """Add the sums of M other places to those in some rows, (M,).
-
-        A row may be there several times.
-        """
-        for values, more in zip(self.sums(), other.sums(), strict=True):
-            np.add.at(values, rows, more)
-
-    def fade(self, share: float) -> None:
-        """Multiply all sums of what was seen with `share`, 0 to 1."""
-        for values in self.sums():
-            values *= share
 
     def is_known(self) -> NDArray[np.bool_]:
         """Return of which places enough was seen: (N,)."""
@@ -152,3 +118,131 @@ class Places:
             return Levels(0.0, 0.0)
         open_log, fastest_log = np.quantile(log, (OPEN_QUANTILE, FASTEST_QUANTILE))
         return Levels(float(open_log), float(fastest_log))
+
+
+@dataclass(frozen=True)
+class Places(Sums):
+    """Sums of what was seen at N squares of the world, in the order of the squares.
+
+    The sums are rounded to float32, as files hold them.
+    """
+
+    side: float  # of a place, metres
+    square: Int32  # (N, 2): x and y of each place, in sides of a place
+    # (N, 2): where in its square a robot first passed, in steps of 1 / OFFSETS of it
+    offset: UInt8
+
+    @classmethod
+    def none(cls, side: float) -> Places:
+        """Return no places; `side` is that of a place, metres."""
+        return cls.at(np.zeros((0, 2)), side)
+
+    @classmethod
+    def at(cls, position: Float64, side: float, **sums: Float64) -> Places:
+        """Return the places at M positions, which may be several times in a square.
+
+        Parameters
+        ----------
+        position : (M, 2) float64
+            x and y, metres.
+        side : float
+            Of a place, metres.
+        **sums : (M,) float64
+            Those of SUMS by their names; sums that are not given are 0.
+        """
+        square = squares_at(position, side)
+        in_square = position / side - square  # (M, 2): 0 to 1
+        offset = np.clip(in_square * OFFSETS, 0, OFFSETS - 1).astype(np.uint8)
+        nothing = np.zeros(len(position))
+        columns = {name: sums.get(name, nothing) for name in SUMS}
+        return _united(cls(**columns, side=side, square=square, offset=offset))
+
+    @classmethod
+    def summed(cls, parts: Sequence[Places]) -> Places:
+        """Return the sums over one or more parts, as over what several drives showed.
+
+        All parts have the same side. The position of a place is that of its first part.
+        """
+        filled = [part for part in parts if len(part)]
+        if len(filled) <= 1:
+            return filled[0] if filled else parts[0]
+        columns = {
+            name: np.concatenate([getattr(part, name) for part in filled])
+            for name in ("square", "offset", *SUMS)
+        }
+        return _united(cls(**columns, side=parts[0].side))
+
+    @property
+    def position(self) -> Float64:
+        """Where a robot first passed each place: x and y, (N, 2) metres."""
+        in_square = (self.offset + 0.5) / OFFSETS
+        position: Float64 = (self.square + in_square) * self.side
+        return position
+
+    def are_in_order(self) -> bool:
+        """Return whether the places stand in the order of their squares, each once."""
+        return bool((np.diff(_keys(self.square)) > 0).all())
+
+    def rows_of(self, square: Int32) -> Int64:
+        """Return the row of each square (M, 2): (M,), NO_ROW for squares not seen."""
+        keys = _keys(self.square)
+        keys_wanted = _keys(square)
+        rows = np.searchsorted(keys, keys_wanted)
+        # A square that is greater than all others has no row.
+        in_table = np.append(keys, NO_KEY)[rows] == keys_wanted
+        return np.where(in_table, rows, NO_ROW)
+
+    def faded(self, share: float) -> Places:
+        """Return the places with all sums multiplied with `share`, 0 to 1."""
+        if share == 1:
+            return self
+        if share == 0:
+            return Places.none(self.side)
+        sums = {name: _rounded(values * share) for name, values in self.sums().items()}
+        return replace(self, **sums)
+
+    def with_few_passages(self) -> Places:
+        """Return the places with at most MOST_PASSAGES, so that the last count most.
+
+        The mean wait stays: the seconds waited shrink as the passages do.
+        """
+        excess = np.maximum(self.passages / MOST_PASSAGES, 1)  # (N,): 1: not too many
+        passages = _rounded(self.passages / excess)
+        return replace(self, passages=passages, waited=_rounded(self.waited / excess))
+
+
+def squares_at(position: Float64, side: float) -> Int32:
+    """Return the squares of positions (M, 2), metres: x and y in sides, (M, 2)."""
+    return np.floor(position / side).astype(np.int32)
+
+
+def _united(places: Places) -> Places:
+    """Return places in the order of their squares, where each square stands once.
+
+    The sums of a square that stands there several times are added.
+    """
+    _, first, row = np.unique(
+        _keys(places.square), return_index=True, return_inverse=True
+    )
+    count = len(first)
+    sums = {
+        name: _rounded(np.bincount(row, values, count))
+        for name, values in places.sums().items()
+    }
+    return Places(
+        **sums,
+        side=places.side,
+        square=places.square[first],
+        offset=places.offset[first],
+    )
+
+
+def _keys(square: Int32) -> Int64:
+    """Return a number for each square (N, 2), in the order of x and then y: (N,)."""
+    wide = square.astype(np.int64)
+    return (wide[:, 0] << 32) + wide[:, 1]
+
+
+def _rounded(values: Float64) -> Float64:
+    """Return values rounded to float32, so that files hold them as they are."""
+    return values.astype(np.float32).astype(np.float64)

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place
 from ddqn_planner.experience.places import (
-    COLUMNS,
     NOISE,
     OPEN_QUANTILE,
     SURE_PLACES,
@@ -18,6 +17,7 @@ from ddqn_planner.experience.places import (
     Float64,
     Int64,
     Places,
+    Sums,
 )
 from ddqn_planner.experience.prior import FEATURES, map_features, regression
 from ddqn_planner.grid import GridMap
@@ -205,7 +205,7 @@ class Posterior:
             self.slowness += self.nominal_speed * self._waits(sums)
 
     def _regression(
-        self, sums: Places, log: Float64, noise: Float64, prior: Float64
+        self, sums: Sums, log: Float64, noise: Float64, prior: Float64
     ) -> Float64:
         """Return by how much features of this map raise the log slowness: (FEATURES,).
 
@@ -217,7 +217,7 @@ class Posterior:
         weight = 1 / (1 / VARIANCE + 1 / visits) / ALIKE_PLACES
         return regression(self._features[driven], log[driven], weight, prior)
 
-    def _sums_of(self, places: Places) -> Places:
+    def _sums_of(self, places: Places) -> Sums:
         """Return what was seen at each of the map's P places.
 
         `places` are N squares of the world, aligned with the axes of its frame. The
@@ -227,9 +227,14 @@ class Posterior:
         """
         nearest_place = self.places_at(places.position)  # (N,)
         is_on_map = nearest_place != NO_PLACE
-        table = np.zeros((len(self._middle_cells), COLUMNS))  # (P, COLUMNS)
-        np.add.at(table, nearest_place[is_on_map], places.table()[is_on_map])
-        return Places.from_table(table)
+        place_of_square = nearest_place[is_on_map]  # (M,)
+        count = len(self._middle_cells)  # P
+        # Without any square on the map, `bincount` returns integers.
+        columns = {
+            name: np.bincount(place_of_square, values[is_on_map], count).astype(float)
+            for name, values in places.sums().items()
+        }
+        return Sums(**columns)
 
     def _solve(self, visits: Float64, log: Float64) -> None:
         """Solve the equations of the Gaussian Markov random field over the P places.
@@ -267,7 +272,7 @@ class Posterior:
         )
         _relax(equations, right, self._solution)
 
-    def _waits(self, sums: Places) -> Float64:
+    def _waits(self, sums: Sums) -> Float64:
         """Return the seconds that a robot waits per metre through each place: (P,).
 
         They are the mean seconds of a passage, with some passages without a wait
