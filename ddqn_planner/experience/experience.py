@@ -610,8 +610,6 @@ class Experience:
         None if they are not known: then the copy needs `to_bytes`. That is so if too
         much was changed, or if anything was merged or forgotten.
         """
-        if state == self.state:
-            return changes_to_bytes(state, [])
         states = [before for before, _ in self._recent]
         if state not in states:
             return None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import pickle
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ def test_without_drives_every_place_takes_its_nominal_time() -> None:
         experience.record(
             *straight((9, 5), (4, 6), 2)
         )  # as if there had been no drive before
-    assert forgotten.to_bytes() == experience.to_bytes()
+    np.testing.assert_array_equal(forgotten.slowness(HALL), experience.slowness(HALL))
 
 
 @given(
@@ -354,27 +355,40 @@ def test_every_broken_file_is_named(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
+    ("name", "change"),
     [
-        ("version", 5),
-        ("options", [0.5, -1.0, 900.0, 45.0]),
-        ("evidence", np.full((39, 8), np.nan)),
-        ("driven", np.zeros(2)),
-        ("driven", np.array("a")),
-        ("driven", -1.0),
-        # No sum but that of logarithms is negative.
-        *[("evidence", -np.eye(1, 8, column)) for column in (0, 1, 3, 4, 5)],
-        ("evidence", np.zeros((39, 5))),
-        ("evidence", np.zeros((39, 8))),
-        ("evidence", np.full((1, 8), 1e9)),
-        ("surprises", [math.nan]),
-        ("errors", np.array([print], dtype=object)),  # nothing is unpickled
+        ("version", lambda value: value + 1),
+        ("options", lambda value: value * [1, -1, 1, 1]),
+        ("robots", lambda value: np.append(value, "another")),
+        ("identities", lambda value: np.append(value, value)),
+        ("versions", lambda value: -value),
+        ("driven", lambda value: -value),
+        ("driven", lambda value: value.astype(np.str_)),
+        ("driven", lambda value: value * math.nan),
+        ("faded", lambda value: value - 1),
+        ("faded", lambda value: value + math.inf),
+        ("priors", lambda value: value[:, 1:]),
+        ("priors", lambda value: value * math.nan),
+        ("counts", lambda value: value + 1),
+        ("counts", lambda value: -value),
+        ("squares", lambda value: value[:, 1:]),
+        ("squares", lambda value: value * 0),  # all places are one
+        ("squares", lambda value: value * 10**7),
+        ("offsets", lambda value: value[:, 1:]),
+        ("sums", lambda value: -value),
+        ("sums", lambda value: value[1:]),
+        ("sums", lambda value: value * math.nan),
+        ("surprises", lambda value: value.reshape(1, -1)),
+        # Nothing is unpickled.
+        ("errors", lambda value: np.array([print], dtype=object)),
     ],
 )
-def test_a_wrong_value_is_refused(path: Path, name: str, value: object) -> None:
+def test_a_wrong_value_is_refused(
+    path: Path, name: str, change: Callable[[np.ndarray], np.ndarray]
+) -> None:
     with np.load(path) as arrays:
         values = dict(arrays)
-    np.savez(path, **{**values, name: value}, allow_pickle=True)
+    np.savez(path, **{**values, name: change(values[name])}, allow_pickle=True)
     with pytest.raises(ExperienceFileError):
         Experience.load(path)
 
@@ -421,31 +435,26 @@ def test_what_was_merged_is_as_if_one_robot_had_driven_all() -> None:
     np.testing.assert_allclose(one.slowness(HALL), together.slowness(HALL), rtol=0.25)
 
 
-def test_one_that_knows_nothing_knows_all_of_another_after_a_merge() -> None:
-    other = Experience(SPEED)
-    for slowness in (1, 2, 1, 3):
-        other.apply(HALL)  # with a map, drives tell how sure expected times are
-        other.record(*straight((2, 5), (12, 5), slowness))
-    assert other.evidence.errors
-    assert other.evidence.surprises
-    one = Experience(SPEED)
-    one.merge(other)
-    assert one.to_bytes() == other.to_bytes()
-
-
-def test_a_file_of_an_older_version_is_read(path: Path) -> None:
-    with np.load(path) as arrays:
-        old = dict(arrays)
-    weight, _, log, _, passages, waited, x, y = old["evidence"].T
+def test_a_file_of_an_older_version_is_of_one_robot_also_if_it_is_copied(
+    path: Path,
+) -> None:
+    loaded = Experience.load(path)
+    places = loaded.evidence.places
+    weight, log, nothing = places.weight, places.sum_of_log, 0 * places.weight
+    x, y = places.position.T
     tables = {  # with failures, and when each place was visited; with predictions
-        1: (weight, log, weight * 9, x, y, 0 * weight),
-        3: (weight, log, passages, waited, 0 * weight, x, y),
+        1: (weight, log, weight * 9, x, y, nothing),
+        3: (weight, log, places.passages, places.waited, nothing, x, y),
     }
+    options = list(loaded.options.values())
     for version, columns in tables.items():
         evidence = np.column_stack(columns)
-        np.savez(path, **{**old, "evidence": evidence, "version": version})
-        slowness = Experience.load(path).slowness(HALL)
+        np.savez(path, version=version, options=options, evidence=evidence, driven=60.0)
+        old, copy = Experience.load(path), Experience.load(path)
+        slowness = old.slowness(HALL)
         assert at(HALL, slowness, 7, 5) == pytest.approx(3, rel=0.15)
+        old.merge(copy)
+        np.testing.assert_array_equal(old.slowness(HALL), slowness)
 
 
 def test_a_file_with_directions_of_slowness_loads_without_them(tmp_path: Path) -> None:
@@ -548,7 +557,7 @@ def test_what_another_learns_after_a_merge_is_not_merged(tmp_path: Path) -> None
     one.save(file)  # joins the changes of both
     expected = driven(straight((2, 2), (12, 2)), straight((2, 3), (12, 3)))
     expected.merge(driven(straight((2, 5), (12, 5), 2)))
-    assert one.to_bytes() == expected.to_bytes()
+    np.testing.assert_allclose(one.slowness(HALL), expected.slowness(HALL), rtol=0.021)
 
 
 def test_each_save_adds_to_the_file_what_is_new_alone(tmp_path: Path) -> None:
@@ -567,5 +576,5 @@ def test_each_save_adds_to_the_file_what_is_new_alone(tmp_path: Path) -> None:
     expected = driven(first, second, third, fourth)
     for measured in ("slowness", "uncertainty"):
         np.testing.assert_allclose(
-            getattr(one, measured)(HALL), getattr(expected, measured)(HALL), rtol=1e-6
+            getattr(one, measured)(HALL), getattr(expected, measured)(HALL), rtol=0.01
         )
