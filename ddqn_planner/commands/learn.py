@@ -89,7 +89,7 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
     recordings = {f"the recording {path}": path for path in options.drives}
     check_distinct({"--out": out}, {**recordings, **files_of(map_file)})
     grid = map_file.grid()
-    experience = _experience_to_teach(options)
+    experience = _experience_to_teach(options, out)
     with ExitStack() as locked_folders:
         drives = _read_drives(options, grid, locked_folders)
         _teach(experience, drives, grid, out)
@@ -103,8 +103,8 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
     return 0
 
 
-def _experience_to_teach(options: LearnOptions) -> Experience:
-    """Return the experience to which the drives are added.
+def _experience_to_teach(options: LearnOptions, out: Path) -> Experience:
+    """Return the experience to which the drives are added, to be written to `out`.
 
     The option ``--experience`` names a file with older experience; without this option
     the experience is new. A ValueError if another option contradicts the file.
@@ -120,7 +120,9 @@ def _experience_to_teach(options: LearnOptions) -> Experience:
     changed = differences(experience.options, robot)
     if changed:
         raise ValueError(f"{options.experience} has {changed}; leave those options out")
-    return experience
+    is_replaced = out.exists() and out.samefile(options.experience)
+    # The older file may be continued elsewhere, too.
+    return experience if is_replaced else experience.for_robot(experience.robot)
 
 
 def _read_drives(

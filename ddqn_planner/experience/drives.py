@@ -10,14 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ddqn_planner.experience.evidence import FARTHEST
 from ddqn_planner.experience.experience import (
     EXPERIENCE,
     LATEST,
     Experience,
     Learned,
 )
-from ddqn_planner.experience.places import Float64
+from ddqn_planner.experience.places import FARTHEST, Float64
 from ddqn_planner.experience.visits import (
     STAND_DISTANCE,
     Poses,
@@ -304,6 +303,7 @@ class DriveFolder(WorkFolder):
         nominal_speed: float,
         robot_width: float,
         older: str = "",
+        robot: str = "",
     ) -> None:
         """Lock a folder, and load its experience.
 
@@ -316,18 +316,21 @@ class DriveFolder(WorkFolder):
         older : str
             A file with older experience, or a folder with one. A new folder begins with
             this experience; empty for none.
+        robot : str
+            The name of the robot, or of the fleet, whose drives a new folder records.
         """
         consequence = "the recording continues, and saving is tried again"
         super().__init__(folder, [LOCK], "drives", "records", consequence)
         self.record_path = self.folder / RECORD
         self.experience_path = self.folder / EXPERIENCE
-        self.experience = Experience(nominal_speed, robot_width)
+        self.experience = Experience(nominal_speed, robot_width, robot=robot)
         with self.opening():
             self.drives = _cut_incomplete_row(self.record_path)
             is_new = not self.experience_path.exists()
-            source = older if is_new else self.experience_path
-            if source:
-                self.experience = self._loaded(source)
+            if not is_new:
+                self.experience = self._loaded(self.experience_path)
+            elif older:
+                self.experience = self._loaded(older).for_robot(robot)
             self._record = Appender(self.record_path)
             self.callback(self._record.close)
             if self.record_path.stat().st_size == 0:

@@ -114,6 +114,11 @@ class Evidence:
         self.surprises = np.concatenate([robot.surprises for robot in members])
         self.levels = self.places.levels()
 
+    @property
+    def driven(self) -> float:
+        """The seconds that all robots have driven."""
+        return math.fsum(robot.driven for robot in self.fleet.members)
+
     def add(self, visits: Visits) -> Change:
         """Learn from a drive: its V visits of places and its W waits.
 

@@ -342,6 +342,16 @@ class Experience:
         self.evidence.sum_up()
         self._recent.clear()
 
+    def for_robot(self, robot: str) -> Experience:
+        """Return the experience of another robot, which begins with this experience.
+
+        `robot` is its name. Unlike a copy, it can be continued and merged with this
+        experience: no drive is lost.
+        """
+        experience = Experience(**self.options, robot=robot)
+        experience.merge(self)
+        return experience
+
     def _check_kind(self, other: Experience) -> None:
         """Raise a ValueError unless another experience has the same parameters."""
         if not isinstance(other, Experience):
@@ -656,7 +666,7 @@ class Experience:
         try:
             content = content_from_bytes(data)
             options = dict(zip(OPTIONS, content.options, strict=True))
-            experience = cls(**options)
+            experience = cls(**options, robot="")
         except Exception as error:  # of many kinds
             raise ExperienceFileError(f"no experience: {error}") from error
         own, *others = content.members

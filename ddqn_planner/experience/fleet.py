@@ -149,7 +149,7 @@ class Fleet:
     def prior(self) -> Float64:
         """The mean prior of the robots that have one, (FEATURES,); else zeros."""
         priors = [robot.prior for robot in self.members if robot.prior.any()]
-        return np.mean(priors or [np.zeros(FEATURES)], axis=0)
+        return np.asarray(np.mean(priors or [np.zeros(FEATURES)], axis=0))
 
     def add(self, change: Change) -> None:
         """Add a drive of the own robot. All other evidence fades by the same share."""

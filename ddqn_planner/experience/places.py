@@ -105,8 +105,8 @@ class Sums:
         total = ASSUMED_VISITS * NOISE + squares.sum()
         noise_of_all = total / (ASSUMED_VISITS + freedom.sum())
         assumed = ASSUMED_VISITS_OF_PLACE * noise_of_all
-        noise = (assumed + squares) / (ASSUMED_VISITS_OF_PLACE + freedom)
-        return np.maximum(noise, LEAST_NOISE)
+        noise: Float64 = (assumed + squares) / (ASSUMED_VISITS_OF_PLACE + freedom)
+        return np.asarray(np.maximum(noise, LEAST_NOISE))
 
     def levels(self) -> Levels:
         """Return how slow the robot is in the open, and where it is fastest.
@@ -199,7 +199,7 @@ class Places(Sums):
         if share == 0:
             return Places.none(self.side)
         sums = {name: _rounded(values * share) for name, values in self.sums().items()}
-        return replace(self, **sums)
+        return Places(**sums, side=self.side, square=self.square, offset=self.offset)
 
     def with_few_passages(self) -> Places:
         """Return the places with at most MOST_PASSAGES, so that the last count most.
@@ -226,7 +226,7 @@ def _united(places: Places) -> Places:
     )
     count = len(first)
     sums = {
-        name: _rounded(np.bincount(row, values, count))
+        name: _rounded(np.bincount(row, values, count).astype(np.float64))
         for name, values in places.sums().items()
     }
     return Places(

@@ -19,14 +19,16 @@ def random_places(random: np.random.Generator, free_cells: np.ndarray) -> Places
     """Visits to some of the free cells, (N, 2) of x and y; some have the weight 0."""
     count = random.integers(0, len(free_cells) + 1)
     cells = random.permutation(free_cells)[:count]
-    places = Places.none()
-    places.append((cells + 0.5) * SIDE)
-    places.weight += random.exponential(3, count) * random.integers(0, 2, count)
+    weight = random.exponential(3, count) * random.integers(0, 2, count)
     log = random.normal(1, 1, count)
-    places.sum_of_slowness += places.weight * np.exp(log)
-    places.sum_of_log += places.weight * log
-    places.sum_of_squares += places.weight * (log**2 + random.exponential(0.1, count))
-    return places
+    return Places.at(
+        (cells + 0.5) * SIDE,
+        SIDE,
+        weight=weight,
+        sum_of_slowness=weight * np.exp(log),
+        sum_of_log=weight * log,
+        sum_of_squares=weight * (log**2 + random.exponential(0.1, count)),
+    )
 
 
 def precision_of_map(free: np.ndarray) -> np.ndarray:
