@@ -70,6 +70,14 @@ class Transform(NamedTuple):
     sin: float
 
 
+class Location(NamedTuple):
+    """Where a robot is in a frame, and the frames whose transforms say so."""
+
+    x: float  # metres
+    y: float
+    frames: list[str]
+
+
 def read_bag(
     path: Path, topic: str = "", frame: str = "map", robot_frame: str = ""
 ) -> RobotPoses:
@@ -143,15 +151,15 @@ def _are_apart(samples: Sequence[Sample], reference: Sequence[Sample]) -> bool:
     """
     if len(samples) < SMALLEST_SHARE * len(reference):
         return False
-    # (N,) each: seconds and metres, in the order of the times.
-    # The columns are seconds, x and y.
+    # (N, 3) each: seconds, x and y, in the order of the times.
     poses = np.array(sorted(samples), dtype=np.float64)
     references = np.array(sorted(reference), dtype=np.float64)
-    times = poses[:, 0]
-    reference_times = references[:, 0]
-    away_x = poses[:, 1] - np.interp(times, reference_times, references[:, 1])
-    away_y = poses[:, 2] - np.interp(times, reference_times, references[:, 2])
-    distance = np.hypot(away_x, away_y)
+    # (N,) each: where the reference robot is at the times of the samples.
+    x, y = (
+        np.interp(poses[:, 0], references[:, 0], references[:, column])
+        for column in (1, 2)
+    )
+    distance = np.hypot(poses[:, 1] - x, poses[:, 2] - y)
     return bool(np.median(distance) > DISTANCE_OF_ROBOTS)
 
 
@@ -231,11 +239,11 @@ class _Bag:
             for robot in tree:
                 if not self._is_robot(robot):
                     continue
-                chain = _chain(robot, self.frame, tree)
-                if child in chain:
-                    x, y = _position_by(chain, tree)
+                location = _location(robot, self.frame, tree)
+                if location is not None and child in location.frames:
                     source = PoseSource(topic, robot, child)
-                    sample = Sample(_seconds(message.header), x, y)
+                    seconds = _seconds(message.header)
+                    sample = Sample(seconds, location.x, location.y)
                     self.samples_of_source[source].append(sample)
 
     def _is_robot(self, frame: str) -> bool:
@@ -267,37 +275,24 @@ def _planar(stamped: TransformStamped) -> Transform | None:
     return Transform(parent, shift.x, shift.y, cos, sin)
 
 
-def _chain(robot: str, frame: str, tree: Mapping[str, Transform]) -> list[str]:
-    """Return the frames from a robot's up to the last one below `frame`.
+def _location(robot: str, frame: str, tree: Mapping[str, Transform]) -> Location | None:
+    """Return where the frame of a robot lies in `frame`.
 
-    The transforms of these frames in `tree` lead from the robot to `frame`. The list is
-    empty if the tree does not lead there.
-    """
-    chain: list[str] = []
-    name = robot
-    while name != frame:
-        # Frames may form a circle.
-        if name not in tree or name in chain:
-            return []
-        chain.append(name)
-        name = tree[name].parent
-    return chain
-
-
-def _position_by(
-    chain: Sequence[str], tree: Mapping[str, Transform]
-) -> tuple[float, float]:
-    """Return where the origin of the first frame of a chain lies: x and y, in metres.
-
-    They are in the parent frame of the last frame of the chain, see `_chain`. `tree`
-    has the transform of each frame to its parent, by the frame's name.
+    `tree` has the transform of each frame to its parent, by the frame's name. None if
+    the tree does not lead from the robot to `frame`.
     """
     x = 0.0
     y = 0.0
-    for name in chain:
-        _, shift_x, shift_y, cos, sin = tree[name]
+    frames: list[str] = []
+    name = robot
+    while name != frame:
+        # Frames may form a circle.
+        if name not in tree or name in frames:
+            return None
+        frames.append(name)
+        name, shift_x, shift_y, cos, sin = tree[name]
         turned_x = cos * x - sin * y
         turned_y = cos * y + sin * x
         x = shift_x + turned_x
         y = shift_y + turned_y
-    return x, y
+    return Location(x, y, frames)
