@@ -32,6 +32,7 @@ MAX_TILT = math.sin(math.radians(1) / 2)
 NORM_TOLERANCE = 1e-6  # a norm that differs less from 1 is left as it is
 # Of bytes in a message: "model" or "experience", the version of that, and the digest.
 LABEL = "ddqn_planner {} 1 sha256:{}"
+CHANGES = "changes"  # the kind of messages with changes of experience
 ENCODING_BYTES = 4  # at the start of a serialised message
 
 
@@ -350,8 +351,8 @@ def _padded(content: bytes, offset: int) -> bytes:
 def bytes_message(kind: str, data: bytes) -> UInt8MultiArray:
     """Make the message that carries the bytes `data` of a file.
 
-    `kind` is "model" or "experience": the label of the message has the kind, a version
-    and a digest of the bytes.
+    `kind` is "model", "experience" or CHANGES: the label of the message has the kind, a
+    version and a digest of the bytes.
     """
     label = LABEL.format(kind, hashlib.sha256(data).hexdigest())
     dimension = MultiArrayDimension(label=label, size=len(data), stride=len(data))
@@ -363,11 +364,11 @@ def bytes_message(kind: str, data: bytes) -> UInt8MultiArray:
 def bytes_of(kind: str, message: UInt8MultiArray) -> bytes:
     """Return the bytes that a message of `bytes_message` carries.
 
-    A ValueError if they are damaged, or not of this kind ("model" or "experience") and
-    of the present version.
+    A ValueError if they are damaged, or not of this kind (see `bytes_message`) and of
+    the present version.
     """
     data = bytes(message.data)
-    label: str = message.layout.dim[0].label if message.layout.dim else ""
+    label = _label_of(message)
     expected_label = LABEL.format(kind, hashlib.sha256(data).hexdigest())
     if label == expected_label:
         return data
@@ -378,6 +379,17 @@ def bytes_of(kind: str, message: UInt8MultiArray) -> bytes:
     else:
         remedy = "let trainer and planner have one version"
     raise ValueError(f"the trainer sent {wrong}; {remedy}")
+
+
+def has_changes(message: UInt8MultiArray) -> bool:
+    """Return whether a message tells of changes of experience, by its label."""
+    before_version, _, _ = LABEL.format(CHANGES, "").rpartition(" 1 ")
+    return _label_of(message).startswith(f"{before_version} ")
+
+
+def _label_of(message: UInt8MultiArray) -> str:
+    """Return the label of a message of `bytes_message`; empty without a label."""
+    return message.layout.dim[0].label if message.layout.dim else ""
 
 
 def check_pose(

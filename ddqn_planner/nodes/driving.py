@@ -1,5 +1,6 @@
 """A learner from drives: those of the node's robot, or of a fleet."""
 
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -11,15 +12,17 @@ from nav_msgs.msg import OccupancyGrid
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
 
+from ddqn_planner.experience import Experience
 from ddqn_planner.experience.drives import (
     Drive,
     DriveFolder,
     DriveRecorder,
     read_drives,
 )
+from ddqn_planner.experience.experience import LONGEST_NAME
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.clocks import STEADY
-from ddqn_planner.nodes.conversions import occupancy_message
+from ddqn_planner.nodes.conversions import CHANGES, occupancy_message
 from ddqn_planner.nodes.learning_node import (
     Answer,
     LearningNode,
@@ -36,6 +39,7 @@ SLOWEST = 10.0  # the slowness that ``~/slowness`` shows as 100
 WRONG_SPEED = np.log(1.5)
 REPLAY_STRIDE = 5  # poses; a replay of all poses would take long
 LOOK_UP_PERIOD = 0.05  # seconds
+PUBLISH_PERIOD = 0.5  # seconds
 NOT_RECORDING = "no drives are being recorded; call ~/start first"
 
 
@@ -175,6 +179,10 @@ class Driving:
         self.robots = [
             DrivingRobot(node, frames, name, self._on_drive) for name in names
         ]
+        # The state of the experience that planners know of; -1: none.
+        self._state_told = -1
+        self._published = -PUBLISH_PERIOD  # when the experience itself was, seconds
+        node.create_trigger(f"{node.products.topic_name}/send", self.send)
         self._is_speed_wrong = False  # whether the last warning of it still holds
         node.create_timer(1.0, self._on_second, clock=STEADY)
         self.start()
@@ -215,9 +223,42 @@ class Driving:
         self._lines["learned speed (m/s)"] = f"{experience.learned_speed:.3f}"
         self._lines["places"] = str(len(experience.evidence.places))
         self._lines["folder"] = str(folder.folder)
-        self._node.tell_saved(
-            experience.to_bytes(), folder.experience_path, folder.save_error
-        )
+        self._tell_of(experience)
+        self._node.tell_saved(folder.experience_path, folder.save_error)
+
+    def _tell_of(self, experience: Experience) -> None:
+        """Publish how the experience has changed since the last message.
+
+        If that is not known, the experience itself is published.
+        """
+        state = experience.state
+        if state == self._state_told:
+            return
+        changes = experience.changes_since(self._state_told)
+        if changes is None:
+            self._publish(experience)
+        else:
+            self._node.publish_product(changes, CHANGES)
+            self._state_told = state
+
+    def _publish(self, experience: Experience) -> None:
+        """Publish the experience itself."""
+        self._node.publish_product(experience.to_bytes())
+        self._state_told = experience.state
+        self._published = time.monotonic()
+
+    def send(self) -> Answer:
+        """Publish the experience itself, for a planner that has missed changes.
+
+        At most once in PUBLISH_PERIOD, as several planners may ask at the same time.
+        """
+        folder = self._folder
+        if folder is None:
+            return Answer(False, NOT_RECORDING)
+        if time.monotonic() < self._published + PUBLISH_PERIOD:
+            return Answer(True, "the experience was sent a moment ago")
+        self._publish(folder.experience)
+        return Answer(True, f"sent the experience of {folder.drives} drives")
 
     def _check_speed(self, folder: DriveFolder) -> None:
         """Warn once when a folder's drives show that the nominal speed is wrong."""
@@ -278,6 +319,7 @@ class Driving:
                 nominal_speed=node.value("nominal_speed"),
                 robot_width=node.value("robot_width"),
                 older=node.value("experience"),
+                robot=node.get_namespace().strip("/")[:LONGEST_NAME],
             )
         except Exception as error:  # the node must survive
             node.state = "failed"

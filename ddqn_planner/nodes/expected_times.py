@@ -4,21 +4,25 @@ from collections.abc import Callable
 
 import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.client import Client
 from rclpy.task import Future
 from std_msgs.msg import MultiArrayLayout, UInt8MultiArray
+from std_srvs.srv import Trigger
 
 from ddqn_planner.experience import Experience
 from ddqn_planner.grid import GridMap
 from ddqn_planner.nodes.base_node import BaseNode
-from ddqn_planner.nodes.conversions import bytes_of
+from ddqn_planner.nodes.clocks import STEADY
+from ddqn_planner.nodes.conversions import CHANGES, bytes_of, has_changes
 from ddqn_planner.nodes.diagnostics import PlannerDiagnostics
 from ddqn_planner.nodes.outcome import NO_REQUEST, Outcome
-from ddqn_planner.nodes.quality import LATCHED
+from ddqn_planner.nodes.quality import CHANGING
 from ddqn_planner.nodes.worker import Worker
 
 # Share of a map's cells: if more than these have changed, the experience is spread anew
 # over the map, which takes long.
 CHANGED_SHARE = 0.02
+ASK_PERIOD = 1.0  # seconds between two requests for the trainer's experience
 
 
 class ExpectedTimes:
@@ -51,6 +55,10 @@ class ExpectedTimes:
         self._experience: Experience | None = None  # in use
         # The layout of the message in which the experience came; it holds a digest.
         self._layout: MultiArrayLayout | None = None
+        self._trainer: Client | None = None  # of the service that sends experience
+        # Whether the trainer's last message told of changes of another experience than
+        # the one in use: the planner came late, or has missed a message.
+        self._is_behind = False
         # The experience of the file that the parameter names, if it was loaded when
         # the parameter was set, and is not in use yet.
         self._experience_of_file: Experience | None = None
@@ -65,13 +73,16 @@ class ExpectedTimes:
         if node.value("experience"):
             self._use_file()
         if node.value("follow_trainer"):
-            node.create_subscription(
+            subscription = node.create_subscription(
                 UInt8MultiArray,
                 "trainer/experience",
                 self.on_message,
-                LATCHED,
+                CHANGING,
                 callback_group=group,
             )
+            service = f"{subscription.topic_name}/send"
+            self._trainer = node.create_client(Trigger, service)
+            node.create_timer(ASK_PERIOD, self._ask_if_behind, clock=STEADY)
 
     def use(self, experience: Experience | None) -> None:
         """Plan by the experience of the parameter's new file; None without a file."""
@@ -87,6 +98,17 @@ class ExpectedTimes:
             is_new: bool = await self._worker.call(self.load, message)
             if is_new:
                 self._on_change()
+        if self._is_behind and message is not None:
+            self._ask_if_behind()
+
+    def _ask_if_behind(self) -> None:
+        """Ask the trainer for its experience if changes of it are missing.
+
+        A timer calls this, too, as the trainer's service may be unknown yet.
+        """
+        trainer = self._trainer
+        if self._is_behind and trainer is not None and trainer.service_is_ready():
+            trainer.call_async(Trigger.Request())
 
     def load(self, message: UInt8MultiArray | None = None) -> bool:
         """Use the experience of a message, or without one of the parameter's file.
@@ -96,7 +118,8 @@ class ExpectedTimes:
         Returns
         -------
         bool
-            False if the message is the same as the last one.
+            False if the message is the same as the last one, or tells of changes that
+            do not follow on the experience in use.
 
         Raises
         ------
@@ -106,15 +129,31 @@ class ExpectedTimes:
         if message is None:
             newer = self._load_file()
         else:
-            data = bytes_of("experience", message)
+            kind = CHANGES if has_changes(message) else "experience"
+            data = bytes_of(kind, message)
             if message.layout == self._layout:
                 return False
+            if kind == CHANGES:
+                return self._apply_changes(message.layout, data)
             newer = Experience.from_bytes(data)
+        self._is_behind = False
         if newer is not None and self._experience is not None:
             newer.take_posterior_from(self._experience)
         self._experience = newer
         self._layout = None if message is None else message.layout
         return True
+
+    def _apply_changes(self, layout: MultiArrayLayout, data: bytes) -> bool:
+        """Change the experience in use; False if these changes do not follow on it.
+
+        `layout` and `data` are those of the trainer's message.
+        """
+        experience = self._experience
+        is_applied = experience is not None and experience.apply_changes(data)
+        self._is_behind = not is_applied
+        if is_applied:
+            self._layout = layout
+        return is_applied
 
     def _load_file(self) -> Experience | None:
         """Return the experience of the parameter's file; None without a file.

@@ -93,7 +93,7 @@ class LearningNode(BaseNode):
         self._saved_files = self.create_publisher(
             String, f"~/{self._product}_saved", LATCHED
         )
-        self._products = self.create_publisher(
+        self.products = self.create_publisher(
             UInt8MultiArray, f"~/{self._product}", LATCHED
         )
 
@@ -113,22 +113,26 @@ class LearningNode(BaseNode):
         self.error = message
         return Answer(False, explained(error))
 
-    def tell_saved(self, data: bytes, path: FilePath, error: str) -> None:
-        """Publish what was learned, and the path of its file if it was saved.
+    def publish_product(self, data: bytes, kind: str = "") -> None:
+        """Publish what was learned: the bytes of the model or the experience.
+
+        `kind` is that of the bytes, see `bytes_message`, if they are something else.
+        """
+        self.products.publish(bytes_message(kind or self._product, data))
+
+    def tell_saved(self, path: FilePath, error: str) -> None:
+        """Publish the path of the file of what was learned, if it was saved.
 
         Parameters
         ----------
-        data
-            The bytes of the model or the experience.
         path
-            The path of its file.
+            The path of the file.
         error
             Why it could not be saved; empty if it was saved. An error that lasts is
             logged once.
         """
         last_error = self.save_error
         self.save_error = error
-        self._products.publish(bytes_message(self._product, data))
         if error:
             if not last_error:
                 self.get_logger().error(error)

@@ -7,6 +7,9 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 # Late subscribers receive the last message too: for maps, plans, saved models.
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
+# For changes of what a latched message told: none is lost while a node is busy.
+CHANGING = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
 # The middleware drops requests that do not fit into the queue, and the node cannot see
 # the loss: ROS's default of ten lost half of 20 requests. Fast DDS keeps 5,000 messages
 # by default.

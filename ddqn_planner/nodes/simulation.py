@@ -244,7 +244,8 @@ class Simulation:
 
         The run calls this after each attempt to save.
         """
-        self._node.tell_saved(run.model, run.model_path, run.save_error)
+        self._node.publish_product(run.model)
+        self._node.tell_saved(run.model_path, run.save_error)
         if not run.save_error:
             place = f"step {run.saved_at} is saved in {run.checkpoint_path}"
             self._node.get_logger().info(place)

@@ -27,7 +27,12 @@ from std_msgs.msg import Header, UInt8MultiArray
 
 from ddqn_planner import Experience, GridMap
 from ddqn_planner.experience.drives import read_drives
-from ddqn_planner.nodes.conversions import bytes_message, bytes_of
+from ddqn_planner.nodes.conversions import (
+    CHANGES,
+    bytes_message,
+    bytes_of,
+    has_changes,
+)
 from ddqn_planner.nodes.driving import NAVIGATION
 from ddqn_planner.nodes.quality import LATCHED
 
@@ -42,6 +47,7 @@ LOWER = [(0.875, 4.625), (3.0, 3.5), (22.0, 3.5), (24.125, 4.625)]
 """Metres: from the start to the goal below the block."""
 
 BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+OLD_FILE = FilePath(__file__).parents[1] / "experience" / "with_directions.npz"
 NAMESPACE = "/drives"  # of the trainer and the planner that most tests share
 
 
@@ -183,8 +189,8 @@ def site(trainer: Any, client: Client, tmp_path: FilePath) -> Iterator[Site]:
     assert "Traceback" not in trainer.log
 
 
-def foretells(message: UInt8MultiArray) -> bool:
-    return Experience.from_bytes(bytes_of("experience", message)).prior is not None
+def is_whole(message: UInt8MultiArray) -> bool:
+    return not has_changes(message)
 
 
 def is_below(path: Path) -> bool:
@@ -215,7 +221,8 @@ def test_the_robot_goes_round_what_was_slow_until_it_forgets(
     assert drive.seconds[-1] - drive.seconds[0] == pytest.approx(238, abs=10)
 
     assert site.saved.wait().data == str(site.folder / "experience.npz")
-    site.experience.wait(foretells)
+    # After each drive, the trainer tells what has changed alone.
+    assert len(site.experience.wait(has_changes).data) < 20_000
     slowness = site.learned()
     assert slowness[14, 50] > 2
     shown = site.slowness.wait(lambda message: max(message.data) > 40)
@@ -239,6 +246,19 @@ def test_the_robot_goes_round_what_was_slow_until_it_forgets(
     planner.wait_for_log("experience refused: no experience")
     assert not is_below(site.client.get_plan(*ends))
 
+    # Changes of what the planner does not know: as if it had missed a message.
+    unknown = Experience(nominal_speed=0.5)
+    state = unknown.state
+    unknown.record_failure((5.0, 5.0))
+    changes = unknown.changes_since(state)
+    assert changes is not None
+    site.experience.clear()
+    site.client.publish("trainer/experience", bytes_message(CHANGES, changes), LATCHED)
+    assert Experience.from_bytes(
+        bytes_of("experience", site.experience.wait(is_whole))
+    ).evidence.driven == pytest.approx(330, rel=0.1)
+    assert not is_below(site.client.get_plan(*ends))
+
     site.episodes.clear()
     site.call("replay")
     site.episodes.wait(lambda path: len(path.poses) == 3)
@@ -251,6 +271,9 @@ def test_the_robot_goes_round_what_was_slow_until_it_forgets(
     kept = str(site.folder / "experience_forgotten.npz")
     assert site.client.set_parameters("planner", experience=kept)
     wait_for("other way", lambda: not is_below(site.client.get_plan(*ends)))
+    # The file of an older version, of places far from both ways.
+    assert site.client.set_parameters("planner", experience=str(OLD_FILE))
+    wait_for("first way", lambda: is_below(site.client.get_plan(*ends)))
     assert site.client.set_parameters("planner", experience="")
     wait_for("first way", lambda: is_below(site.client.get_plan(*ends)))
     assert site.outcomes == ["arrived"] * 3
@@ -370,7 +393,6 @@ def test_a_fleet_teaches_one_trainer_and_each_robot_plans_by_all(
         sites[0].send_goal(9.0, 9.0)
         sites[0].move([UPPER[2]], 0.5)  # it is under way when the trainer is killed
         node.wait_for_log("drive 3 by three: 23")
-        node.wait_for_log("the prior was not trained: training needs another library")
         folder.rename(tmp_path / "moved")
         remaps = [f"{topic}:=/fleet/{topic}" for topic in ("map", "trainer/experience")]
         parameters = {"follow_trainer": True, "move_rule": "robot_safe"}
@@ -382,7 +404,43 @@ def test_a_fleet_teaches_one_trainer_and_each_robot_plans_by_all(
             assert is_above(robot.get_plan(*ends))
     sites[0].folder = tmp_path / "moved"
     assert sites[0].outcomes == ["arrived"] * 3
-    assert node.log.count("the prior was not trained") == 1
+
+
+def test_two_trainers_whose_files_are_merged_know_the_drives_of_both_robots_once(
+    run_trainer: Any, run_node: Any, make_client: Any, tmp_path: FilePath
+) -> None:
+    ways = {"one": (UPPER, 0.5), "two": (LOWER, 0.1)}
+    sites = {
+        name: Site(make_client(f"/{name}"), tmp_path / f"drives_{name}")
+        for name in ways
+    }
+    ends = pose(GRID, START), pose(GRID, GOAL)
+    parameters = {"follow_trainer": True, "move_rule": "robot_safe"}
+    with (
+        run_trainer(sites["one"].folder, "/one"),
+        run_trainer(sites["two"].folder, "/two"),
+    ):
+        for name, (way, speed) in ways.items():
+            sites[name].at = way[0]
+            sites[name].begin()
+            sites[name].drive(way, speed)
+        files = [site.folder / "experience.npz" for site in sites.values()]
+        for _ in range(2):
+            for file, other in (files, files[::-1]):
+                experience = Experience.load(file)
+                experience.merge(Experience.load(other))
+                experience.save(file)
+        one = sites["one"]
+        with run_node("planner_node", parameters, namespace="/one"):
+            one.begin(listeners=2)
+            plan = one.client.get_plan
+            wait_for("first way", lambda: is_below(plan(*ends)))
+            one.drive(UPPER[::-1], 0.5)  # then it saves, and finds the other's drives
+            wait_for("other way", lambda: is_above(plan(*ends)))
+    merged = Experience.load(files[0])
+    robots = merged.evidence.fleet.members
+    assert {robot.robot for robot in robots} == {"one", "two"}
+    assert merged.evidence.driven == pytest.approx(238 + 2 * 56, rel=0.1)
 
 
 def test_a_kill_loses_nothing_but_the_drive_under_way_and_an_end_not_even_that(

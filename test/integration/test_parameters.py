@@ -37,6 +37,7 @@ OF_EVERY_NODE = {
 }
 OF_DRIVING = {
     "~/experience",
+    "~/experience/send",
     "~/experience_saved",
     "~/slowness",
     "~/forget",
