@@ -219,6 +219,23 @@ def test_plan_drives_a_body_as_the_library_and_without_a_collision(
     assert len(seen) == len(BODY_ASKED)  # each option counts
 
 
+def test_plan_leads_a_body_out_of_an_obstacle(rooms: Any, console: Any) -> None:
+    map_file, path = rooms
+    x, y = 15, 25
+    grid = map_file.grid().with_patch([[True]], x, y)
+    start, goal = ((*grid.cell_to_world(cell), 0.0) for cell in ((x, y), (112, 40)))
+    file = Path(path).with_name("marked.yaml")
+    save_map(grid, file)
+    command = f"plan --model car --json {file} --start {x} {y} --goal 112 40"
+    console(command, status=1)
+    answer = json.loads(console(f"{command} --start-clearing-radius 2").out)
+    plan = Planner.load("car").plan_poses(
+        grid, start, goal, bound=1.0, start_clearing_radius=2.0
+    )
+    assert answer["poses"] == plan.poses.tolist()
+    assert answer["escape"] == plan.escape > 0
+
+
 def test_plan_tells_how_a_body_drives_or_why_it_cannot(
     rooms: Any, console: Any
 ) -> None:
@@ -241,7 +258,6 @@ REFUSED = {
     "--model car --robot-radius 0": "--robot-radius is for models without a body,",
     "--model car --move-rule corner_cutting": "--move-rule is for models without",
     "--model car --mode greedy": "--mode is for models without",
-    "--model car --start-clearing-radius 1": "--start-clearing-radius is for models",
     "--model car --cells": "--cells is for models without",
     "--yaws 0 0": "--yaws is for models with a body, unlike any_map; leave it out,",
     "--yaw-tolerance 0": "--yaw-tolerance is for models with a",

@@ -89,7 +89,6 @@ CELL_OPTIONS: Final = (
     "robot_radius",
     "move_rule",
     "mode",
-    "start_clearing_radius",
     "cells",
 )
 BODY_OPTIONS: Final = ("yaws", "yaw_tolerance", "bound")
@@ -301,7 +300,16 @@ def _plan_poses(
     start_pose = (*grid.cell_to_world(start), start_yaw)
     goal_pose = (*grid.cell_to_world(goal), goal_yaw)
     tolerance = options.tolerance, options.yaw_tolerance
-    plan = planner.plan_poses(grid, start_pose, goal_pose, tolerance, options.bound)
+    radius = as_number(
+        "--start-clearing-radius",
+        options.start_clearing_radius,
+        0,
+        np.inf,
+        "metres, 0 or more",
+    )
+    plan = planner.plan_poses(
+        grid, start_pose, goal_pose, tolerance, options.bound, radius
+    )
     metres = plan.length * grid.resolution
     title = plan.status.value
     ends = np.array([start_pose, goal_pose])  # (2, 3): where the picture shows the body
@@ -320,6 +328,7 @@ def _plan_poses(
             "metres": metres,
             "cost": plan.cost,
             "bound": plan.bound,
+            "escape": plan.escape,
         },
         lines=[
             f"{title}, {len(plan.poses)} poses, at most {plan.bound:.3f} times the "

@@ -58,8 +58,8 @@ class PlannerSettings:
     )
     start_clearing_radius: float = parameter(
         -1.0,
-        "Metres: obstacles so near to an occupied start do not count; "
-        "-1: robot_radius, at least one cell; 0: such a start is refused",
+        "Metres: obstacles so near to an occupied start do not count; -1: "
+        "robot_radius, at least one cell, or all of a body; 0: refuse such a start",
         (-1, 100),
     )
     clearance_weight: float = parameter(

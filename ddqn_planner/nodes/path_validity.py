@@ -9,7 +9,12 @@ from std_msgs.msg import Header
 from ddqn_planner.nodes.conversions import frame_of, in_outer_frame, pose_of, poses_of
 from ddqn_planner.nodes.outcome import RequestError
 from ddqn_planner.nodes.reasons import THE_START
-from ddqn_planner.nodes.requests import PlanInputs, Requests, clearing_radius
+from ddqn_planner.nodes.requests import (
+    PlanInputs,
+    Requests,
+    clearing_radius,
+    clearing_radius_of_body,
+)
 from ddqn_planner.planning.path_check import LETHAL, Float64, invalid_poses
 from ddqn_planner.planning.pose_paths import points_of
 from ddqn_planner.robot.footprint import read_footprint
@@ -72,6 +77,9 @@ async def check_path(
             f"{problem}, and the planner has one map without layers; leave it empty"
         )
     poses = await poses_in_map(requests, inputs, check.path, has_body=body is not None)
+    radius = clearing_radius(requests.settings, grid)  # cells
+    if body is not None:
+        radius = clearing_radius_of_body(requests.settings) / grid.resolution
     robot = None
     try:
         robot = await robot_in_map(requests, inputs)
@@ -86,7 +94,7 @@ async def check_path(
         unknown=requests.map.unknown if check.is_unknown_invalid else None,
         max_cost=check.max_cost,
         distance=check.distance,
-        clearing_radius=clearing_radius(requests.settings, grid),
+        clearing_radius=radius,
     ).tolist()
     return invalid[:1] if check.only_first else invalid
 

@@ -17,6 +17,8 @@ THE_GOAL = "the goal"  # in errors, where there is one goal
 MOST_CELLS = 5  # of goals that a reason lists
 # No remedy for several goals: none of them moves.
 TOLERANCE = ", or a greater tolerance"
+# No remedy if all cells under the body are ignored.
+CLEARING_RADIUS = ", or a greater start_clearing_radius"
 REMEDIES = {
     PlanStatus.START_OUTSIDE_MAP: "set the start on the map",
     PlanStatus.GOAL_OUTSIDE_MAP: "set the goal on the map",
@@ -34,7 +36,9 @@ REMEDIES = {
 }
 REMEDIES_OF_BODY = {
     **REMEDIES,
-    PlanStatus.START_OCCUPIED: "set the start where the robot's body has room",
+    PlanStatus.START_OCCUPIED: (
+        f"set the start where the robot's body has room{CLEARING_RADIUS}"
+    ),
     PlanStatus.GOAL_OCCUPIED: (
         f"set the goal where the robot's body has room{TOLERANCE}"
     ),
@@ -125,6 +129,8 @@ def reason_of_failure(
         remedies = REMEDIES_OF_BODY if isinstance(plan, PosePlan) else REMEDIES
         problem = plan.reason if has_several_goals else plan.status.value
         remedy = remedies[plan.status]
+        if math.isinf(_clearing_radius(request)):
+            remedy = remedy.removesuffix(CLEARING_RADIUS)
     goals_in_words = f"goal: {_place(goal, goal_cells[0])}"
     if has_several_goals:
         problem = f"no path to any of {len(goal_cells)} goals: {problem}"
@@ -140,8 +146,7 @@ def reason_of_failure(
             limit = _clearance_in_words(plan, robot_radius)
             reason += f", nearer to an obstacle than {limit}"
     if plan.status is PlanStatus.START_OCCUPIED and _clearing_radius(request):
-        radius = f"{_clearing_radius(request):.3g} m"
-        reason += f", deeper than the start_clearing_radius, {radius}"
+        reason += _depth_in_words(_clearing_radius(request))
     return f"{reason}; {remedy}"
 
 
@@ -167,7 +172,10 @@ def reason_of_path(request: Request, plan: Plan, path: ExactPath) -> str:
         # In metres between centres of cells, as the tolerance counts.
         metres = math.dist(plan.goal, goal_cells[0]) * grid.resolution
         reason += f"; the goal {problem} and moved {metres:.3g} m"
-    if grid.is_obstacle(plan.path[0]):
+    if isinstance(plan, PosePlan):
+        _, _, escape = plan.reason.partition("; ")
+        reason += f"; {escape}" if escape else ""
+    elif grid.is_obstacle(plan.path[0]):
         radius = f"{_clearing_radius(request):.3g} m"
         reason += (
             f"; the start is occupied: obstacles within {radius} of it were ignored"
@@ -189,10 +197,17 @@ def _method_in_words(plan: Plan) -> str:
 
 
 def _clearing_radius(request: Request) -> float:
-    """Return the start_clearing_radius of a request in metres; 0 for a body."""
+    """Return the start_clearing_radius of a request in metres, perhaps infinite."""
     if isinstance(request, PoseRequest):
-        return 0.0
+        return request.start_clearing_radius
     return request.start_clearing_radius * request.grid.resolution
+
+
+def _depth_in_words(clearing_radius: float) -> str:
+    """Return how deep a start lies in obstacles; the radius is in metres."""
+    if math.isinf(clearing_radius):
+        return ", and no motion leads out of the obstacles under the body"
+    return f", deeper than the start_clearing_radius, {clearing_radius:.3g} m"
 
 
 def _clearance_in_words(plan: Plan, robot_radius: float) -> str:

@@ -540,6 +540,7 @@ def request_to(
             tolerance=(tolerance, yaw_tolerance),
             bound=settings.path_bound,
             switch_threshold=settings.switch_threshold,
+            start_clearing_radius=clearing_radius_of_body(settings),
         )
     return PlanRequest(
         grid,
@@ -607,6 +608,12 @@ def clearing_radius(settings: PlannerSettings, grid: GridMap) -> float:
     if metres < 0:  # by default
         metres = max(settings.robot_radius, grid.resolution)
     return metres / grid.resolution
+
+
+def clearing_radius_of_body(settings: PlannerSettings) -> float:
+    """Return the start_clearing_radius in metres: by default all under the body."""
+    metres = settings.start_clearing_radius
+    return math.inf if metres < 0 else metres
 
 
 # From plans to the outcome, and to the poses of its path

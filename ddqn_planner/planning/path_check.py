@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.planning.paths import obstacles_in_the_way
+from ddqn_planner.planning.pose_escape import escape_of
 from ddqn_planner.planning.pose_paths import BodyPoints, Float64, in_cells, touches
 
 LETHAL: Final = 254  # Nav2's cost of an obstacle
@@ -53,20 +54,22 @@ def invalid_poses(
     clearing_radius : float
         A robot without a body that stands in a cell which is not free may leave it
         through inflated cells. If it stands on an obstacle, it may also pass obstacles
-        within this radius of its cell, in cells.
+        within this radius of its cell, in cells. A body may leave the cells within this
+        radius that it covers at the first pose.
     """
     first, end = _part_to_check(poses, robot, distance)
     closed = _closed_cells(grid, body is not None, unknown, max_cost)
     if body is not None:
-        path = in_cells(poses, grid)
-        points = np.concatenate(body)
-        bits = closed.view(np.uint8)
-        invalid = [
-            number
-            for number in range(first, end)
-            if touches(path[number : number + 1], points, bits)  # a path of one pose
-        ]
-        return np.array(invalid, np.int64)
+        path = in_cells(poses[first:end], grid)
+        is_invalid = _touches_at(path, body, closed)  # (M,)
+        may_escape = robot is not None and clearing_radius > 0 and is_invalid[:1].any()
+        escape = None
+        if may_escape:
+            escape = escape_of(path, closed, body, clearing_radius)
+        if escape is not None:
+            begin = path[: escape.poses]
+            is_invalid[: escape.poses] = _touches_at(begin, body, escape.occupied)
+        return first + np.flatnonzero(is_invalid)
     # As float64, since poses may lie too far away for whole numbers.
     cells = np.floor(grid.in_cells(poses[first:end, :2]))  # (M, 2)
     is_invalid = _is_closed(cells, closed)  # (M,)
@@ -79,6 +82,22 @@ def invalid_poses(
     obstacles = obstacles_in_the_way(grid, robot_cell, clearing_radius)
     is_invalid[:way_out] = _is_closed(cells[:way_out], obstacles)
     return first + np.flatnonzero(is_invalid)
+
+
+def _touches_at(
+    path: Float64, body: BodyPoints, closed: Occupancy
+) -> NDArray[np.bool_]:
+    """Return at which poses (N, 3) from `in_cells` a body touches closed cells: (N,).
+
+    `closed` (H, W) tells which cells of the map are closed.
+    """
+    points = np.concatenate(body)
+    cells = closed.view(np.uint8)
+    touching = [
+        touches(path[number : number + 1], points, cells)  # a path of one pose
+        for number in range(len(path))
+    ]
+    return np.array(touching, np.bool_)
 
 
 def _part_to_check(poses: Float64, robot: Any, distance: float) -> tuple[int, int]:

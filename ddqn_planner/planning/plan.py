@@ -111,6 +111,7 @@ class PoseRequest(PathRequest[Pose]):
 
     tolerance: tuple[float, float] = (0.0, 0.0)  # metres, radians; for one goal
     bound: float = 1.2
+    start_clearing_radius: float = 0.0  # metres
 
     @property
     def cells(self) -> tuple[Cell, ...]:
@@ -262,11 +263,16 @@ class PosePlan(Plan):
         The length of the origin's way in cells, whatever the direction.
     bound : float
         The proved ratio of the cost to the least cost: 1.0 if the cost is the least.
+    escape : int
+        How many poses lead out of the obstacles on which the robot starts, see
+        `Planner.plan_poses`: from pose number `escape` on, the body touches none. 0 for
+        a start with room for the body.
     """
 
     poses: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)))
     driven: float = 0.0
     bound: float = 1.0
+    escape: int = 0
 
     @property
     def length(self) -> float:
@@ -313,6 +319,8 @@ def _with_poses_of(plans: Sequence[Plan]) -> PosePlan:
         poses=_end_to_end([leg.poses for leg in legs]),
         driven=sum(leg.driven for leg in legs),
         bound=max(leg.bound for leg in legs),
+        escape=legs[0].escape,
+        reason=legs[0].reason,
     )
 
 

@@ -301,6 +301,7 @@ class Planner:
         goal: Pose | Sequence[Pose],
         tolerance: tuple[float, float] = (0.0, 0.0),
         bound: float = 1.2,
+        start_clearing_radius: float = 0.0,
     ) -> PosePlan:
         """Plan a path for a robot with a body and a heading, by a model of that robot.
 
@@ -323,11 +324,17 @@ class Planner:
             The factor by which the cost of a path may exceed the least cost, 1 or more.
             With 1 a path of the least cost is found, which takes longer.
             `PosePlan.bound` tells what is proved of the path.
+        start_clearing_radius : float
+            For a start without room for the body: occupied cells that the body covers
+            there do not count until the first free pose, if their centres are no
+            farther than this from that of the start's cell, in metres. With 0, all
+            cells count; with `math.inf`, none of those under the body.
 
         Returns
         -------
         PosePlan
-            No pose of its path touches an occupied cell.
+            From pose number `PosePlan.escape` on, its path touches no occupied cell.
+            The number is 0 unless the path leads out of obstacles at the start.
 
         Raises
         ------
@@ -342,6 +349,13 @@ class Planner:
             _poses_of_goals(goal),
             tolerance=_tolerance_of_poses(tolerance),
             bound=as_number("the bound", bound, 1, math.inf, "1 or more"),
+            start_clearing_radius=as_number(
+                "start_clearing_radius",
+                start_clearing_radius,
+                0,
+                math.inf,
+                "0 metres or more",
+            ),
         )
         if self.pose_planner is None:
             raise ValueError(

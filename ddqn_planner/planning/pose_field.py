@@ -319,7 +319,9 @@ class PoseField(Field[Search]):
             most_primitives = int(cost / body.cost.min()) + 1
             most_poses = int(np.diff(body.first_pose).max())  # of a primitive
             rows = np.empty((4, 1 + most_primitives * most_poses))
-            count = pose_space.follow(search, start_number, most_primitives, rows)
+            count, escape = pose_space.follow(
+                search, start_number, most_primitives, rows
+            )
         grid = self.grid
         in_cells = np.column_stack([rows[0, :count], rows[1, :count]])
         yaw = rows[2, :count]  # radians on the map
@@ -330,6 +332,7 @@ class PoseField(Field[Search]):
             cells=cells_of(in_cells),
             costs=costs.copy(),
             least_cost=float(costs[-1]) / proved_bound,
+            escape=escape,
         )
         return self.path
 
@@ -411,6 +414,18 @@ class PoseField(Field[Search]):
             columns_near = slice(max(x - reach, 0), x + reach + 1)
             is_near[rows_near, columns_near] = True
         return is_near
+
+
+def may_escape(start: State, world: World) -> bool:
+    """Return whether primitives may lead from a start on obstacles to a free state.
+
+    The world has an escape, see `world_with_escape`.
+    """
+    number = int(pose_space.number_of_state(*start, world))
+    states = world.nearness.size << pose_space.TILE_BITS  # on the map
+    mark = _untouched(states, np.uint8)
+    queue = np.empty(UNGUIDED, np.int64)
+    return bool(pose_space.leads_to_room(number, mark, queue, world))
 
 
 def _cost_from_start(search: Search) -> float:

@@ -25,6 +25,10 @@ FILL_SPACING: Final = 0.7
 SAME: Final = 1 + 1e-6  # what is rounded in sums of float32 is less
 # The cosine above which a robot drives ahead, not behind or sideways.
 AHEAD: Final = 0.9
+ESCAPED: Final = (
+    f"{PlanStatus.SUCCEEDED}; the start is occupied: cells that the robot's body covers"
+    " there do not count until it has left them"
+)
 ON_THE_SPOT: Final = 1e-6  # cells: a shorter step is a turn
 
 
@@ -35,6 +39,8 @@ class PosePath(NamedTuple):
     cells: NDArray[np.int32]  # (N, 2)
     costs: Float64  # (N,): from the first pose to each, in cells
     least_cost: float  # a lower bound of the cost of any path between its ends
+    # Poses that lead out of the obstacles on which the path starts.
+    escape: int = 0
 
     def plan(self, first: int, grid: GridMap) -> PosePlan:
         """Return the plan along the rest of the path, from pose number `first` on.
@@ -57,6 +63,7 @@ class PosePath(NamedTuple):
             bound = max(cost / least_cost, 1.0)
         steps = np.diff(poses[:, :2], axis=0)  # (M - 1, 2), in metres
         goal_x, goal_y = cells[-1].tolist()
+        escape = max(self.escape - first, 0)
         return PosePlan(
             PlanStatus.SUCCEEDED,
             cells[is_new_cell],
@@ -65,6 +72,8 @@ class PosePath(NamedTuple):
             poses=poses,
             driven=float(np.hypot(steps[:, 0], steps[:, 1]).sum()) / grid.resolution,
             bound=bound,
+            escape=escape,
+            reason=ESCAPED if escape else "",
         )
 
 

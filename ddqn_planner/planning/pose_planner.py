@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,14 +25,17 @@ from ddqn_planner.planning.plan import (
     PosePlan,
     PoseRequest,
 )
-from ddqn_planner.planning.pose_field import PoseField
+from ddqn_planner.planning.pose_escape import is_drivable, poses_of_escape
+from ddqn_planner.planning.pose_field import PoseField, may_escape
 from ddqn_planner.planning.pose_world import (
     State,
     World,
     body_of,
+    covered_cells,
     differences,
     move_free_to_front,
     world_of,
+    world_with_escape,
 )
 from ddqn_planner.robot.motions import HEADINGS, turn_between
 
@@ -51,6 +54,14 @@ SAME_END = 1.0, 0.5
 BESIDE_PATH = 1.0, 2 * math.pi / HEADINGS
 # A start so near to a pose of a path, in cells and radians, lies on that path.
 ON_PATH = 0.5, math.pi / HEADINGS
+
+
+class _Start(NamedTuple):
+    """The state in which a path begins, and the body on the map from there on."""
+
+    state: State
+    world: World  # with an escape if the body has no room in the state
+    ignored: NDArray[np.int64]  # (K, 2): cells that do not count until the first room
 
 
 class PosePlanner(PathFinder[PoseRequest, PosePlan]):
@@ -123,7 +134,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
             return PosePlan(PlanStatus.START_OUTSIDE_MAP)
         yield  # a pause: a slow step follows
         world = self._world(grid)
-        start = self._state_at(grid, request.start, world)
+        start = self._start_of(request, world)
         if start is None:
             return PosePlan(PlanStatus.START_OCCUPIED)
         goal_states = self._states_at(grid, goals, world)
@@ -131,7 +142,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         has_path = plan.status is PlanStatus.SUCCEEDED
         if has_path or not any(request.tolerance):
             return plan
-        states_around = self._states_around_goal(request, start, world)
+        states_around = self._states_around_goal(request, start.state, world)
         if not len(states_around):
             return plan
         return (yield from self._to_states(request, states_around, start, clock))
@@ -140,7 +151,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         self,
         request: PoseRequest,
         states: NDArray[np.int64],
-        start: State,
+        start: _Start,
         clock: Clock,
     ) -> PausingGenerator[PosePlan]:
         """Return the plan of the cheapest path from a start to one of some states.
@@ -151,26 +162,24 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         states : (N, 3)
             The (x, y, heading) in which the path may end, all with room for the body.
             Without any, the goal is occupied.
-        start : State
-            (x, y, heading)
+        start : _Start
         clock : Clock
             Is told when the field is known.
         """
         if not len(states):
             return PosePlan(PlanStatus.GOAL_OCCUPIED)
         grid = request.grid
-        key = request.goals, request.tolerance, states.tobytes()
-        field = self.fields.get(
-            key, grid, lambda: PoseField(states, grid, self._world(grid))
-        )
-        bound = field.reach(start, request.bound, VISITS)
+        ignored = start.ignored.tobytes()
+        key = request.goals, request.tolerance, states.tobytes(), ignored
+        field = self.fields.get(key, grid, lambda: PoseField(states, grid, start.world))
+        bound = field.reach(start.state, request.bound, VISITS)
         while bound is None:
             yield  # a pause: a slow step follows
-            bound = field.reach(start, request.bound, VISITS)
+            bound = field.reach(start.state, request.bound, VISITS)
         clock.end_field()
         if bound == math.inf:
             return PosePlan(PlanStatus.NO_PATH, field_ms=clock.field_ms)
-        plan = field.rollout(start, request.bound).plan(0, grid)
+        plan = field.rollout(start.state, request.bound).plan(0, grid)
         return replace(plan, field_ms=clock.field_ms, rollout_ms=clock.rollout_ms)
 
     def _reason(self, request: PoseRequest, plan: PosePlan) -> PausingGenerator[str]:
@@ -291,7 +300,12 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
 
     def rest_of_path(self, request: PoseRequest) -> NDArray[np.float64]:
         """Return the rest of the path under way, (N, 3)."""
-        return self.rest_of(request.under_way, request.start, request.grid)
+        return self.rest_of(
+            request.under_way,
+            request.start,
+            request.grid,
+            start_clearing_radius=request.start_clearing_radius,
+        )
 
     def rest_of(
         self,
@@ -299,6 +313,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         robot: Any,
         grid: GridMap,
         reach: tuple[float, float] = paths.REACH,
+        start_clearing_radius: float = 0.0,
     ) -> NDArray[np.float64]:
         """Return the rest of a path, (N, 3): from the pose nearest to the robot on.
 
@@ -314,11 +329,15 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         grid : GridMap
         reach : (float, float)
             Cells and radians by which the robot may be beside the path.
+        start_clearing_radius : float
+            Metres, see `Planner.plan_poses`: the rest may lead out of obstacles that
+            the body covers at its first pose.
         """
         poses: NDArray[np.float64] = np.asarray(path, dtype=np.float64).reshape(-1, 3)
         first = paths.nearest_pose(poses, robot, grid, reach)
         is_too_far = first < 0
-        if is_too_far or not paths.is_free(poses[first:], grid, self.points):
+        radius = start_clearing_radius / grid.resolution
+        if is_too_far or not is_drivable(poses[first:], grid, self.points, radius):
             return poses[:0]
         return poses[first:]
 
@@ -332,7 +351,13 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         grid = request.grid
         has_new_path = plan.poses.size > 0
         reach = paths.REACH if has_new_path else BESIDE_PATH
-        rest = self.rest_of(request.under_way, request.start, grid, reach)  # (N, 3)
+        rest = self.rest_of(
+            request.under_way,
+            request.start,
+            grid,
+            reach,
+            request.start_clearing_radius,
+        )  # (N, 3)
         if not len(rest):
             return plan
         ends = np.array([*plan.poses[-1:], *request.goals])
@@ -356,8 +381,9 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
             least_cost = cost_of_plan / plan.bound
         cells = paths.cells_of(paths.in_cells(rest, grid))
         costs = np.linspace(0, rest_cost, len(rest))
+        escape = poses_of_escape(rest, grid, self.points)
         return replace(
-            paths.PosePath(rest, cells, costs, least_cost).plan(0, grid),
+            paths.PosePath(rest, cells, costs, least_cost, escape).plan(0, grid),
             extra_cost=ratio - 1,
             field_ms=plan.field_ms,
             rollout_ms=plan.rollout_ms,
@@ -374,6 +400,46 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
                 f" train-robot with --resolution {resolution:g}"
             )
 
+    def _start_of(self, request: PoseRequest, world: World) -> _Start | None:
+        """Return where a path begins; None if the robot cannot leave its place.
+
+        If the body has no room in the two headings nearest to that of the request, the
+        path begins on obstacles, in the heading from which primitives lead to a free
+        state.
+
+        Parameters
+        ----------
+        request : PoseRequest
+        world : World
+            The body on the request's map.
+        """
+        grid = request.grid
+        state = self._state_at(grid, request.start, world)
+        if state is not None:
+            return _Start(state, world, np.empty((0, 2), np.int64))
+        if request.start_clearing_radius == 0:
+            return None
+        radius = request.start_clearing_radius * ROUNDING / grid.resolution  # cells
+        for occupied_state in self._nearest_states(grid, request.start):
+            cells = covered_cells(occupied_state, grid, self.body)  # (N, 2)
+            x, y, _ = occupied_state
+            distance = np.hypot(cells[:, 0] - x, cells[:, 1] - y)
+            ignored = cells[distance <= radius]
+            if not len(ignored):
+                continue
+            world_of_start = world_with_escape(world, ignored)
+            if may_escape(occupied_state, world_of_start):
+                return _Start(occupied_state, world_of_start, ignored)
+        return None
+
+    def _nearest_states(self, grid: GridMap, pose: Pose) -> list[State]:
+        """Return the states of a pose's cell in the two headings nearest to its yaw."""
+        x, y, yaw = pose
+        turn = np.abs(turn_between(self.motions.angles, yaw - grid.origin[2]))  # (16,)
+        nearest_headings: list[int] = np.argsort(turn, kind="stable")[:2].tolist()
+        column, row = grid.world_to_cell(x, y)
+        return [(column, row, heading) for heading in nearest_headings]
+
     def _state_at(self, grid: GridMap, pose: Pose, world: World) -> State | None:
         """Return the state (x, y, heading) of a pose on a map; None without room.
 
@@ -388,11 +454,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         world : World
             The body on the map.
         """
-        x, y, yaw = pose
-        turn = np.abs(turn_between(self.motions.angles, yaw - grid.origin[2]))  # (16,)
-        nearest_headings = np.argsort(turn, kind="stable")[:2]
-        column, row = grid.world_to_cell(x, y)
-        states = np.array([(column, row, heading) for heading in nearest_headings])
+        states = np.array(self._nearest_states(grid, pose))
         count_with_room = move_free_to_front(states, world)
         return tuple(states[0].tolist()) if count_with_room else None
 
@@ -412,7 +474,8 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
     ) -> NDArray[np.int64]:
         """Return the states (N, 3) within the goal's tolerance in which a path may end.
 
-        If the start lies within the tolerance, it is the only state. The body has room
+        If the start lies within the tolerance and has room for the body, it is the only
+        state. The body has room
         in all states that are returned.
 
         Parameters
@@ -435,7 +498,9 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         start_column, start_row, start_heading = start
         start_distance = math.hypot(start_column - goal_column, start_row - goal_row)
         if may_end[start_heading] and start_distance <= radius:
-            return np.array([start])
+            start_states = np.array([start])
+            if move_free_to_front(start_states, world):
+                return start_states
         # The cells of the map in a square around the goal, counted from the goal.
         columns = np.arange(grid.width) - goal_column
         columns = columns[abs(columns) <= radius]  # (C,)
@@ -489,7 +554,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         """
         for field in self.fields.kept:
             path = field.path  # the last one that was made from the field
-            goals, tolerance, _ = field.key  # the last part: the states of the goals
+            goals, tolerance, *_ = field.key
             is_for_goals = goals == request.goals and tolerance == request.tolerance
             if path is None or not is_for_goals:
                 continue
@@ -499,7 +564,9 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
                 continue
             # The number of the pose at the start; -1 if no pose is near.
             first = paths.nearest_pose(path.poses, request.start, request.grid, ON_PATH)
-            if first < 0:
+            # Nor does a path out of obstacles count: which obstacles a robot may leave
+            # depends on its start.
+            if first < path.escape:
                 continue
             plan = path.plan(first, request.grid)
             if plan.bound <= request.bound * paths.SAME:

@@ -19,6 +19,7 @@ from ddqn_planner.planning.pose_world import (
     cost_of_primitive,
     has_room,
     is_inside,
+    stands_on_obstacle,
 )
 from ddqn_planner.planning.queues import (
     Heap,
@@ -277,8 +278,10 @@ def cheapest_primitive(
 
 
 @in_place
-def follow(search: Search, start: int, limit: int, rows: NDArray[np.float64]) -> int:
-    """Write the poses of greedy primitives from a state to a goal; return how many.
+def follow(
+    search: Search, start: int, limit: int, rows: NDArray[np.float64]
+) -> tuple[int, int]:
+    """Write the poses of greedy primitives from a state to a goal.
 
     Parameters
     ----------
@@ -291,9 +294,19 @@ def follow(search: Search, start: int, limit: int, rows: NDArray[np.float64]) ->
     rows : (4, N)
         Where the poses are written, one in each column: x and y in cells, yaw in
         radians, and the cost from the start to the pose, in cells.
+
+    Returns
+    -------
+    count : int
+        Poses that were written.
+    escape : int
+        How many of them lead out of the obstacles on which the robot starts: the next
+        pose begins the first primitive that sweeps no occupied cell.
     """
     world = search.world
     body = world.body
+    has_escape = world.escape_bits.size > 0
+    escape = 0
     number = start
     x, y, heading = state_of(number, world)
     rows[0, 0] = x
@@ -320,10 +333,51 @@ def follow(search: Search, start: int, limit: int, rows: NDArray[np.float64]) ->
             share = body.pose[place, 3]  # of the cost, up to this pose
             rows[3, count] = cost_after - cost + share * cost
             count += 1
+        if has_escape and stands_on_obstacle(x, y, body.start[primitive], world):
+            escape = count - 1
         cost_before = cost_after
         number = end_of(x, y, primitive, world)
         x, y, _ = state_of(number, world)
-    return count
+    return count, escape
+
+
+@in_place
+def leads_to_room(
+    start: int, mark: NDArray[np.uint8], queue: NDArray[np.int64], world: World
+) -> bool:
+    """Return whether primitives may lead from a start to a state without obstacles.
+
+    Parameters
+    ----------
+    start : int
+        The number of a state.
+    mark : (N,)
+        UNREACHED for each state; states on occupied cells that are seen become OPEN.
+    queue : (K,)
+        Memory for these states. If there are K states or more, the result is True.
+    world : World
+        With an escape.
+    """
+    queue[0] = start
+    mark[start] = OPEN
+    count = 1  # states in the queue
+    expanded = 0  # states of the queue whose primitives were followed
+    while expanded < count:
+        x, y, heading = state_of(queue[expanded], world)
+        if not stands_on_obstacle(x, y, heading, world):
+            return True
+        expanded += 1
+        for primitive in range(
+            world.body.first_starting[heading], world.body.first_starting[heading + 1]
+        ):
+            end = end_of(x, y, primitive, world)
+            if end == OUTSIDE or mark[end] == OPEN or count == queue.size:
+                continue
+            if has_room(x, y, primitive, world):
+                queue[count] = end
+                mark[end] = OPEN
+                count += 1
+    return bool(count == queue.size)
 
 
 @in_place

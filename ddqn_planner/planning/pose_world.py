@@ -83,6 +83,9 @@ class World(NamedTuple):
     body: Body
     # (rows, words): a bit for each occupied cell, with the border.
     occupied_bits: NDArray[np.uint64]
+    # The same without the cells that do not count until the body has left them, see
+    # `world_with_escape`; (0, 0) where all cells count.
+    escape_bits: NDArray[np.uint64]
     # (tile rows, tile columns): IS_NEAR if the body can reach an occupied cell from the
     # tile, IS_FAR if not, UNSEEN until a kernel looks.
     nearness: NDArray[np.uint8]
@@ -324,6 +327,48 @@ def world_of(
     )
 
 
+def covered_cells(state: State, grid: GridMap, body: Body) -> NDArray[np.int64]:
+    """Return the occupied cells (N, 2) that a body covers in a state, x and y."""
+    x, y, heading = state
+    mask = body.standing_mask + heading
+    rows = slice(body.first_row[mask], body.first_row[mask + 1])
+    octets = body.row_bits[rows].view(np.uint8).reshape(-1, 8)
+    bits = np.unpackbits(octets, axis=1, bitorder="little")  # (R, 64)
+    row, bit = np.nonzero(bits)
+    begin = body.row_begin[rows][row]  # (K, 2): y and x of the first cell of each row
+    cells = np.column_stack([x + begin[:, 1] + bit, y + begin[:, 0]])
+    is_on_map = ((cells >= 0) & (cells < (grid.width, grid.height))).all(axis=1)
+    cells = cells[is_on_map]
+    return cells[grid.uninflated[cells[:, 1], cells[:, 0]]]
+
+
+def world_with_escape(world: World, cells: NDArray[np.int64]) -> World:
+    """Return a body on a map where some occupied cells do not count at first.
+
+    From a state in which the body touches an occupied cell, motions are possible that
+    sweep no occupied cells except these. A motion from any other state sweeps none.
+
+    Parameters
+    ----------
+    world : World
+        It does not change.
+    cells : (N, 2), at least one
+        The occupied cells x, y on which the robot stands.
+    """
+    escape_bits = world.occupied_bits.copy()
+    column = cells[:, 0] + BORDER
+    word = column // 64
+    bit = ONE << (column % 64).astype(np.uint64)
+    np.bitwise_and.at(escape_bits, (cells[:, 1] + BORDER, word), ~bit)
+    # The origin may pass more tiles near these cells than elsewhere.
+    first_column, first_row = cells.min(axis=0).tolist()
+    last_column, last_row = cells.max(axis=0).tolist()
+    passability = world.passability.copy()
+    near_rows = _tiles_near(first_row, last_row)
+    passability[near_rows, _tiles_near(first_column, last_column)] = UNSEEN
+    return world._replace(escape_bits=escape_bits, passability=passability)
+
+
 def _tiles_near(first: int, last: int) -> slice:
     """Return the rows of tiles that lie within `BORDER` cells of some rows of cells.
 
@@ -344,6 +389,7 @@ def _new_world(grid: GridMap, body: Body) -> World:
     return World(
         body,
         occupied_bits,
+        escape_bits=np.empty((0, 0), np.uint64),
         nearness=np.full(tiles, UNSEEN, np.uint8),
         passability=np.full(tiles, UNSEEN, np.uint8),
         height=grid.height,
@@ -397,13 +443,13 @@ def differences(old: GridMap, new: GridMap) -> NDArray[np.int64] | None:
 
 
 @inlined
-def touches(x: int, y: int, mask: int, world: Any) -> bool:
+def touches(x: int, y: int, mask: int, occupied_bits: Any, body: Any) -> bool:
     """Return whether an occupied cell lies in a mask around cell (x, y).
 
     `mask` is the number of a set of cells around the body, see `has_room`. The cells of
-    a mask are bits, in words of 64 cells of a row.
+    a mask are bits, in words of 64 cells of a row. So are the occupied cells, see
+    `World`.
     """
-    body = world.body
     for number in range(body.first_row[mask], body.first_row[mask + 1]):
         # The first cell of the mask's row, on the map with its border.
         row = y + body.row_begin[number, 0] + BORDER
@@ -413,8 +459,8 @@ def touches(x: int, y: int, mask: int, world: Any) -> bool:
         # 64, which bit 0 would need, has no meaning.
         word = column // WORD
         bit = column & LAST_BIT
-        occupied = world.occupied_bits[row, word] >> bit
-        occupied |= (world.occupied_bits[row, word + ONE] << ONE) << (LAST_BIT - bit)
+        occupied = occupied_bits[row, word] >> bit
+        occupied |= (occupied_bits[row, word + ONE] << ONE) << (LAST_BIT - bit)
         if occupied & body.row_bits[number]:
             return True
     return False
@@ -439,7 +485,8 @@ def is_far(x: int, y: int, world: Any) -> bool:
         # The cells within reach of the tile are a mask around its middle.
         middle_x = (column << SHIFT) + TILE // 2
         middle_y = (row << SHIFT) + TILE // 2
-        if touches(middle_x, middle_y, world.body.reach_mask, world):
+        reach_mask = world.body.reach_mask
+        if touches(middle_x, middle_y, reach_mask, world.occupied_bits, world.body):
             world.nearness[row, column] = IS_NEAR
         else:
             world.nearness[row, column] = IS_FAR
@@ -488,18 +535,47 @@ def leaves_map(x: int, y: int, primitive: int, world: Any) -> bool:
     return not is_inside(x + highest[primitive, 0], y + highest[primitive, 1], world)
 
 
+@in_place
+def _may_escape(x: int, y: int, mask: int, world: Any) -> bool:
+    """Return whether the occupied cells in a mask around cell (x, y) do not count.
+
+    `mask` is the number of a set of cells around the body, see `has_room`, and the
+    world has an escape. The body may stand on occupied cells at the begin of a
+    primitive alone.
+    """
+    body = world.body
+    if touches(x, y, mask, world.escape_bits, body):
+        return False
+    is_primitive = mask < body.standing_mask
+    if not is_primitive:
+        return True
+    standing_mask = body.standing_mask + body.start[mask]
+    return bool(touches(x, y, standing_mask, world.occupied_bits, body))
+
+
+@inlined
+def stands_on_obstacle(x: int, y: int, heading: int, world: Any) -> bool:
+    """Return whether the body touches an occupied cell in a state."""
+    mask = world.body.standing_mask + heading
+    return bool(touches(x, y, mask, world.occupied_bits, world.body))
+
+
 @inlined
 def has_room(x: int, y: int, mask: int, world: Any) -> bool:
     """Return whether no occupied cell lies in a mask around cell (x, y).
 
     `mask` is the number of a set of cells around the body: p for the cells that the
     body sweeps on primitive p, higher numbers for the cells where it stands in each
-    heading, and others. On a primitive, the origin must not leave the map either.
+    heading, and others. On a primitive, the origin must not leave the map either. In a
+    world with an escape, the cells that do not count at first may lie in the mask of a
+    primitive that begins on occupied cells, and in all masks of other kinds.
     """
     if is_far(x, y, world):  # no mask around the cell touches an occupied cell
         return True
-    if touches(x, y, mask, world):
-        return False
+    if touches(x, y, mask, world.occupied_bits, world.body):
+        has_escape = world.escape_bits.size > 0
+        if not has_escape or not _may_escape(x, y, mask, world):
+            return False
     is_primitive = mask < world.body.standing_mask  # the masks of primitives come first
     return not (is_primitive and leaves_map(x, y, mask, world))
 

@@ -145,10 +145,23 @@ def test_the_nearest_pose_counts_and_services_are_answered(robot: Robot) -> None
     robot.wait_for_reason("to goal 2 of 2")
     answer = robot.get_plan(at(robot, BEYOND, 0.0), at(robot, START, 3.0))
     check(answer, robot.grid, START, 3.0)
+    robot.set(start_clearing_radius=0.0)
     assert not robot.get_plan(at(robot, (29, 3), 0.0), at(robot, START, 3.0)).poses
     cells = r"start: .* in cell \(29, 3\); goal: .* in cell \(10, 10\); .*"
     why = rf"the start is occupied \({cells}"
-    robot.wait_for_reason(f"{why}; set the start where the robot's body has room$")
+    remedy = "set the start where the robot's body has room, or a greater start_clear"
+    robot.wait_for_reason(f"{why}; {remedy}")
+    robot.set(start_clearing_radius=-1.0)
+
+
+def test_a_robot_on_a_mark_leaves_it_and_the_reason_says_so(robot: Robot) -> None:
+    column, row = START
+    marked = robot.values.copy()
+    marked[row, column + 1] = 100
+    message = map_message(marked, GridMap(marked > 0, CELL, ORIGIN), next(NUMBERS))
+    robot.send_goal(at(robot, BESIDE, 0.0))
+    robot.plan_on(message, reason="the start is occupied: cells that the robot's body")
+    robot.send_map()
 
 
 def test_a_path_to_one_of_several_goals_is_kept_on_a_map_with_other_cells(
@@ -271,8 +284,7 @@ def test_actions_lead_through_poses_and_paths_are_checked(
         assert outcome.plan.extra_cost is not None  # kept
         assert np.array_equal(array_of(again), array_of(first)[9:])
         assert is_valid(path)
-        # In a door as wide as the body is at most, half a cell aside is too much for a
-        # new path.
+        # In a door as wide as the body is at most, half a cell aside is on its wall.
         narrow = rooms.copy()
         narrow[:, 28:33] = 100
         narrow[24:29, 28:33] = 0
@@ -292,10 +304,7 @@ def test_actions_lead_through_poses_and_paths_are_checked(
             node.navigation.plan(PathQuery(aside, [goal], ""), lambda: None)
         )
         assert np.array_equal(array_of(rest), poses_through[number:])
-        assert (
-            "cells, kept, as there is none from the cell and heading nearest"
-            in outcome.reason
-        )
+        assert outcome.plan.extra_cost is not None  # kept
         node.map_source.take(map_message(rooms, grid, next(NUMBERS)))
         blocked = rooms.copy()
         x, y = grid.world_to_cell(*poses[len(poses) // 2, :2])
