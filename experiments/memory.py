@@ -1,15 +1,24 @@
-"""Measures where the planner's memory goes, and whether reloads add to it."""
+"""Measures where the planner's memory goes, and whether reloads add to it.
+
+And the memory of a trainer that learns from driving.
+"""
 
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 import client as ros
 import numpy as np
 import processes
+from nav_msgs.msg import OccupancyGrid, Odometry
 from nav_msgs.srv import GetPlan
+from rclpy.time import Time as RosTime
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
 from tables import report
 
 from ddqn_planner import Planner
@@ -18,6 +27,7 @@ from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.resources import find_map
 
 PLANS = 8
+POSES = 1000  # of a drive
 LARGE = 2000  # cells of a side of the large map
 RELOADS = 1500
 FIRST_RELOADS = 50  # after which the memory is measured first
@@ -100,6 +110,30 @@ def measure_reloads() -> Iterator[bool]:
     )
 
 
+def measure_trainer(fixture: ros.MapFixture) -> Iterator[bool]:
+    """Measure the memory of a trainer that learns from a drive on a map."""
+    with ExitStack() as stack:
+        folder = stack.enter_context(tempfile.TemporaryDirectory())
+        parameters = {"learn_from": "driving", "output_folder": f"{folder}/drives"}
+        client = stack.enter_context(ros.Client())
+        node = stack.enter_context(processes.running_node("trainer_node", **parameters))
+        slowness = client.subscribe(OccupancyGrid, "trainer/slowness", LATCHED)
+        client.publish("map", fixture.message(), LATCHED)
+        slowness.wait()
+        for number in range(POSES):
+            nanoseconds = int(1e9 + 2e8 * number)
+            odometry = Odometry(header=Header(frame_id="map"))
+            odometry.header.stamp = RosTime(nanoseconds=nanoseconds).to_msg()
+            odometry.pose.pose.position.x = 1 + 0.1 * (number % 200)
+            odometry.pose.pose.position.y = 1 + 0.01 * number
+            client.publish("odom", odometry, POSES)
+        time.sleep(SETTLED)
+        client.call(Trigger, "trainer/stop")
+        time.sleep(SETTLED)
+        memory = processes.memory(node.pid)
+    yield report("trainer_node that learns from driving", memory, "MB", 250)
+
+
 def main(_: Sequence[str]) -> int:
     """Print tables, and each figure beside its bound; return 1 if one is missed."""
     office = find_map("office")
@@ -112,6 +146,7 @@ def main(_: Sequence[str]) -> int:
         missed = [*measure_node("office", office_fixture, 210, office)]
         missed += measure_node(f"{LARGE}x{LARGE}", large_fixture, 250)
         missed += measure_reloads()
+        missed += measure_trainer(office_fixture)
     return int(any(missed))
 
 
