@@ -23,7 +23,7 @@ from ddqn_planner.experience.experience_file import (
 )
 from ddqn_planner.experience.fleet import Change, Fleet, Version
 from ddqn_planner.experience.places import FARTHEST, Float32, Float64, Int64
-from ddqn_planner.experience.posterior import VARIANCE, Posterior
+from ddqn_planner.experience.posterior import Posterior
 from ddqn_planner.experience.prior import FEATURES
 from ddqn_planner.experience.visits import (
     UNSEEN,
@@ -442,7 +442,7 @@ class Experience:
             return expected
         # The bold map: each of P places is faster by one standard deviation of its log
         # slowness. The largest deviation is rounded up to steps.
-        deviation = math.sqrt(VARIANCE) * posterior.unknown  # (P,)
+        deviation = math.sqrt(posterior.variance) * posterior.unknown  # (P,)
         largest_deviation = deviation.max(initial=0)
         largest = FAST_STEP * math.ceil(largest_deviation / FAST_STEP)
         bold = self._timed(grid, posterior, "bold", deviation, fastest - largest)
@@ -493,7 +493,7 @@ class Experience:
         """
         posterior = self.evidence.posterior_over(grid)
         unknown = posterior.to_cells(posterior.unknown.astype(np.float32), occupied=1)
-        return math.sqrt(VARIANCE) * unknown
+        return math.sqrt(posterior.variance) * unknown
 
     def expected_time(self, grid: GridMap, cells: Cells) -> ExpectedTime:
         """Return the time that a path takes, with an interval of 90 %.

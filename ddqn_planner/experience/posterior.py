@@ -31,12 +31,17 @@ STEPS = np.minimum(STEPS, MAX_SLOWNESS).astype(np.float32)
 # Of the log slowness: no place is farther from the solution of the equations.
 ACCURACY = 0.01
 OVER_RELAXATION = 1.4  # of the solver: neighbours agree sooner
-# Of the log slowness of places.
+# The variance of the log slowness of places, assumed from so many places before the
+# first drive, and its limits.
 VARIANCE = 1.0
+ASSUMED_PLACES = 4.0
+LEAST_VARIANCE = 0.02
+MOST_VARIANCE = 2.0
+SMALLEST_WEIGHT = 0.2  # of a place's visits, from which the place counts for it
 # Neighbours are alike: so many places of a path tell as much of other places as one
 # place alone.
 ALIKE_PLACES = 8.0
-ASSUMED_PASSAGES = 2.0  # of each place, without a wait
+ASSUMED_PASSAGES = 4.0  # of each place, without a wait
 # A straight path through a place leads to so many ends of ways of two links or less.
 WAYS_AROUND = 11.0
 # Standard deviations of the log time of a drive: on known places, and what is added on
@@ -108,6 +113,8 @@ class Posterior:
         The standard deviation of one visit's log slowness beyond the usual one.
     slowness : (P,) float64
         The expected seconds over those at nominal speed, with waits.
+    variance : float
+        Of the log slowness of places around the expected one.
     coefficients : (FEATURES,) float64
         By how much each feature of the map raises the log slowness.
     """
@@ -146,6 +153,7 @@ class Posterior:
         x, y = self._middle_cells.T
         self._features = map_features(grid)[y, x].astype(np.float64)  # (P, FEATURES)
         self.coefficients = np.zeros(FEATURES)
+        self.variance = VARIANCE
         self._painted: dict[str, Painted] = {}
 
     def deviation_of(self, seconds: Float64, places: Int64) -> float:
@@ -195,6 +203,7 @@ class Posterior:
             self.expected += np.quantile(known_beyond, OPEN_QUANTILE)
         else:
             self.expected += open_log
+        self.variance = self._variance(sums, log - self.expected, noise)
         self._solve(sums.weight / noise, log - self.expected)
         self.known: Float64 = np.clip(self._solution[:, 1], 0, 1)
         self.unknown = np.sqrt(1 - self.known)
@@ -203,6 +212,19 @@ class Posterior:
         self.slowness = np.exp(self.mean)
         if sums.waited.any():
             self.slowness += self.nominal_speed * self._waits(sums)
+
+    def _variance(self, sums: Sums, beyond: Float64, noise: Float64) -> float:
+        """Return the variance of the log slowness of places, as driven places show it.
+
+        `sums` are of the map's P places, `beyond` (P,) is their log slowness less the
+        expected one, and `noise` (P,) the variance of one visit.
+        """
+        driven = sums.weight >= SMALLEST_WEIGHT
+        # The part of each square that is not noise.
+        squares = beyond[driven] ** 2 - noise[driven] / sums.weight[driven]
+        total = ASSUMED_PLACES * VARIANCE + squares.sum() / ALIKE_PLACES
+        mean_square = total / (ASSUMED_PLACES + len(squares) / ALIKE_PLACES)
+        return float(np.clip(mean_square, LEAST_VARIANCE, MOST_VARIANCE))
 
     def _regression(
         self, sums: Sums, log: Float64, noise: Float64, prior: Float64
@@ -256,8 +278,8 @@ class Posterior:
         # added to the argument.
         kappa = (self._spacing / CORRELATION) ** 2
         variance_of_lattice = math.log1p(32 / kappa) / (4 * math.pi)
-        # All is scaled so that the field has the variance VARIANCE.
-        strength = VARIANCE / variance_of_lattice * visits  # (P,)
+        # All is scaled so that the field has the given variance.
+        strength = self.variance / variance_of_lattice * visits  # (P,)
         right = np.column_stack([strength * log, strength])  # (P, 2)
         # If the solution is off by the same error everywhere, the residuals are that
         # error times `kappa + strength`, and they are larger for larger errors. So

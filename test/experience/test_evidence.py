@@ -171,7 +171,7 @@ def test_what_is_slow_in_one_direction_alone_is_no_change() -> None:
         experience.apply(HALL)  # so that it learns how sure expected times are
         up, down = straight((2, 8), (12, 8), 4), straight((12, 8), (2, 8))
         experience.record(*(up if number % 4 else down))
-    assert unsure_at(experience, 7, 2) < 0.2
+    assert unsure_at(experience, 7, 2) < 0.4
 
 
 def test_where_parts_of_drives_often_surprise_a_surprise_is_no_change() -> None:
@@ -228,8 +228,8 @@ def test_the_mean_wait_of_passages_is_added_to_each_passage(
         experience.record(*waited(seconds if has_wait else 0))
     waits = len(range(0, 10, passages_without_wait + 1))
     cost = planner.plan(experience.apply(grid), *ends).cost
-    # Twenty passages, and two that are assumed.
-    assert cost - usual == pytest.approx(seconds * waits / 22, rel=0.25)
+    # Twenty passages, and four that are assumed.
+    assert cost - usual == pytest.approx(seconds * waits / 24, rel=0.25)
 
 
 def test_a_wait_is_not_spread_along_the_way_or_to_other_ways() -> None:
@@ -269,7 +269,7 @@ def test_a_wait_beside_a_wall_costs_nothing_behind_it() -> None:
     slowness = experience.slowness(MAPS[1])
     assert at(HALL, slowness, 5, 5.1) > 10
     assert at(HALL, slowness, 5, 5.6) < 1.3
-    assert at(HALL, experience.slowness(HALL), 5, 5.4) > 10
+    assert at(HALL, experience.slowness(HALL), 5, 5.4) > 5
 
 
 def test_waits_say_nothing_of_the_places_elsewhere() -> None:

@@ -129,7 +129,7 @@ def test_places_with_and_without_waits_count_as_faster_the_less_of_them_is_known
     )
     of_a_step = 0.021  # in which slowness is told
     unseen, most = (
-        1.0,
+        math.sqrt(experience.evidence.posterior_over(HALL).variance),
         math.log(1 + share),
     )
     deviation = experience.uncertainty(HALL)
