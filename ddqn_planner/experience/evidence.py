@@ -36,6 +36,9 @@ SURPRISE_QUANTILE = 0.95
 # The share of all evidence that remains after a change: other places may have changed.
 SHARE_AFTER_CHANGE = 0.01
 
+# Of all evidence after a drive, also after one that took many half-lives.
+LEAST_SHARE = 1e-30
+
 # A drive through fewer places says little about how sure expected times are.
 FEWEST_VISITS = 8
 # So many normal errors are assumed before those of drives.
@@ -136,7 +139,7 @@ class Evidence:
         errors = self._errors_of_expected_time(visits)
         surprises = self._surprises_of(visits.position, log)  # one for each part
         largest_surprise = max(surprises, default=0.0)
-        share = 0.5 ** (visits.total_seconds / self.half_life)
+        share = max(0.5 ** (visits.total_seconds / self.half_life), LEAST_SHARE)
         if largest_surprise > self._usual_surprise(errors):
             share *= SHARE_AFTER_CHANGE
         change = Change(
@@ -224,13 +227,13 @@ class Evidence:
         map, there is no error: (0,).
         """
         posterior = self.posterior
-        nothing = np.zeros(0)
+        no_errors = np.zeros(0)
         if posterior is None:
-            return nothing
+            return no_errors
         places = posterior.places_at(visits.position)  # (V,)
         is_on_map = places != NO_PLACE
         if np.count_nonzero(is_on_map) < FEWEST_VISITS:
-            return nothing
+            return no_errors
         places = places[is_on_map]  # (K,): the numbers of places on the map
         nominal_seconds = visits.metres[is_on_map] / self.nominal_speed  # (K,)
         # The slowness of a place includes the waits that are expected there.

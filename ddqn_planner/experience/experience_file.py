@@ -181,16 +181,30 @@ def _parts(arrays: Arrays, side: float) -> list[Part]:
     totals = [len(square), len(errors), len(surprises)]
     if (counts < 0).any() or counts.sum(axis=0).tolist() != totals:
         raise ValueError("its counts cannot be true")
-    ends = np.cumsum(counts, axis=0)  # (K, 3)
-    begins = ends - counts
-    parts = []
-    for begin, end in zip(begins.tolist(), ends.tolist(), strict=True):
-        rows = slice(begin[0], end[0])
-        columns = dict(zip(SUMS, sums[:, rows], strict=True))
-        places = Places(**columns, side=side, square=square[rows], offset=offset[rows])
-        part = Part(places, errors[begin[1] : end[1]], surprises[begin[2] : end[2]])
+    # (K - 1,) each: the first row of each part but the first.
+    rows, rows_of_errors, rows_of_surprises = np.cumsum(counts, axis=0)[:-1].T
+    places = [
+        Places(
+            **dict(zip(SUMS, sums_of_part, strict=True)),
+            side=side,
+            square=square_of_part,
+            offset=offset_of_part,
+        )
+        for sums_of_part, square_of_part, offset_of_part in zip(
+            np.split(sums, rows, axis=1),
+            np.split(square, rows),
+            np.split(offset, rows),
+            strict=True,
+        )
+    ]
+    columns = (
+        places,
+        np.split(errors, rows_of_errors),
+        np.split(surprises, rows_of_surprises),
+    )
+    parts = [Part(*column) for column in zip(*columns, strict=True)]
+    for part in parts:
         _check(part)
-        parts.append(part)
     return parts
 
 
@@ -259,9 +273,9 @@ def _old_evidence(
     columns = _sums_of_logs(table)
     places = Places.at(table[:, 5:7], side, **columns)
     # The first files have neither errors nor surprises.
-    nothing = np.zeros(0)
-    errors = arrays.get("errors", nothing).astype(np.float64)
-    surprises = arrays.get("surprises", nothing).astype(np.float64)
+    no_drives = np.zeros(0)
+    errors = arrays.get("errors", no_drives).astype(np.float64)
+    surprises = arrays.get("surprises", no_drives).astype(np.float64)
     part = Part(places, errors, surprises)
     _check(part)
     if not 0 <= driven < math.inf or errors.ndim != 1 or surprises.ndim != 1:
@@ -286,9 +300,10 @@ def _without_dates(table: Float64, driven: float, half_life: float) -> Float64:
     driven_before = table[:, 5]
     half_lives = (driven - driven_before) / half_life  # since the last visit
     remaining = 0.5**half_lives
-    nothing = np.zeros((len(table), 3))  # no passages, waits and predictions
+    zeros = np.zeros((len(table), 3))  # no passages, waits and predictions
+    position = table[:, 3:5]
     return np.column_stack(
-        [weight * remaining, sum_of_log * remaining, nothing, table[:, 3:5]]
+        [weight * remaining, sum_of_log * remaining, zeros, position]
     )
 
 

@@ -59,7 +59,7 @@ class RobotEvidence(NamedTuple):
 
         `robot` is its name, and `side` that of a place, metres.
         """
-        nothing = np.zeros(0)
+        no_drives = np.zeros(0)
         return cls(
             identity=secrets.token_hex(16),
             robot=robot,
@@ -68,8 +68,8 @@ class RobotEvidence(NamedTuple):
             faded=0.0,
             prior=np.zeros(FEATURES),
             places=Places.none(side),
-            errors=nothing,
-            surprises=nothing,
+            errors=no_drives,
+            surprises=no_drives,
         )
 
     @property

@@ -153,8 +153,8 @@ class Places(Sums):
         square = squares_at(position, side)
         in_square = position / side - square  # (M, 2): 0 to 1
         offset = np.clip(in_square * OFFSETS, 0, OFFSETS - 1).astype(np.uint8)
-        nothing = np.zeros(len(position))
-        columns = {name: sums.get(name, nothing) for name in SUMS}
+        zeros = np.zeros(len(position))
+        columns = {name: sums.get(name, zeros) for name in SUMS}
         return _united(cls(**columns, side=side, square=square, offset=offset))
 
     @classmethod

@@ -101,6 +101,21 @@ def test_the_evidence_of_others_fades_while_this_robot_drives() -> None:
     assert share == pytest.approx(0.5, abs=0.02)
 
 
+def test_a_drive_of_many_half_lives_leaves_hardly_anything_of_older_evidence() -> None:
+    one = driven(straight((2, 2), (12, 2)), half_life=1.0)
+    one.merge(driven(straight((2, 3), (12, 3)), half_life=1.0))
+    copy = copy_of(one)
+    state = one.state
+    one.record(*straight((2, 8), (12, 8), 80))  # 1,600 s
+    changes = one.changes_since(state)
+    assert changes is not None
+    assert copy.apply_changes(changes)
+    assert evidence_of(copy) == evidence_of(one)
+    weight, y = one.evidence.places.weight, one.evidence.places.position[:, 1]
+    assert weight[y < 7].max() < 1e-20
+    assert weight[y > 7].min() > 0.1
+
+
 def test_a_robot_that_forgot_is_forgotten_where_it_is_merged_and_others_are_not() -> (
     None
 ):

@@ -32,6 +32,7 @@ from ddqn_planner.grid import inflate
 from ddqn_planner.grid.inflation import Inflation
 from ddqn_planner.nodes.base_node import BaseNode
 from ddqn_planner.nodes.conversions import (
+    CHANGES,
     MapRules,
     bytes_message,
     grid_from_message,
@@ -672,6 +673,32 @@ def test_drives_are_planned_with_at_once(
     finished(source.times.on_message(message_of(Experience(0.5))))
     assert source.heard == 1
     assert source.slowness() is None  # it was forgotten
+
+
+def test_changes_are_planned_with_where_they_follow_on_what_is_known(
+    source: Source,
+) -> None:
+    experience, x = Experience(0.5), np.linspace(5, 25, 201)
+    source.take(MESSAGE)
+    finished(source.times.on_message(message_of(experience)))
+    messages = []
+    for y in (5.1, 7.6):
+        state = experience.state
+        experience.record((x - 5) / 0.1, np.column_stack([x, np.full(201, y)]))
+        changes = experience.changes_since(state)
+        assert changes is not None
+        messages.append(bytes_message(CHANGES, changes))
+    source.heard = 0
+    # The second message comes before the first one, and is no news when it comes again.
+    for number, heard in ((1, 0), (0, 1), (1, 2), (1, 2)):
+        finished(source.times.on_message(messages[number]))
+        assert source.heard == heard
+    assert source.diagnostics.refused == {}
+    expected: Any = experience.apply(GRID).slowness
+    np.testing.assert_allclose(source.slowness(), expected, rtol=0.021)
+    broken = bytes_message(CHANGES, bytes(messages[1].data)[:-9])
+    finished(source.times.on_message(broken))
+    assert "no changes of experience" in source.diagnostics.refused["experience"]
 
 
 def test_a_file_is_planned_with_or_refused_or_none_is_set(
