@@ -254,7 +254,7 @@ def lattice() -> dict[str, Any]:
         ),
         (
             {"trajectory_length": 0.01},
-            "trajectory_length of .* is 0.01, .* lead 0.15 m far; give",
+            "trajectory_length of .* is 0.01, .* drive 0.15 m; give",
         ),
         ({"poses": []}, r"the poses of primitive 0 have shape \(0,\); give 1 to"),
         (

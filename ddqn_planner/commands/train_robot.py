@@ -37,6 +37,7 @@ OPTIONS = (
         None,
         "a file of Nav2's lattice generator, instead of these three",
     ),
+    Option("allow-reverse", bool, False, "the lattice's motions also in reverse"),
     Option("out", Path, "my_robot.safetensors", "the model's file"),
     Option("seed", int, 0, "seed of the training"),
     Option("steps", int, ROBOT.steps, "transitions after which to give up"),
@@ -64,6 +65,7 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
         options.lattice,
         options.seed,
         options.padding,
+        options.allow_reverse,
     )
     try:
         certificate = _train_with_bar(trainer, options.steps)

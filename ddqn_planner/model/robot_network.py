@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -12,7 +13,12 @@ from ddqn_planner.grid import MoveRule
 from ddqn_planner.model.networks import ModelFileError, QNetwork
 from ddqn_planner.robot.body_certificate import BodyCertificate, certify_body
 from ddqn_planner.robot.footprint import read_footprint, swept_cells
-from ddqn_planner.robot.motions import HEADINGS, Motions, turn_between
+from ddqn_planner.robot.motions import (
+    HEADINGS,
+    Motions,
+    is_too_cheap,
+    turn_between,
+)
 from ddqn_planner.robot.units import units_of
 
 Float64: TypeAlias = NDArray[np.float64]
@@ -143,12 +149,15 @@ class RobotNetwork(QNetwork):
 
         The move rule does not matter: it is one of cells.
         """
-        return certify_body(
+        of_body = certify_body(
             weight_USS=self.tensors["weight"],
             threshold_U=self.tensors["threshold"],
             swept_USS=self.swept_by_unit,
             unit_P=self.unit,
         )
+        costs: list[float] = self.motions.cost.tolist()
+        cheap = sum(map(is_too_cheap, costs, self.motions.poses))
+        return replace(of_body, cheap=cheap)
 
     def swept(self) -> NDArray[np.bool_]:
         """Return the cells that forbid each primitive, as proved: (P, S, S) bool.
@@ -204,7 +213,7 @@ def _motions_of(tensors: Mapping[str, NDArray[Any]]) -> Motions:
         or not np.array_equal(column.pose_count, pose_count)
         or not (pose_count >= 1).all()
         or pose_count.sum() != len(pose_N3)
-        or not (column.cost > 0).all()
+        or not ((column.cost > 0) & (column.cost < np.inf)).all()
         or not tensors["resolution"] > 0
     )
     if is_damaged:

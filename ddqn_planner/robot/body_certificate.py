@@ -25,11 +25,17 @@ class BodyCertificate:
     # The least distance of a logit from 0 on its right side, as a share of the unit's
     # threshold. It is 0 or less if the network is wrong.
     margin: float
+    # Primitives that cost less than the way that the robot drives on them: the lower
+    # bounds of a search, and so `PosePlan.bound`, rely on costs.
+    cheap: int = 0
 
     @property
     def proved(self) -> bool:
-        """Whether a primitive is forbidden just where it sweeps an occupied cell."""
-        return self.weak == self.forbidden == 0
+        """Whether a primitive is forbidden just where it sweeps an occupied cell.
+
+        Besides, none may cost less than its way.
+        """
+        return self.weak == self.forbidden == self.cheap == 0
 
     def __str__(self) -> str:
         if self.proved:
@@ -40,10 +46,14 @@ class BodyCertificate:
             return f"proved: {proved}, margin {self.margin:.2f}"
         weak = f"{self.weak:,} of {self.cells:,} swept cells"
         forbidden = f"{self.forbidden:,} of {self.primitives:,}"
-        return (
+        problem = (
             f"not proved: {weak} do not forbid their primitive, "
             f"{forbidden} are forbidden by other cells"
         )
+        if self.cheap:
+            cheap = f"{self.cheap:,} of {self.primitives:,}"
+            problem += f", {cheap} cost less than the way that the robot drives"
+        return problem
 
 
 def certify_body(

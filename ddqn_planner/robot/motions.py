@@ -48,9 +48,11 @@ MAX_DISTANCE: Final = 100.0  # metres from the start of a lattice's primitive
 MAX_YAW: Final = 100.0  # radians in a lattice
 MAX_POSES: Final = 10_000  # of a lattice's primitive
 MAX_OFF_CENTRE: Final = 0.01  # cells from a lattice's end to the centre of its cell
-# Of the straight distance: a shorter trajectory_length is wrong.
-MIN_LENGTH_SHARE: Final = 0.9
-MIN_COST: Final = 1e-6
+MAX_YAW_OFF: Final = 0.01  # radians from a lattice's end to the yaw of its heading
+# Of the way that a robot drives on a primitive: a cost below is wrong, as lower bounds
+# rely on costs. Nav2's files round to 1e-5.
+MIN_COST_SHARE: Final = 1 - 1e-4
+MIN_COST: Final = 1e-3  # cells, also of a turn on the spot
 SAME_POSE: Final = 1e-6  # cells and radians
 GENERATOR_REMEDY: Final = "give a file of Nav2's lattice generator"
 
@@ -83,6 +85,17 @@ class Primitive(NamedTuple):
     end: int  # heading
     poses: Poses
     cost: float  # as that of so many cells driven ahead
+
+
+def driven_length(poses: Poses) -> float:
+    """Return the length of the origin's way along poses (N, 3), in their unit."""
+    steps = np.diff(poses[:, :2], axis=0)
+    return float(np.hypot(steps[:, 0], steps[:, 1]).sum())
+
+
+def is_too_cheap(cost: float, poses: Poses) -> bool:
+    """Return whether a primitive costs less than its way; all is in cells."""
+    return not cost >= max(MIN_COST_SHARE * driven_length(poses), MIN_COST)
 
 
 def turn_between(start_yaw: ArrayLike, end_yaw: ArrayLike) -> Float64:
@@ -208,9 +221,7 @@ def _driven_ahead(start: int, end: int, poses: Poses) -> Primitive:
 
     `start` and `end` are the headings, 0 to 15, of the first and the last pose.
     """
-    steps = np.diff(poses[:, :2], axis=0)
-    length = float(np.hypot(steps[:, 0], steps[:, 1]).sum())
-    return Primitive(start, end, poses, cost=length)
+    return Primitive(start, end, poses, cost=driven_length(poses))
 
 
 def _driven_behind(primitive: Primitive) -> Primitive:
@@ -391,10 +402,17 @@ def dense_poses(poses: Poses, spacing: float, lever: float) -> Poses:
 # Lattice files
 
 
-def read_lattice(file: str | Path) -> Motions:
+def read_lattice(file: str | Path, allow_reverse: bool = False) -> Motions:
     """Read the primitives of a state lattice in Nav2's JSON format.
 
     A ValueError says what is wrong with a file.
+
+    Parameters
+    ----------
+    file : path
+    allow_reverse : bool
+        Whether the robot can also drive each primitive back, at `BEHIND` times its
+        cost. Files of Nav2's generator have no primitives in reverse.
     """
     path = as_path(file, "the lattice")
     try:
@@ -403,7 +421,7 @@ def read_lattice(file: str | Path) -> Motions:
         problem = f"the lattice {path}: it cannot be read ({error.strerror})"
         raise ValueError(f"{problem}; {GENERATOR_REMEDY}") from None
     try:
-        return _motions_in(_json_of(content))
+        return _motions_in(_json_of(content), allow_reverse)
     except ValueError as error:
         raise ValueError(f"the lattice {path}: {error}") from None
 
@@ -429,8 +447,8 @@ def _field(owner: object, field: str, owner_name: str) -> Any:
     return owner[field]
 
 
-def _motions_in(lattice: object) -> Motions:
-    """Return the motion primitives of a lattice's JSON."""
+def _motions_in(lattice: object, allow_reverse: bool) -> Motions:
+    """Return the motion primitives of a lattice's JSON, perhaps also in reverse."""
     metadata: object = _field(lattice, "lattice_metadata", "it")
     cell_size = _cell_size(
         "grid_resolution", _field(metadata, "grid_resolution", "lattice_metadata")
@@ -446,10 +464,29 @@ def _motions_in(lattice: object) -> Motions:
     for number, primitive in enumerate(objects):
         name = f"primitive {number}"
         primitives.append(_primitive(name, primitive, cell_size, angles))
+    if allow_reverse:
+        primitives += _reversed(primitives)
     motions = _motions(cell_size, angles, primitives)
     _check_headings(motions.start, "starts")
     _check_headings(motions.end, "ends")
     return motions
+
+
+def _reversed(primitives: Sequence[Primitive]) -> list[Primitive]:
+    """Return the primitives in reverse, except turns and those that are there."""
+    ends = {_ends_of(primitive) for primitive in primitives}
+    reverses = [
+        _driven_behind(primitive)
+        for primitive in primitives
+        if driven_length(primitive.poses) > 0
+    ]
+    return [reverse for reverse in reverses if _ends_of(reverse) not in ends]
+
+
+def _ends_of(primitive: Primitive) -> tuple[int, int, int, int]:
+    """Return the headings of a primitive, and its way from cell to cell."""
+    x, y, _ = np.rint(primitive.poses[-1]).astype(int).tolist()
+    return primitive.start, primitive.end, x, y
 
 
 def _check_number_of_headings(metadata: object) -> None:
@@ -512,6 +549,7 @@ def _primitive(
     )
     metric_poses = _poses(f"the poses of {name}", _field(primitive, "poses", name))
     poses = metric_poses / (cell_size, cell_size, 1)  # cells, cells, radians
+    _check_last_yaw(name, poses, angles[end])
     poses = _from_heading_to_heading(poses, angles[start], angles[end])
     _check_end(name, poses)
     metres = length
@@ -519,12 +557,12 @@ def _primitive(
         turn = float(np.abs(np.diff(poses[:, 2])).sum())
         metres = turn * TURN
     cost = metres / cell_size
-    # From the start to the end of the poses, metres.
-    distance = float(np.hypot(poses[-1, 0], poses[-1, 1])) * cell_size
-    if length < MIN_LENGTH_SHARE * distance or cost < MIN_COST:
+    if is_too_cheap(cost, poses):
+        driven = driven_length(poses) * cell_size  # metres
         raise ValueError(
-            f"trajectory_length of {name} is {length:g}, and its poses lead "
-            f"{distance:.3g} m far; give the metres that it drives, or leave it out"
+            f"trajectory_length of {name} is {length:g}, and its poses drive "
+            f"{driven:.5g} m; give the metres that it drives, 0 for a turn on the "
+            "spot, or leave it out"
         )
     return Primitive(start, end, dense_poses(poses, SPACING, SPACING / ANGLE), cost)
 
@@ -548,6 +586,20 @@ def _from_heading_to_heading(poses: Poses, start_yaw: float, end_yaw: float) -> 
         poses = np.vstack([start_pose, poses])
     poses[:, 2] = np.unwrap(poses[:, 2])
     return poses
+
+
+def _check_last_yaw(name: str, poses: Poses, end_yaw: float) -> None:
+    """Raise a ValueError unless a primitive's last yaw is that of its last heading.
+
+    `name` is what the error calls it; `end_yaw` and the yaws of its poses (N, 3) are in
+    radians.
+    """
+    last_yaw = float(poses[-1, 2])
+    if abs(turn_between(last_yaw, end_yaw)) > MAX_YAW_OFF:
+        raise ValueError(
+            f"{name} ends with a yaw of {last_yaw:.4g}, and its end_angle_index has "
+            f"{end_yaw:.4g} in heading_angles; {GENERATOR_REMEDY}"
+        )
 
 
 def _check_end(name: str, poses: Poses) -> None:

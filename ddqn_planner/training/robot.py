@@ -89,6 +89,7 @@ class RobotTrainer:
         lattice: str | Path | None,
         seed: int,
         padding: float = 0.0,
+        allow_reverse: bool = False,
     ) -> None:
         """Make maps, tables and first weights.
 
@@ -103,8 +104,12 @@ class RobotTrainer:
             A file of motions that replaces the three; then `motion` must be None.
         seed
             Of all random draws.
+        allow_reverse
+            Whether the robot can drive the lattice's motions in reverse, too.
         """
-        motions = _read_motions(motion, turning_radius, resolution, lattice)
+        motions = _read_motions(
+            motion, turning_radius, resolution, lattice, allow_reverse
+        )
         self.network = RobotNetwork.untrained(
             read_footprint(footprint, padding), motions
         )
@@ -455,16 +460,21 @@ def _read_motions(
     turning_radius: float,
     resolution: float,
     lattice: str | Path | None,
+    allow_reverse: bool,
 ) -> Motions:
     """Return the primitives of a kind of motion, or of a lattice file.
 
     Either `motion` or `lattice` is None. `turning_radius`, in metres, and `resolution`,
-    in metres per cell, are for a kind of motion; a lattice file has its own.
+    in metres per cell, are for a kind of motion; a lattice file has its own, and can be
+    driven in reverse with `allow_reverse`.
     """
+    if allow_reverse and lattice is None:
+        problem = "allow_reverse is given without a lattice"
+        raise ValueError(f"{problem}; leave it out: all other motions can reverse")
     if motion is not None and lattice is None:
         return make_motions(motion, turning_radius, resolution)
     if lattice is not None and motion is None:
-        return read_lattice(lattice)
+        return read_lattice(lattice, allow_reverse)
     is_neither = motion is None
     problem = (
         "neither motion nor lattice is" if is_neither else "motion and lattice are"

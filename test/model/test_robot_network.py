@@ -97,11 +97,13 @@ def test_one_unit_serves_the_quarter_turns_of_a_primitive(motion: str) -> None:
         np.vstack([p[:1], p[1:-1] + np.array([0, 0.3 * (i < 9), 0]), p[-1:]])
         for i, p in enumerate(motions.poses)
     )
-    other = RobotNetwork.untrained(footprint, replace(motions, poses=bent))
+    # Their ways are longer.
+    bent_motions = replace(motions, poses=bent, cost=2 * motions.cost)
+    other = RobotNetwork.untrained(footprint, bent_motions)
     assert other.sizes["units"] > network.sizes["units"]
     other.tensors["weight"][other.swept_by_unit] = 2.0
     other.tensors["threshold"][:] = 1.0
-    expected = swept_cells(footprint, replace(motions, poses=bent))
+    expected = swept_cells(footprint, bent_motions)
     np.testing.assert_array_equal(other.swept(), expected)
 
 
@@ -218,3 +220,61 @@ def test_a_sum_that_float32_may_round_up_to_the_threshold_proves_nothing() -> No
             weight, np.array([threshold * share], np.float32), swept, np.zeros(1, int)
         )
         assert certificate.proved == is_proved
+
+
+CHANGES = {
+    "a tenth": lambda array: array / 10,
+    "less": lambda array: array * 0.9,
+    "ten times": lambda array: array * 10,
+    "negated": lambda array: -array,
+    "backward": lambda array: array[::-1],
+    "infinite": lambda array: array * np.inf,
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("name", [*exact().tensors, "cost"])
+def test_a_damaged_model_is_refused_or_keeps_what_bounds_rely_on(
+    name: str, change: str
+) -> None:
+    network = exact("ackermann")
+    tensors = network.tensors
+    with np.errstate(invalid="ignore"):
+        if name == "cost":
+            primitive = tensors["primitive"].copy()
+            primitive[:, 4] = CHANGES[change](primitive[:, 4])
+            tensors["primitive"] = primitive
+        else:
+            tensors[name] = np.ascontiguousarray(CHANGES[change](tensors[name]))
+    problem = ""
+    try:
+        content = model_bytes(network, metadata_of(network))
+        loaded = cast(RobotNetwork, model_of(content)[0])
+        swept = loaded.swept()
+    except ValueError as error:
+        problem = str(error)
+    if problem:
+        assert "train" in problem or "give" in problem
+        return
+    # Then it is a model of the same proof: each primitive costs its way at least, and
+    # what it sweeps is forbidden.
+    motions = loaded.motions
+    np.testing.assert_array_equal(swept, swept_cells(loaded.footprint, motions))
+    for cost, poses in zip(motions.cost.tolist(), motions.poses, strict=True):
+        assert cost >= 0.999 * np.hypot(*np.diff(poses[:, :2], axis=0).T).sum()
+
+
+def test_a_model_whose_motions_cost_too_little_is_not_proved() -> None:
+    network = exact()
+    primitive = network.tensors["primitive"].copy()
+    primitive[:, 4] /= 10
+    network.tensors["primitive"] = primitive
+    loaded = cast(RobotNetwork, model_of(model_bytes(network, metadata_of(network)))[0])
+    certificate = loaded.certificate()
+    assert not certificate.proved
+    # Turns on the spot may cost any share of a cell.
+    drives = int(network.motions.offset.any(axis=1).sum())
+    assert certificate.cheap == drives
+    assert f"{drives} of {certificate.primitives} cost less" in str(certificate)
+    with pytest.raises(ModelFileError, match=r"cost less than the way.*train-robot"):
+        loaded.swept()

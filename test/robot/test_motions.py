@@ -330,3 +330,104 @@ def test_wrong_footprints_are_named(text: Any, problem: str) -> None:
 def test_a_body_that_is_too_large_for_its_cells_is_refused() -> None:
     with pytest.raises(ValueError, match="give a coarser resolution"):
         swept_cells(read_footprint("8.0"), make_motions("differential", 0.5, 0.05))
+
+
+def lattice_content() -> dict[str, Any]:
+    """A lattice whose robot drives ahead and turns on the spot in each heading."""
+    motions = make_motions("differential", 0.5, 0.05)
+    angles = motions.angles.tolist()
+    primitives = []
+    for heading, start in enumerate(angles):
+        numbers = np.flatnonzero((motions.start == heading) & (motions.end == heading))
+        ahead = max(numbers.tolist(), key=lambda number: -motions.cost[number])
+        poses = motions.poses[ahead][1:] * (0.05, 0.05, 1)
+        straight = {"start_angle_index": heading, "end_angle_index": heading}
+        length = float(motions.cost[ahead]) * 0.05
+        primitives.append(
+            {**straight, "trajectory_length": length, "poses": poses.tolist()}
+        )
+        end = (heading + 1) % 16
+        turn = {"start_angle_index": heading, "end_angle_index": end}
+        spin = [[0, 0, start], [0, 0, angles[end]]]
+        primitives.append({**turn, "trajectory_length": 0.0, "poses": spin})
+    metadata = {"grid_resolution": 0.05, "heading_angles": angles}
+    return {"lattice_metadata": metadata, "primitives": primitives}
+
+
+def written(folder: Path, lattice: Any) -> Path:
+    file = folder / "lattice.json"
+    file.write_text(json.dumps(lattice))
+    return file
+
+
+def test_a_lattice_may_be_driven_in_reverse(tmp_path: Path) -> None:
+    file = written(tmp_path, lattice_content())
+    ahead, both = read_lattice(file), read_lattice(file, allow_reverse=True)
+    assert len(both.start) == len(ahead.start) + 16  # turns have no reverse
+    rows = {
+        (start, end, *offset): cost
+        for start, end, offset, cost in zip(
+            both.start.tolist(),
+            both.end.tolist(),
+            both.offset.tolist(),
+            both.cost.tolist(),
+            strict=True,
+        )
+    }
+    for start, end, (x, y), cost in zip(
+        ahead.start.tolist(),
+        ahead.end.tolist(),
+        ahead.offset.tolist(),
+        ahead.cost.tolist(),
+        strict=True,
+    ):
+        assert rows[start, end, x, y] == cost
+        if x or y:
+            assert rows[end, start, -x, -y] == 2 * cost
+    for start, end, offset, poses in zip(
+        both.start, both.end, both.offset, both.poses, strict=True
+    ):
+        first, last = both.angles[[start, end]]
+        assert np.abs(turn_between(poses[[0, -1], 2], [first, last])).max() < 1e-6
+        assert np.abs(poses[[0, -1], :2] - [[0, 0], offset]).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "problem"),
+    [
+        ("grid_resolution", 0, "grid_resolution is 0; give metres per cell"),
+        ("grid_resolution", -0.05, "grid_resolution is -0.05; give metres per cell"),
+        ("grid_resolution", math.nan, "grid_resolution is nan; give metres per cell"),
+        ("grid_resolution", None, "grid_resolution is None; give metres per cell"),
+        ("grid_resolution", ..., "lattice_metadata has no grid_resolution; give"),
+        ("heading_angles", ..., "lattice_metadata has no heading_angles; give"),
+        ("heading_angles", [0.1 * n for n in range(16)], "ends with a yaw of .*; give"),
+        ("trajectory_length", ..., "primitive 0 has no trajectory_length; give"),
+        ("trajectory_length", 0.02, "is 0.02, and its poses drive 0.05 m; give"),
+        ("trajectory_length", 1e-9, "is 1e-09, and its poses drive 0.05 m; give"),
+        ("trajectory_length", -1, "of primitive 0 is -1; give metres"),
+        ("trajectory_length", math.nan, "of primitive 0 is nan; give metres"),
+        ("poses", ..., "primitive 0 has no poses; give"),
+        ("poses", [], "the poses of primitive 0 have shape .*; give"),
+        ("start_angle_index", 16, "start_angle_index of primitive 0 is 16; give"),
+    ],
+)
+def test_a_lattice_without_sense_is_refused_with_the_remedy(
+    tmp_path: Path, name: str, value: Any, problem: str
+) -> None:
+    lattice = lattice_content()
+    owner = lattice["lattice_metadata"]
+    if name not in owner:
+        owner = lattice["primitives"][0]
+    owner[name] = value
+    if value is ...:
+        del owner[name]
+    with pytest.raises(ValueError, match=rf"lattice\.json: .*{problem}"):
+        read_lattice(written(tmp_path, lattice))
+
+
+def test_a_turn_on_the_spot_that_costs_nothing_is_refused(tmp_path: Path) -> None:
+    lattice = lattice_content()
+    lattice["primitives"][1]["trajectory_length"] = 1e-9
+    with pytest.raises(ValueError, match=r"of primitive 1 is 1e-09.*; give .* 0 for"):
+        read_lattice(written(tmp_path, lattice))
