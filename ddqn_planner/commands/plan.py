@@ -78,6 +78,7 @@ OPTIONS: Final = (
         "obstacles so near to a start do not count, metres",
     ),
     Option("yaw-tolerance", float, 0.0, "body: how far such a goal may turn, radians"),
+    Option("either-direction", bool, False, "body: the goal also in reverse"),
     Option("bound", float, 1.0, "body: how many times the least cost a path may have"),
     Option("cells", bool, False, "print each cell of the path, as X Y"),
     Option("csv", Path, None, "write the path's cells and metres, or its poses"),
@@ -91,7 +92,7 @@ CELL_OPTIONS: Final = (
     "mode",
     "cells",
 )
-BODY_OPTIONS: Final = ("yaws", "yaw_tolerance", "bound")
+BODY_OPTIONS: Final = ("yaws", "yaw_tolerance", "either_direction", "bound")
 
 
 class PlanOptions(Namespace):
@@ -112,6 +113,7 @@ class PlanOptions(Namespace):
     start_clearing_radius: float
     yaws: tuple[float, float]
     yaw_tolerance: float
+    either_direction: bool
     bound: float
     cells: bool
     csv: Path | None
@@ -308,7 +310,13 @@ def _plan_poses(
         "metres, 0 or more",
     )
     plan = planner.plan_poses(
-        grid, start_pose, goal_pose, tolerance, options.bound, radius
+        grid,
+        start_pose,
+        goal_pose,
+        tolerance,
+        options.bound,
+        radius,
+        options.either_direction,
     )
     metres = plan.length * grid.resolution
     title = plan.status.value

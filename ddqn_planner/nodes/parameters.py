@@ -1,5 +1,6 @@
 """The planner's parameters, in the words of its ``--help``."""
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -69,10 +70,13 @@ class PlannerSettings:
         0.0, "Metres: how far an occupied or cut off goal may move", (0, 1000)
     )
     yaw_tolerance: float = parameter(
-        0.0, "Radians: the same for a robot's heading", (0, 4)
+        0.0, "Radians: the same for a robot's heading; pi or more: any", (0, 4)
+    )
+    either_direction: bool = parameter(
+        False, "A robot's goal may be reached forwards or backwards"
     )
     path_bound: float = parameter(
-        1.2, "A robot's first path: how many times the least cost", (1, 10)
+        1.2, "A robot's first path: how many times the least cost", (1, math.inf)
     )
     replan_period: float = parameter(
         1.0, "Seconds between plans on a free path; 0: each map", (0, 3600)

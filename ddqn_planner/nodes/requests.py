@@ -532,7 +532,10 @@ def request_to(
     if len(goals) > 1:
         tolerance = 0.0
     if planner.pose_planner is not None:
-        yaw_tolerance = settings.yaw_tolerance if len(goals) == 1 else 0.0
+        has_any_heading = settings.yaw_tolerance >= math.pi
+        yaw_tolerance = settings.yaw_tolerance
+        if len(goals) > 1 and not has_any_heading:
+            yaw_tolerance = 0.0
         return PoseRequest(
             grid,
             start=pose_of(start.message),
@@ -541,6 +544,7 @@ def request_to(
             bound=settings.path_bound,
             switch_threshold=settings.switch_threshold,
             start_clearing_radius=clearing_radius_of_body(settings),
+            either_direction=settings.either_direction,
         )
     return PlanRequest(
         grid,

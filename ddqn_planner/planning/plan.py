@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -112,6 +113,24 @@ class PoseRequest(PathRequest[Pose]):
     tolerance: tuple[float, float] = (0.0, 0.0)  # metres, radians; for one goal
     bound: float = 1.2
     start_clearing_radius: float = 0.0  # metres
+    either_direction: bool = False  # a goal may be reached forwards or backwards
+
+    @property
+    def has_any_heading(self) -> bool:
+        """Whether a path may end at its goal in any heading."""
+        _, radians = self.tolerance
+        return radians * ROUNDING >= math.pi
+
+    @property
+    def may_goal_move(self) -> bool:
+        """Whether a goal without room may move or turn to another state."""
+        metres, radians = self.tolerance
+        return metres > 0 or (radians > 0 and not self.has_any_heading)
+
+    @property
+    def reach(self) -> tuple[tuple[float, float], bool]:
+        """Where a path may end besides the goals themselves."""
+        return self.tolerance, self.either_direction
 
     @property
     def cells(self) -> tuple[Cell, ...]:

@@ -302,6 +302,7 @@ class Planner:
         tolerance: tuple[float, float] = (0.0, 0.0),
         bound: float = 1.2,
         start_clearing_radius: float = 0.0,
+        either_direction: bool = False,
     ) -> PosePlan:
         """Plan a path for a robot with a body and a heading, by a model of that robot.
 
@@ -319,16 +320,20 @@ class Planner:
             Likewise; of several, the one that the cheapest path reaches.
         tolerance : (float, float)
             Metres and radians by which a goal may move if the body has no room there,
-            or if no path leads to it.
+            or if no path leads to it. With pi radians or more, goals have no heading:
+            the path ends in the heading that costs least.
         bound : float
             The factor by which the cost of a path may exceed the least cost, 1 or more.
-            With 1 a path of the least cost is found, which takes longer.
+            With 1 a path of the least cost is found, which takes longer; with
+            `math.inf` any path.
             `PosePlan.bound` tells what is proved of the path.
         start_clearing_radius : float
             For a start without room for the body: occupied cells that the body covers
             there do not count until the first free pose, if their centres are no
             farther than this from that of the start's cell, in metres. With 0, all
             cells count; with `math.inf`, none of those under the body.
+        either_direction : bool
+            Whether the robot may also arrive with the opposite of the goal's heading.
 
         Returns
         -------
@@ -356,6 +361,7 @@ class Planner:
                 math.inf,
                 "0 metres or more",
             ),
+            either_direction=as_flag("either_direction", either_direction),
         )
         if self.pose_planner is None:
             raise ValueError(

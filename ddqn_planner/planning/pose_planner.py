@@ -137,10 +137,11 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         start = self._start_of(request, world)
         if start is None:
             return PosePlan(PlanStatus.START_OCCUPIED)
-        goal_states = self._states_at(grid, goals, world)
+        ends = self._ends_at(request, goals)
+        goal_states = self._states_at(grid, ends, world)
         plan = yield from self._to_states(request, goal_states, start, clock)
         has_path = plan.status is PlanStatus.SUCCEEDED
-        if has_path or not any(request.tolerance):
+        if has_path or not request.may_goal_move:
             return plan
         states_around = self._states_around_goal(request, start.state, world)
         if not len(states_around):
@@ -170,7 +171,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
             return PosePlan(PlanStatus.GOAL_OCCUPIED)
         grid = request.grid
         ignored = start.ignored.tobytes()
-        key = request.goals, request.tolerance, states.tobytes(), ignored
+        key = request.goals, request.reach, states.tobytes(), ignored
         field = self.fields.get(key, grid, lambda: PoseField(states, grid, start.world))
         bound = field.reach(start.state, request.bound, VISITS)
         while bound is None:
@@ -246,13 +247,14 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         free_grid, free_world : GridMap and World
             The map with unknown cells free, and the body on it.
         """
-        if any(request.tolerance):
+        if request.may_goal_move:
             free_request = replace(request, grid=free_grid)
             return self._states_around_goal(free_request, start, free_world)
         goals_with_room = [
             goal for goal, place in zip(request.goals, places, strict=True) if not place
         ]
-        return self._states_at(free_grid, goals_with_room or request.goals, free_world)
+        ends = self._ends_at(request, goals_with_room or request.goals)
+        return self._states_at(free_grid, ends, free_world)
 
     def _through_unknown_space(
         self, field: PoseField, start: State
@@ -284,9 +286,10 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         cell = grid.world_to_cell(*goal[:2])
         if not grid.contains(cell):
             return unknown_space.OUTSIDE
-        if self._state_at(grid, goal, self._world(grid)) is not None:
+        ends = self._ends_at(request, [goal])
+        if len(self._states_at(grid, ends, self._world(grid))):
             return ""
-        if self._state_at(free_grid, goal, free_world) is not None:
+        if len(self._states_at(free_grid, ends, free_world)):
             return self._place_in_words(request, cell)
         return unknown_space.OCCUPIED
 
@@ -360,7 +363,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         )  # (N, 3)
         if not len(rest):
             return plan
-        ends = np.array([*plan.poses[-1:], *request.goals])
+        ends = np.array([*plan.poses[-1:], *self._ends_at(request, request.goals)])
         is_other_end = paths.nearest_pose(ends, rest[-1], grid, SAME_END) < 0
         if is_other_end:
             return plan
@@ -458,6 +461,22 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         count_with_room = move_free_to_front(states, world)
         return tuple(states[0].tolist()) if count_with_room else None
 
+    def _ends_at(self, request: PoseRequest, goals: Sequence[Pose]) -> list[Pose]:
+        """Return the poses in which a path may end at goals (x, y, yaw).
+
+        They have the goals' headings, and besides the opposite headings, or all
+        headings, if the request says so.
+        """
+        ends: list[Pose] = []
+        for x, y, yaw in goals:
+            yaws = [yaw]
+            if request.either_direction:
+                yaws = [yaw, yaw + math.pi]
+            if request.has_any_heading:
+                yaws = (self.motions.angles + request.grid.origin[2]).tolist()
+            ends += [(x, y, yaw_of_end) for yaw_of_end in yaws]
+        return ends
+
     def _states_at(
         self, grid: GridMap, poses: Iterable[Pose], world: World
     ) -> NDArray[np.int64]:
@@ -494,7 +513,9 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         radius = metres * ROUNDING / grid.resolution  # cells
         # In which headings a path may end: within the tolerance, or the nearest one.
         turn = np.abs(turn_between(self.motions.angles, yaw - grid.origin[2]))  # (16,)
-        may_end = turn <= max(radians * ROUNDING, turn.min())  # (16,)
+        if request.either_direction:
+            turn = np.minimum(turn, math.pi - turn)
+        may_end = turn <= max(radians, turn.min()) * ROUNDING  # (16,)
         start_column, start_row, start_heading = start
         start_distance = math.hypot(start_column - goal_column, start_row - goal_row)
         if may_end[start_heading] and start_distance <= radius:
@@ -554,8 +575,8 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         """
         for field in self.fields.kept:
             path = field.path  # the last one that was made from the field
-            goals, tolerance, *_ = field.key
-            is_for_goals = goals == request.goals and tolerance == request.tolerance
+            goals, reach, *_ = field.key
+            is_for_goals = goals == request.goals and reach == request.reach
             if path is None or not is_for_goals:
                 continue
             # (N, 2); None for another place, and after too many changes.
