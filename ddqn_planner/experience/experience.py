@@ -65,8 +65,10 @@ LATEST = 1e12  # seconds of a clock: a pose of a later time is not believed
 MAX_MEDIAN_FACTOR = 4.0
 # Times the usual speed: a faster move is not believed.
 MAX_SPEED_FACTOR = 3
-# Of the log speed: the steps in which the fastest move that a map knows of changes.
-FAST_STEP = 0.1
+# Of the log slowness in the open: a map's fastest move changes in such steps.
+OPEN_STEP = 0.1
+# By default, the share by which the shortest path may take longer than the best one.
+EXPLORATION = 0.2
 
 
 class ExperienceFileError(ValueError):
@@ -418,7 +420,7 @@ class Experience:
             self.evidence.posterior = older.evidence.posterior
             older.evidence.posterior = None
 
-    def apply(self, grid: GridMap, exploration: float = 0.0) -> GridMap:
+    def apply(self, grid: GridMap, exploration: float = EXPLORATION) -> GridMap:
         """Return a map whose moves cost expected time: `Plan.cost` is in seconds.
 
         Parameters
@@ -426,60 +428,24 @@ class Experience:
         grid : GridMap
             The map; its own costs multiply the time.
         exploration : float
-            0 to 10. If it is not 0, plans lead where driving may be faster: places
-            count as faster by a standard deviation. But no plan is expected to take
-            longer than the best plan by more than this share of its time. `Plan.cost`
-            is the expected time.
+            0 to 10. The share of the best plan's time by which the shortest path may be
+            expected to take longer, and still be driven: as long as that difference
+            does not exceed its own standard error. No new plan is expected to take
+            longer. `Plan.cost` is the expected time. With 0, plans are the best ones.
         """
         share = as_number("exploration", exploration, 0, 10, "0 to 10")
         posterior = self.evidence.posterior_over(grid)
-        # The log slowness of the fastest place, 0 or less, rounded to steps: all fields
-        # have to be made anew when it changes.
-        steps = math.floor(self.evidence.levels.fastest_log / FAST_STEP + 0.5)
-        fastest = FAST_STEP * min(0, steps)
-        expected = self._timed(grid, posterior, "expected", 0.0, fastest)
+        # All fields have to be made anew when the speed in the open changes.
+        steps = round(self.evidence.levels.open_log / OPEN_STEP)
+        open_log = OPEN_STEP * steps
+        # No place is believed to be faster than the open floor.
+        slowness = posterior.paint(open_log)
+        seconds = grid.resolution / self.nominal_speed * math.exp(open_log)
+        expected = grid.with_times(slowness, seconds)
         if not share:
             return expected
-        # The bold map: each of P places is faster by one standard deviation of its log
-        # slowness. The largest deviation is rounded up to steps.
-        deviation = math.sqrt(posterior.variance) * posterior.unknown  # (P,)
-        largest_deviation = deviation.max(initial=0)
-        largest = FAST_STEP * math.ceil(largest_deviation / FAST_STEP)
-        bold = self._timed(grid, posterior, "bold", deviation, fastest - largest)
-        # The safe map: no place is faster by more than the share. So no plan on it is
-        # expected to take longer than the best plan by more than the share.
-        limit = math.log(1 + share)
-        limited = np.minimum(deviation, limit)
-        safe = self._timed(grid, posterior, "safe", limited, fastest - limit)
-        return expected.with_layers(exploration=Exploration(share, bold, safe))
-
-    def _timed(
-        self,
-        grid: GridMap,
-        posterior: Posterior,
-        name: str,
-        optimism: Float64 | float,
-        fastest: float,
-    ) -> GridMap:
-        """Return the map with expected times: slowness, and seconds per cell.
-
-        The slowness (H, W) is that of each cell over that of the fastest place, whose
-        time for a cell is the seconds per cell.
-
-        Parameters
-        ----------
-        grid, posterior : GridMap, Posterior
-            The map, and the posterior of its P places.
-        name : str
-            A name of the layer, under which `posterior` keeps its array.
-        optimism : (P,) float64, or float
-            The logarithm by which each place is assumed to be faster than expected.
-        fastest : float
-            The log slowness of the fastest place, after optimism.
-        """
-        slowness = posterior.paint(name, optimism, fastest)
-        seconds = grid.resolution / self.nominal_speed * math.exp(fastest)
-        return grid.with_times(slowness, seconds)
+        exploration_layers = Exploration(share, grid, self.uncertainty(grid))
+        return expected.with_layers(exploration=exploration_layers)
 
     def slowness(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: seconds, with waits, over those at nominal speed."""

@@ -154,7 +154,7 @@ class Posterior:
         self._features = map_features(grid)[y, x].astype(np.float64)  # (P, FEATURES)
         self.coefficients = np.zeros(FEATURES)
         self.variance = VARIANCE
-        self._painted: dict[str, Painted] = {}
+        self._painted: Painted | None = None  # by the last call of `paint`
 
     def deviation_of(self, seconds: Float64, places: Int64) -> float:
         """Return the standard deviation of the logarithm of a path's time.
@@ -315,30 +315,22 @@ class Posterior:
             values = values + self._links @ values
         return values
 
-    def paint(self, name: str, optimism: Float64 | float, fastest: float) -> Float32:
-        """Return the slowness of each cell over that of the fastest place.
+    def paint(self, open_log: float) -> Float32:
+        """Return the slowness of each cell over that of the open floor.
 
-        (H, W) float32: 1 to MAX_SLOWNESS, in steps of 2 %, and 1 in occupied cells.
+        (H, W) float32: 1 to MAX_SLOWNESS, in steps of 2 %, and 1 in occupied cells. No
+        place counts as faster than the open floor, whose log slowness is `open_log`.
         While no value changes, the array is the very object of the last call, so that
         fields need no repair.
-
-        Parameters
-        ----------
-        name : str
-            A name for the layer, under which the array is kept for the next call.
-        optimism : (P,) float64, or float
-            The logarithm by which each place is assumed to be faster than expected.
-        fastest : float
-            The log slowness of the fastest place.
         """
-        log = np.log(self.slowness) - optimism - fastest  # (P,)
+        log = np.log(self.slowness) - open_log  # (P,)
         possible_log = np.clip(log, 0, math.log(MAX_SLOWNESS))
         steps = np.rint(possible_log / math.log(1 + STEP)).astype(np.int64)
         values = STEPS[steps]  # (P,)
-        painted = self._painted.get(name)
+        painted = self._painted
         if painted is None or not np.array_equal(values, painted.values):
             painted = Painted(values, self.to_cells(values, occupied=1))
-            self._painted[name] = painted
+            self._painted = painted
         return painted.layer
 
     def to_cells(self, values: Float32, occupied: float) -> Float32:

@@ -418,14 +418,10 @@ class GridMap:
         )
 
     def with_times_of(self, other: GridMap) -> GridMap:
-        """Return the same map with the expected and the optimistic times of another."""
+        """Return the same map with the times of another, and how sure they are."""
         exploration = other.exploration
         if exploration is not None:
-            exploration = Exploration(
-                share=exploration.share,
-                bold=self.with_times_of(exploration.bold),
-                safe=self.with_times_of(exploration.safe),
-            )
+            exploration = exploration._replace(untimed=self)
         return self.with_layers(
             slowness=other.slowness,
             seconds_per_cell=other.seconds_per_cell,
@@ -478,7 +474,7 @@ class GridMap:
 
     @cached_property
     def exploration(self) -> Exploration | None:
-        """The optimistic maps, added by `Experience.apply` through `with_layers`."""
+        """How sure the times are, added by `Experience.apply` through `with_layers`."""
         return None  # unless `with_layers` has set the attribute
 
     def labels(self, move_rule: MoveRule | str) -> NDArray[np.int32]:
@@ -731,11 +727,11 @@ class History(NamedTuple):
 
 
 class Exploration(NamedTuple):
-    """The same map twice, where places count as faster the less of them is known."""
+    """When the shortest path is driven, not the one that is expected to be quicker."""
 
     share: float  # by which a path may be expected to take longer than the best one
-    bold: GridMap  # by a standard deviation
-    safe: GridMap  # by the share at most, so that each plan keeps it
+    untimed: GridMap  # the same map without expected times
+    deviation: NDArray[np.float32]  # (H, W): of the logarithm of each cell's time
 
 
 def _sum_of_words(layer: Occupancy | NDArray[np.int8]) -> int:

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
+from ddqn_planner.experience.experience import EXPLORATION
 from ddqn_planner.grid import MoveRule
 from ddqn_planner.nodes.declared import Declared, declared_by, parameter
 from ddqn_planner.planning import PlanMethod
@@ -126,7 +127,7 @@ class PlannerSettings:
     )
     experience: str = parameter("", "What drives taught: a file or folder; '': none")
     exploration: float = parameter(
-        0.1, "Share by which a path may take longer, to learn", (0, 10)
+        EXPLORATION, "Share by which a path may take longer, to learn", (0, 10)
     )
     follow_trainer: bool = parameter(
         False, "Load what the trainer saves", read_only=True

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ddqn_planner.grid import Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import Cells
-from ddqn_planner.grid.grid_map import Exploration
 from ddqn_planner.grid.map_changes import changed_cells
 from ddqn_planner.model import QNetwork
 from ddqn_planner.model.move_costs import MoveCosts
@@ -29,7 +27,7 @@ from ddqn_planner.planning.paths import (
     way_and_ends,
 )
 from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus
-from ddqn_planner.planning.segments import SAME_COST, Path, cost_along, straightened
+from ddqn_planner.planning.segments import Path, cost_along, straightened
 
 VISITS = 2**18  # about how many cells a field visits in one step of a plan: some 30 ms
 
@@ -126,35 +124,10 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
         yield from ()  # it never pauses, but must be a generator
         return unknown_space.reason_of(request, plan)
 
-    def _explore(
-        self, request: PlanRequest, exploration: Exploration, clock: Clock
-    ) -> PausingGenerator[Plan]:
-        """Return the plan on the bold map, or the plan on the safe map.
-
-        Both maps assume that cells which were seldom driven through are quicker than
-        expected, the bold map more so. The path on the bold map is taken if its
-        expected cost is at most (1 + `exploration.share`) times the least expected
-        cost. The cost of the plan is the expected one, in seconds. `clock` measures the
-        time of the request, without its pauses.
-        """
-        grid = request.grid  # the map of expected times
-        rule = request.move_rule
-        bold_request = replace(request, grid=exploration.bold)
-        plan = yield from self._find_on_map(bold_request, clock)
-        if not plan.path.size:
-            return plan
-        is_under_way = plan.extra_cost is not None
-        if not is_under_way:  # a path under way was judged when it was new
-            best_request = replace(request, under_way=())
-            best = yield from self._find_on_map(best_request, clock)
-            best_cost = best.cost or math.inf
-            greatest_cost = (1 + exploration.share) * best_cost * SAME_COST
-            if _cost(plan.path, grid, rule) > greatest_cost:
-                safe_request = replace(request, grid=exploration.safe)
-                plan = yield from self._find_on_map(safe_request, clock)
-        if not plan.path.size:
-            return plan
-        return replace(plan, cost=_cost(plan.path, grid, rule))
+    def expected(self, plan: Plan, request: PlanRequest) -> Plan:
+        """Return a plan with the cost of its path on the map of a request."""
+        cost = _cost(plan.path, request.grid, request.move_rule)
+        return replace(plan, cost=cost)
 
     def _find_on_map(
         self, request: PlanRequest, clock: Clock

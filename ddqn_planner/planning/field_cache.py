@@ -14,7 +14,7 @@ from ddqn_planner.model.move_costs import MoveCosts
 
 # For a planner's Q fields: 3 of 500 x 500 cells, at 9 bytes per cell.
 CACHE_BYTES = 2**23
-# Fields, whatever their size: to and fro, or the three of `Exploration`.
+# Fields, whatever their size: to and fro, or the two of `Exploration`.
 ALWAYS_KEPT = 3
 MOST_KEPT = 64  # fields, however small: a request's map is compared with that of each
 OBJECTS = 4_000  # bytes of a field, its costs and its map beside their arrays
@@ -215,7 +215,7 @@ def _put_on(field: Field[Any], grid: GridMap) -> None:
     maps = [grid]
     exploration = grid.exploration
     if exploration is not None:
-        maps += [exploration.bold, exploration.safe]
+        maps.append(exploration.untimed)
     values: list[Any] = [*(field.costs or ())]
     for map_ in maps:
         # A copy, as other threads may add to the map what they compute of it.

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.grid.grid_map import Exploration
 from ddqn_planner.planning import unknown_space
+from ddqn_planner.planning.exploration import error_of_difference
 from ddqn_planner.planning.plan import PathRequest, Plan
 
 AnyPlan = TypeVar("AnyPlan", bound=Plan)
@@ -97,15 +98,45 @@ class PathFinder(ABC, Generic[Request, AnyPlan]):
             return (yield from self._find_on_map(request, clock))
         return (yield from self._explore(request, exploration, clock))
 
+    def _explore(
+        self, request: Request, exploration: Exploration, clock: Clock
+    ) -> PausingGenerator[AnyPlan]:
+        """Return the best plan, or the shortest one if the best is not surely quicker.
+
+        The shortest path is left only if another one is expected to be quicker by more
+        than the standard error of the difference, or by more than the share
+        `exploration.share` of its own time: whoever leaves it for less follows errors,
+        and learns nothing of it. The path under way is kept on the same terms. The cost
+        of the plan is the expected one, in seconds. `clock` measures the time of the
+        request, without its pauses.
+        """
+        best = yield from self._find_on_map(request, clock)
+        is_kept = best.extra_cost is not None
+        if is_kept or best.cost is None:
+            return best
+        shortest_request = replace(request, grid=exploration.untimed)
+        shortest = yield from self._find_on_map(shortest_request, clock)
+        if not shortest.path.size:
+            return best
+        shortest = self.expected(shortest, request)
+        assert shortest.cost is not None
+        error = error_of_difference(
+            shortest.path, best.path, request.grid, exploration.deviation
+        )
+        greatest_loss = min(error, exploration.share * best.cost)
+        is_as_quick = shortest.cost <= best.cost + greatest_loss
+        return shortest if is_as_quick else best
+
     @abstractmethod
     def _find_on_map(self, request: Request, clock: Clock) -> PausingGenerator[AnyPlan]:
         """Return the plan on a map without an exploration."""
 
     @abstractmethod
-    def _explore(
-        self, request: Request, exploration: Exploration, clock: Clock
-    ) -> PausingGenerator[AnyPlan]:
-        """Return the plan on a map of expected times that has an exploration."""
+    def expected(self, plan: AnyPlan, request: Request) -> AnyPlan:
+        """Return a plan on the map without times with its expected cost, in seconds.
+
+        The map of the request has the expected times.
+        """
 
     @abstractmethod
     def _reason(self, request: Request, plan: AnyPlan) -> Generator[None, None, str]:

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.grid import Cell, GridMap
-from ddqn_planner.grid.grid_map import Exploration
 from ddqn_planner.grid.inflation import with_unknown_free
 from ddqn_planner.planning import pose_paths as paths
 from ddqn_planner.planning import unknown_space
@@ -83,15 +82,20 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         """Return how a copy is made, also in another process: without fields."""
         return PosePlanner, (self._network,)
 
-    def _explore(
-        self, request: PoseRequest, exploration: Exploration, clock: Clock
-    ) -> PausingGenerator[PosePlan]:
-        """Return the plan on the safe map, with the expected cost of its path."""
-        safe_request = replace(request, grid=exploration.safe)
-        plan = yield from self._find_on_map(safe_request, clock)
-        if len(plan.poses) < 2:
+    def expected(self, plan: PosePlan, request: PoseRequest) -> PosePlan:
+        """Return a plan with the cost of its path on the map of a request.
+
+        The cost of a plan is that of its primitives. On this map it is multiplied by
+        the ratio of the costs along the poses, on this map to that without times.
+        """
+        exploration = request.grid.exploration
+        if exploration is None or plan.cost is None or len(plan.poses) < 2:
             return plan
-        return _with_expected_cost(plan, request.grid, exploration.safe)
+        seconds = [
+            paths.cost_of_poses(plan.poses, grid) * (grid.seconds_per_cell or 1.0)
+            for grid in (request.grid, exploration.untimed)
+        ]
+        return replace(plan, cost=plan.cost * seconds[0] / seconds[1])
 
     def _find_on_map(
         self, request: PoseRequest, clock: Clock
@@ -607,22 +611,6 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         world = world_of(grid, self.body, older_world, changed)
         self._map = grid, world
         return world
-
-
-def _with_expected_cost(
-    plan: PosePlan, expected: GridMap, planned: GridMap
-) -> PosePlan:
-    """Return a plan with the cost in seconds that it has on the map of expected times.
-
-    The plan's cost, which was computed from primitives on the map `planned`, is
-    multiplied by a ratio: of the costs along the plan's poses, on the map `expected` to
-    that on the map `planned`.
-    """
-    expected_cost = paths.cost_of_poses(plan.poses, expected)
-    expected_seconds = expected_cost * (expected.seconds_per_cell or 1.0)
-    planned_cost = paths.cost_of_poses(plan.poses, planned)
-    planned_seconds = planned_cost * (planned.seconds_per_cell or 1.0)
-    return replace(plan, cost=(plan.cost or 0.0) * expected_seconds / planned_seconds)
 
 
 def _reason_of_places(places: Sequence[str], grid: GridMap, has_start: bool) -> str:

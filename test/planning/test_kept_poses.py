@@ -81,21 +81,26 @@ def test_a_kept_path_is_proved_as_far_as_the_new_one(planner: Planner) -> None:
     assert kept.bound == pytest.approx(new.bound * (1 + kept.extra_cost))
 
 
-def test_a_body_explores_within_the_share_alone(planner: Planner) -> None:
-    random = np.random.default_rng(0)
-    slowness = random.uniform(4, 8, (3, 20, 40)).astype(np.float32)
-    slowness[0] *= 1.1
+@pytest.mark.parametrize(("share", "is_left"), [(0.01, True), (1.0, False)])
+def test_a_body_leaves_the_shortest_path_by_the_share_too(
+    planner: Planner, share: float, is_left: bool
+) -> None:
+    slowness = np.ones((20, 40), dtype=np.float32)
+    slowness[6:15, 14:26] = 1.5
     hall = GridMap(np.zeros((20, 40)), CELL)
-    expected, bold, safe = (
-        replace(hall, slowness=each, seconds_per_cell=1.0) for each in slowness
-    )
-    timed = expected.with_layers(exploration=Exploration(0.1, bold, safe))
-    paths = [plan(planner, grid, START, bound=1.0) for grid in (timed, safe, bold)]
-    assert np.array_equal(paths[0].poses, paths[1].poses)
-    assert not np.array_equal(paths[0].poses, paths[2].poses)
-    costs = [cost_of_poses(paths[0].poses, grid) for grid in (expected, safe)]
-    assert paths[0].cost == pytest.approx(paths[1].cost * costs[0] / costs[1])
-    assert costs[0] > 1.05 * costs[1]
+    expected = replace(hall, slowness=slowness, seconds_per_cell=1.0)
+    exploration = Exploration(share, hall, np.ones_like(slowness))
+    timed = expected.with_layers(exploration=exploration)
+    for under_way in ((), plan(planner, hall, START, bound=1.0).poses):
+        explored, best, shortest = (
+            plan(planner, grid, START, bound=1.0, under_way=under_way)
+            for grid in (timed, expected, hall)
+        )
+        chosen = best if is_left else shortest
+        assert np.array_equal(explored.poses, chosen.poses)
+        costs = [cost_of_poses(path.poses, expected) for path in (explored, best)]
+        assert explored.cost == pytest.approx(best.cost * costs[0] / costs[1], rel=0.1)
+        assert best.cost <= explored.cost <= (1 + share) * best.cost
 
 
 def test_it_keeps_no_path_that_is_blocked_or_leads_elsewhere(
