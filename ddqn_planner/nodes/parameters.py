@@ -127,7 +127,9 @@ class PlannerSettings:
     )
     experience: str = parameter("", "What drives taught: a file or folder; '': none")
     exploration: float = parameter(
-        EXPLORATION, "Share by which a path may take longer, to learn", (0, 10)
+        EXPLORATION,
+        "Share by which the shortest path may take longer than the best one",
+        (0, 10),
     )
     follow_trainer: bool = parameter(
         False, "Load what the trainer saves", read_only=True

@@ -111,20 +111,29 @@ def test_what_is_explored_is_expected_to_take_no_longer_than_the_share(
         assert tried.cost <= best.cost * (1 + share) * (1 + 1e-6)
 
 
-def test_a_map_tells_how_sure_its_times_are_and_nobody_is_faster_than_in_the_open() -> (
-    None
-):
-    drives = [straight((2, 5), (12, 5), 0.5)] + 12 * [straight((2, 8), (12, 8))]
-    experience = driven(*drives)
+def test_nobody_is_believed_to_be_faster_than_in_the_open() -> None:
+    fast = straight((2, 5), (12, 5), 0.5)
+    others = [straight((2, y), (12, y)) for y in (1, 3, 7, 9)]
+    experience = driven(*[fast, *others] * 6)
+    grid = experience.apply(HALL)
+    open_slowness = SPEED / experience.learned_speed
+    assert at(HALL, experience.slowness(HALL), 7, 5) < 0.8 * open_slowness
+    assert at(HALL, grid.slowness, 7, 5) == 1
+    seconds_per_cell = HALL.resolution / SPEED * open_slowness
+    assert grid.seconds_per_cell == pytest.approx(seconds_per_cell, rel=0.06)
+
+
+def test_a_map_tells_how_sure_its_times_are() -> None:
+    experience = driven(straight((2, 5), (12, 5), 2))
     grid = experience.apply(HALL)
     assert grid.exploration is not None
     assert grid.exploration.share == EXPLORATION
     assert grid.exploration.untimed is HALL
     deviation = experience.uncertainty(HALL)
     np.testing.assert_array_equal(grid.exploration.deviation, deviation)
-    assert grid.slowness.min() == 1
-    np.testing.assert_array_equal(grid.slowness, experience.apply(HALL, 0.0).slowness)
-    assert experience.apply(HALL, 0.0).exploration is None
+    best = experience.apply(HALL, 0.0)
+    assert best.exploration is None
+    np.testing.assert_array_equal(grid.slowness, best.slowness)
 
 
 def test_waiting_counts_as_time_and_standing_before_a_drive_does_not() -> None:
@@ -239,10 +248,12 @@ def test_the_cost_of_a_plan_is_its_expected_time_and_no_path_is_faster(
     grid = GridMap(
         occupancy, 0.25, cost=random.integers(0, 99, (40, 60)) if seed % 2 else None
     )
-    applied = three_lines.apply(grid)
+    applied = three_lines.apply(grid, exploration=0.0)
+    assert applied.seconds_per_cell is not None
     free_cells = grid.free_cells()
     goal = free_cells[5]
-    seconds = shortest_distances(applied, goal, MoveRule.ROBOT_SAFE) * 0.25 / SPEED
+    distances = shortest_distances(applied, goal, MoveRule.ROBOT_SAFE)
+    seconds = distances * applied.seconds_per_cell
     for start in free_cells[::211]:
         plan = PLANNER.plan(applied, start, goal, MoveRule.ROBOT_SAFE)
         if plan.cells:
@@ -251,9 +262,8 @@ def test_the_cost_of_a_plan_is_its_expected_time_and_no_path_is_faster(
             )
             if grid.cost is None:
                 told = three_lines.expected_time(grid, plan.path)
-                assert told.seconds == pytest.approx(
-                    plan.cost, rel=0.03
-                )  # in steps of 2 %
+                # Costs are in steps of 2 %, and no place is faster than the open floor.
+                assert told.seconds == pytest.approx(plan.cost, rel=0.06)
                 straight_plan = PLANNER.plan(applied, start, goal, simplified=True)
                 told = three_lines.expected_time(grid, straight_plan.path)
                 # It looks at one cell of each column or row that a segment passes.
