@@ -435,10 +435,10 @@ class Experience:
         """
         share = as_number("exploration", exploration, 0, 10, "0 to 10")
         posterior = self.evidence.posterior_over(grid)
-        # All fields have to be made anew when the speed in the open changes.
+        # No place is believed to be faster than the open floor, whose log slowness is 0
+        # or less: drives may all have been slow. A change makes all fields anew.
         steps = round(self.evidence.levels.open_log / OPEN_STEP)
-        open_log = OPEN_STEP * steps
-        # No place is believed to be faster than the open floor.
+        open_log = OPEN_STEP * min(0, steps)
         slowness = posterior.paint(open_log)
         seconds = grid.resolution / self.nominal_speed * math.exp(open_log)
         expected = grid.with_times(slowness, seconds)
