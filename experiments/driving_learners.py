@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Final, Protocol
+from typing import Final, Protocol
 
 import numpy as np
 from driving_laws import Float64
@@ -97,7 +97,7 @@ class MarkovField:
         )
 
 
-LEARNERS: Final[dict[str, Callable[[GridMap], Any]]] = {
+LEARNERS: Final[dict[str, Callable[[GridMap], Learner]]] = {
     "experience": lambda _: Experience(SPEED),
     "Markov field": MarkovField,
 }

@@ -3,18 +3,19 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, Final
+from typing import Final
 
 import driving_worlds as worlds
 import numpy as np
 from driving_kinds import law_of
 from driving_laws import Float64
-from driving_learners import LEARNERS
+from driving_learners import LEARNERS, Learner
 from driving_worlds import RATE, RULE, Drive, World, drive, path_seconds
 from random_maps import Random
 
 from ddqn_planner import Experience, Planner, inflate, load_map
-from ddqn_planner.grid import Cell
+from ddqn_planner.experience.prior import Prior
+from ddqn_planner.grid import Cell, GridMap
 
 MOVED_AT: Final = 100
 """The mission before which all that is slow moves, in jobs where it moves."""
@@ -97,13 +98,13 @@ def run(job: Job) -> list[Result]:
     results = []
     for name in job.learners:
         learner = LEARNERS[name](world.grid)
-        if job.prior_from:
+        if job.prior_from and isinstance(learner, Experience):
             learner.prior = _taught_prior(job, job.prior_from)
         results.append(run_in(job, world, name, learner))
     return results
 
 
-def _taught_prior(job: Job, kind: str) -> Any:
+def _taught_prior(job: Job, kind: str) -> Prior | None:
     """Return the prior that a robot learns in a world of another kind."""
     lesson = replace(job, kind=kind, prior_from="", missions=TEACHING)
     teacher = Experience(worlds.SPEED)
@@ -112,7 +113,7 @@ def _taught_prior(job: Job, kind: str) -> Any:
     return teacher.prior_of(world.grid)
 
 
-def run_in(job: Job, world: World, name: str, learner: Any) -> Result:
+def run_in(job: Job, world: World, name: str, learner: Learner) -> Result:
     """Drive a job's missions in its world, with a learner."""
     return _Missions(job, world, name, learner).drive_all()
 
@@ -120,7 +121,7 @@ def run_in(job: Job, world: World, name: str, learner: Any) -> Result:
 class _Missions:
     """The missions of one robot: what it drives, sees, and learns."""
 
-    def __init__(self, job: Job, world: World, name: str, learner: Any) -> None:
+    def __init__(self, job: Job, world: World, name: str, learner: Learner) -> None:
         self.job = job
         self.world = world
         self.name = name
@@ -128,9 +129,6 @@ class _Missions:
         self.pairs, self.noise, self.faults, self.moves = (
             np.random.default_rng([job.seed, number]) for number in range(4)
         )
-        self.options: dict[str, float] = {}
-        if isinstance(learner, Experience) and job.exploration is not None:
-            self.options["exploration"] = job.exploration
         self.shortest: dict[tuple[Cell, Cell], Sequence[Cell]] = {}
         self.is_new = np.ones(world.grid.occupancy.shape, dtype=np.bool_)
         self.forecast: list[list[float]] = []
@@ -161,8 +159,7 @@ class _Missions:
         if (start, goal) not in self.shortest:
             plan = planner().plan(world.grid, start, goal, RULE)
             self.shortest[start, goal] = plan.cells
-        learned_map = self.learner.apply(world.grid, **self.options)
-        cells = planner().plan(learned_map, start, goal, RULE).cells
+        cells = planner().plan(self._learned_map(), start, goal, RULE).cells
         seconds = path_seconds(cells, world, self.world_clock)
         shortest = path_seconds(self.shortest[start, goal], world, self.world_clock)
         best = world.best_seconds(start, goal, self.world_clock)
@@ -174,6 +171,13 @@ class _Missions:
         self.world_clock += best
         self.robot_clock += measured.duration
         return [seconds, shortest, best]
+
+    def _learned_map(self) -> GridMap:
+        """Return the map with what the learner expects."""
+        exploration = self.job.exploration
+        if isinstance(self.learner, Experience) and exploration is not None:
+            return self.learner.apply(self.world.grid, exploration)
+        return self.learner.apply(self.world.grid)
 
     def _forecast(self, cells: Sequence[Cell], duration: float) -> None:
         """Note what an experience expected of a route, and mark the route as driven."""
