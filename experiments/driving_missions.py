@@ -14,7 +14,6 @@ from driving_worlds import RATE, RULE, Drive, World, drive, path_seconds
 from random_maps import Random
 
 from ddqn_planner import Experience, Planner, inflate, load_map
-from ddqn_planner.experience.prior import Prior
 from ddqn_planner.grid import Cell, GridMap
 
 MOVED_AT: Final = 100
@@ -104,7 +103,7 @@ def run(job: Job) -> list[Result]:
     return results
 
 
-def _taught_prior(job: Job, kind: str) -> Prior | None:
+def _taught_prior(job: Job, kind: str) -> Float64:
     """Return the prior that a robot learns in a world of another kind."""
     lesson = replace(job, kind=kind, prior_from="", missions=TEACHING)
     teacher = Experience(worlds.SPEED)
