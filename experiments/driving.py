@@ -297,14 +297,16 @@ def _forecasts(results: Sequence[Result]) -> str:
 
 
 def _curve(path: Path, results: Sequence[Result]) -> str:
-    """Draw the time over the best possible, of all learners."""
-    learners = _groups(results, lambda result: result.learner)
+    """Draw the total time over the best possible, where places are slow."""
+    slow = [result for result in results if kinds.class_of(result.kind) == kinds.PLACES]
+    learners = _groups(slow or results, lambda result: result.learner)
     seconds = {
-        name: [result.seconds for result in group] for name, group in learners.items()
+        name: [np.sum([result.seconds for result in group], axis=0)]
+        for name, group in learners.items()
     }
-    best = [result.best for result in learners[EXPERIENCE]]
-    width = min(SMOOTHED, len(best[0]))
-    figure, _ = draw_times(seconds, best, width, banded=EXPERIENCE)
+    best = np.sum([result.best for result in learners[EXPERIENCE]], axis=0)
+    width = min(SMOOTHED, len(best))
+    figure, _ = draw_times(seconds, [best], width, banded=EXPERIENCE)
     title = "Time over the best possible, from mission to mission"
     return save_figure(figure, path, title)
 
