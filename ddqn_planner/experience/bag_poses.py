@@ -21,10 +21,10 @@ from ddqn_planner.experience.drives import Sample
 from ddqn_planner.grid.rotations import Rotation
 
 if TYPE_CHECKING:
-    from rosbags.typesys.stores.ros2_jazzy import (
+    from rosbags.typesys.stores.ros2_humble import (
         geometry_msgs__msg__TransformStamped as TransformStamped,
     )
-    from rosbags.typesys.stores.ros2_jazzy import (
+    from rosbags.typesys.stores.ros2_humble import (
         std_msgs__msg__Header as Header,
     )
 

@@ -79,7 +79,7 @@ def _decoders() -> Mapping[str, Callable[[bytes, str], object]]:
         fields = "geometry_msgs/TransformStamped[] transforms"
         ros1.register(get_types_from_msg(fields, name))
     return {
-        "cdr": get_typestore(Stores.ROS2_JAZZY).deserialize_cdr,
+        "cdr": get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr,
         "ros1": ros1.deserialize_ros1,
     }
 
