@@ -1,7 +1,7 @@
 """Paths that a robot with a body follows while it still stands on obstacles."""
 
 import math
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,10 @@ from ddqn_planner.planning.pose_paths import (
     is_free,
     touches,
 )
+
+MARGIN: Final = 0.3  # cells by which a learned body is larger than its points, at most
+# (5, 2): a point itself, and its neighbours at this distance.
+AROUND: Final = MARGIN * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
 
 
 class Escape(NamedTuple):
@@ -63,7 +67,9 @@ def _without_start(
     sin = math.sin(yaw)
     turned = points @ np.array([[cos, sin], [-sin, cos]])
     corner = np.array([x + 0.5, y + 0.5])  # from the corner of cell (0, 0)
-    cells = np.floor(corner + turned).astype(np.int64)  # (M, 2): of each point
+    # (5 M, 2): also of points a little beside, as the learned body is a little larger.
+    around = (corner + turned + AROUND[:, None]).reshape(-1, 2)
+    cells = np.floor(around).astype(np.int64)
     height, width = occupied.shape
     is_on_map = ((cells >= 0) & (cells < (width, height))).all(axis=1)
     distance = np.hypot(cells[:, 0] - x, cells[:, 1] - y)
