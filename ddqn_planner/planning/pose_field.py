@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ddqn_planner.grid import GridMap
+from ddqn_planner.grid.layers import has_costs
 from ddqn_planner.planning import pose_space, wavefront
 from ddqn_planner.planning.field_cache import Field
 from ddqn_planner.planning.pose_paths import SAME, PosePath, cells_of
-from ddqn_planner.planning.pose_space import Aim, Search
+from ddqn_planner.planning.pose_space import Aim, Search, height_at
 from ddqn_planner.planning.pose_world import (
     SHIFT,
     TILE,
@@ -32,6 +33,11 @@ HEAP = 2**18  # entries that a heap has room for, at least
 KEPT_SHARE = 1 / 2
 UNGUIDED = 2**14  # states that are visited before a look at the map pays
 FINEST_SHIFT = 1  # of the smallest tiles that the look uses
+# Where cells have costs: the first look is at tiles of 16 cells a side, and each look
+# at so many tiles for each state that was visited.
+COARSEST_SHIFT = 4
+TILES_PER_VISIT = 3
+VISITS_BETWEEN_LOOKS = 2**10
 NO_STATE = -1
 # An aim at no start, before the first look, which is at tiles of 2**SHIFT cells a side.
 NOWHERE = Aim(
@@ -41,7 +47,13 @@ NOWHERE = Aim(
     weight=1.0,
     corner_bound=np.empty((0, 0), np.float32),
     shift=SHIFT + 1,
+    middle_height=np.empty((0, 0), np.float32),
+    start_height=0.0,
+    least_multiplier=1.0,
 )
+NO_MULTIPLIERS = np.empty((0, 0), np.float32)
+# What sums of float32 lose is less.
+LEAST_SHARE = 1 - 1e-5
 ALL_STATES = 2**62  # no map has so many
 # A bound that each path keeps: a greater one would make the weight infinite.
 ANY_PATH = 1e6
@@ -90,6 +102,10 @@ class PoseField(Field[Search]):
         """States that were visited for the start that is aimed at."""
         self._lower_bound = math.inf
         """A lower bound of the cost from that start."""
+        self._leads_on = False
+        """Whether the start is known to lead to a goal, or to many states."""
+        self._multipliers: NDArray[np.float32] | None = None
+        """The least multiplier of each tile of 2 cells a side, once it is needed."""
 
     def _goals_alone(self) -> Search:
         """Return what is known before any growth: the goals cost 0 and are open."""
@@ -101,7 +117,7 @@ class PoseField(Field[Search]):
             mark=_untouched(states, np.uint8),  # UNREACHED everywhere
             touched=np.zeros(tiles, np.bool_),
             heap=make_heap(0),
-            aim=NOWHERE,
+            aim=self._nowhere(),
             world=world,
         )
         goal_numbers = self._goal_numbers()
@@ -146,15 +162,15 @@ class PoseField(Field[Search]):
             while not self._is_enough(finite_bound):
                 if visits_left <= 0:
                     return None
-                if self._should_look_at_map():
-                    has_no_path = self._proved_bound() == math.inf
-                    if has_no_path and not self._may_reach_goal():
+                if self._should_count_reachable():
+                    self._leads_on = self._may_reach_goal()
+                    if not self._leads_on:
                         return math.inf
+                if self._should_look_at_map():
                     # Finer tiles give better lower bounds: a new round begins.
-                    aim = self.known.aim
-                    self._begin_round(self.with_look_at_map(aim, aim.shift - 1))
+                    self._begin_round(self._next_look())
                 else:
-                    most_visits = min(visits_left, UNGUIDED)
+                    most_visits = min(visits_left, self._visits_between_looks())
                     visits_left -= self._visit(finite_bound, most_visits)
             return self._proved_bound()
 
@@ -168,20 +184,39 @@ class PoseField(Field[Search]):
         number = int(pose_space.number_of_state(*start, self.world))
         if number == aim.start_number:
             return
+        self.visits = 0
+        self._leads_on = False
+        self._begin_round(
+            self._aim_toward(start)._replace(
+                start_number=number, weight=bound**GREEDY_EXPONENT
+            )
+        )
+
+    def _aim_toward(self, start: State) -> Aim:
+        """Return the lower bounds that hold toward a start (x, y, heading)."""
+        aim = self.known.aim
         x, y, _ = start
+        if aim.middle_height.size > 0:
+            # Heights tell a lower bound between any two cells.
+            start_height = float(height_at(x, y, aim))
+            if start_height < math.inf:
+                return aim._replace(start_height=start_height)
+            return self._nowhere()._replace(start_x=x, start_y=y)
         # An aim holds lower bounds from a look at the map, if there was one. They are
         # those toward one cell, for all headings.
         if (x, y) != (aim.start_x, aim.start_y):
-            aim = NOWHERE
-        self.visits = 0
-        self._begin_round(
-            aim._replace(
-                start_x=x,
-                start_y=y,
-                start_number=number,
-                weight=bound**GREEDY_EXPONENT,
-            )
-        )
+            aim = self._nowhere()
+        return aim._replace(start_x=x, start_y=y)
+
+    def _nowhere(self) -> Aim:
+        """Return an aim at no start, before the first look."""
+        if not self._has_costs():
+            return NOWHERE
+        return NOWHERE._replace(shift=COARSEST_SHIFT + 1)
+
+    def _has_costs(self) -> bool:
+        """Return whether cells of the map differ in what they cost."""
+        return bool(has_costs(self.world.layers))
 
     def _begin_round(self, aim: Aim) -> None:
         """Queue all states that are open or wait, in the order of A* toward an aim.
@@ -198,14 +233,45 @@ class PoseField(Field[Search]):
         """Return whether a bound is proved, or that no path leads from the start."""
         return self._proved_bound() <= bound * SAME or self._lower_bound == math.inf
 
+    def _should_count_reachable(self) -> bool:
+        """Return whether to ask now, once per start, to how many states it leads."""
+        has_no_path = self._proved_bound() == math.inf
+        return has_no_path and not self._leads_on and self.visits >= UNGUIDED
+
+    def _visits_between_looks(self) -> int:
+        """Return after how many visits a look may pay again."""
+        return VISITS_BETWEEN_LOOKS if self._has_costs() else UNGUIDED
+
+    def _is_rooted(self) -> bool:
+        """Return whether the lower bounds are toward the start itself."""
+        return self.known.aim.start_height == 0
+
+    def _next_shift(self) -> int:
+        """Return the shift of the tiles at which the next look is."""
+        return self.known.aim.shift - 1 if self._is_rooted() else COARSEST_SHIFT
+
+    def _next_look(self) -> Aim:
+        """Return the aim with the lower bounds of the next look."""
+        aim = self.known.aim
+        shift = self._next_shift()
+        if not self._is_rooted():
+            x, y, _ = pose_space.state_of(aim.start_number, self.world)
+            aim = aim._replace(start_x=x, start_y=y, start_height=0.0)
+        return self.with_look_at_map(aim, shift)
+
     def _should_look_at_map(self) -> bool:
         """Return whether to look at the map's tiles now, for a better lower bound.
 
-        Each look is at tiles of half the side of those in the look before: it takes 4
-        times as long, and shows that narrower gaps are closed. It pays after 8 times as
-        many visits of states; once a path is known, only the first look pays.
+        Where cells have costs, a look pays as soon as it takes no longer than the
+        visits before. Elsewhere, each look is at tiles of half the side of those in the
+        look before: it takes 4 times as long, and shows that narrower gaps are closed.
+        It pays after 8 times as many visits of states; once a path is known, only the
+        first look pays.
         """
-        shift = self.known.aim.shift - 1  # the next look is at tiles of 2**shift cells
+        shift = self._next_shift()  # the next look is at tiles of 2**shift cells a side
+        if self._has_costs():
+            tiles = (self.world.height >> shift) * (self.world.width >> shift)
+            return shift >= FINEST_SHIFT and tiles <= TILES_PER_VISIT * self.visits
         is_first_look = shift == SHIFT
         has_visited_enough = self.visits >= UNGUIDED << 3 * (SHIFT - shift)
         if is_first_look:
@@ -289,7 +355,20 @@ class PoseField(Field[Search]):
         if shift == SHIFT:  # the world keeps what is found out of tiles of this size
             passability = world.passability
         corner_bound = np.empty((rows + 1, columns + 1), np.float32)  # cells
-        aim_with_look = aim._replace(corner_bound=corner_bound, shift=shift)
+        aim_with_look = aim._replace(
+            corner_bound=corner_bound,
+            shift=shift,
+            middle_height=NOWHERE.middle_height,
+            least_multiplier=1.0,
+        )
+        multipliers = NO_MULTIPLIERS
+        if self._has_costs():
+            multipliers = self._multipliers_of_tiles(shift)
+            least = float(multipliers.min()) * LEAST_SHARE
+            aim_with_look = aim_with_look._replace(
+                middle_height=np.empty((rows, columns), np.float32),
+                least_multiplier=max(least, 1.0),
+            )
         goal_tiles = self.goals[:, :2] >> shift  # (G, 2): the tile of each goal
         goal_x = goal_tiles[:, 0]
         goal_y = goal_tiles[:, 1]
@@ -300,8 +379,24 @@ class PoseField(Field[Search]):
         # corner queues.
         heap = make_heap(4 + 8 * corner_bound.size)
         search = self.known._replace(aim=aim_with_look, heap=heap)
-        pose_space.write_corner_bounds(search, passability, is_goal, box)
+        pose_space.write_corner_bounds(search, multipliers, passability, is_goal, box)
         return aim_with_look
+
+    def _multipliers_of_tiles(self, shift: int) -> NDArray[np.float32]:
+        """Return the least multiplier of tiles of 2**shift cells a side, (R, C)."""
+        if self._multipliers is None:
+            rows = math.ceil(self.world.height / 2)
+            columns = math.ceil(self.world.width / 2)
+            self._multipliers = np.empty((rows, columns), np.float32)
+            pose_space.write_least_multipliers(self._multipliers, self.world)
+        multipliers = self._multipliers
+        for _ in range(shift - 1):
+            rows, columns = multipliers.shape
+            missing = (0, rows % 2), (0, columns % 2)
+            padded = np.pad(multipliers, missing, constant_values=np.inf)
+            of_pairs = np.minimum(padded[::2], padded[1::2])
+            multipliers = np.minimum(of_pairs[:, ::2], of_pairs[:, 1::2])
+        return multipliers
 
     def rollout(self, start: State, bound: float) -> PosePath:
         """Return the path from a start (x, y, heading) to a goal, and keep it.
@@ -374,13 +469,18 @@ class PoseField(Field[Search]):
         most_opened = len(tiles) << pose_space.TILE_BITS  # states that a repair opens
         occupied = self.grid.uninflated
         has_free_cell = not occupied[changed[:, 1], changed[:, 0]].all()
+        # An origin that may lie in occupied cells counts their costs, too.
+        counts_occupied = self._has_costs() and not self.world.body.has_origin_inside
+        had_costs = search.aim.shift > self._nowhere().shift
+        may_cost_less = has_free_cell or counts_occupied or had_costs
         # 1. The aim and the queue. A path through a changed cell that is free may be
         # cheaper than before: the lower bounds, which the aim holds, do not hold any
         # more. Else they hold, and the states in the queue stay in order. A search
         # with an empty queue lists its open states anew when it begins: its marks tell
         # which these are.
-        if has_free_cell:
-            search = search._replace(aim=NOWHERE, heap=make_heap(most_opened))
+        if may_cost_less:
+            aim = self._nowhere()
+            search = search._replace(aim=aim, heap=make_heap(most_opened))
         elif search.heap.size[0] + most_opened > search.heap.keys.size:
             # The aim has no start any more: the search begins anew toward the next.
             aim = search.aim._replace(start_number=NO_STATE)
@@ -394,7 +494,7 @@ class PoseField(Field[Search]):
         if unsupported_cost < math.inf:
             pose_space.take_back(search, tiles, unsupported_cost)
         # 3. Costs that may be too high: states near the changed cells are opened again.
-        if has_free_cell:
+        if may_cost_less:
             mark = search.mark.reshape(self.world.nearness.size, -1)
             mark[near_tiles] = np.minimum(mark[near_tiles], wavefront.OPEN)
         return search

@@ -7,13 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place, inlined, specialised
-from ddqn_planner.grid.layers import has_costs
+from ddqn_planner.grid.layers import has_costs, multiplier_at
 from ddqn_planner.planning.pose_world import (
+    BORDER,
     IMPASSABLE,
+    LAST_BIT,
+    ONE,
     PASSABLE,
     SHIFT,
     TILE,
     UNSEEN,
+    WORD,
     State,
     World,
     cost_of_primitive,
@@ -43,7 +47,9 @@ NO_PRIMITIVE: Final = -1
 class Aim(NamedTuple):
     """The start toward which a field grows, and lower bounds of the cost to it."""
 
-    start_x: int  # the start's cell
+    # The cell toward which the lower bounds lead: the start's, or with a
+    # `middle_height` that of an earlier start.
+    start_x: int
     start_y: int
     start_number: int  # of the start's state; negative for none
     weight: float  # of the lower bound, in the order in which states are visited
@@ -51,6 +57,11 @@ class Aim(NamedTuple):
     # the start, in cells; empty before the map was looked at.
     corner_bound: NDArray[np.float32]
     shift: int  # of these tiles: each has 2**shift cells along a side
+    # (rows, columns): where cells have costs, the height of the middle of each tile,
+    # see `height_at`; then `corner_bound` has those of the corners. Else empty.
+    middle_height: NDArray[np.float32]
+    start_height: float  # of the start's cell
+    least_multiplier: float  # of the cells of the map, or less
 
 
 class Search(NamedTuple):
@@ -114,8 +125,12 @@ def remaining_cost(x: int, y: int, aim: Any) -> float:
 
     It is the straight distance between the centres of both cells. If the aim has lower
     bounds from the corners of tiles to the start, a greater one may count: that of a
-    corner of the cell's tile, minus the distance from the cell to this corner.
+    corner of the cell's tile, minus the distance from the cell to this corner. Where
+    cells have costs, it is the difference between the heights of both cells.
     """
+    if aim.middle_height.size > 0:
+        climb: float = height_at(x, y, aim) - aim.start_height
+        return climb
     dx = x - aim.start_x
     dy = y - aim.start_y
     bound = math.sqrt(dx * dx + dy * dy)
@@ -134,6 +149,44 @@ def remaining_cost(x: int, y: int, aim: Any) -> float:
                 distance = math.sqrt(corner_dx * corner_dx + corner_dy * corner_dy)
                 bound = max(bound, bound_of_corner - distance)
     return bound
+
+
+@inlined
+def height_at(x: int, y: int, aim: Any) -> Any:
+    """Return the height of cell (x, y), on a map whose cells have costs.
+
+    No path climbs by more than it costs: so the difference between the heights of two
+    cells is a lower bound of the cost between them. The height is infinite where no
+    path leads from the cell in which it is 0.
+    """
+    dx = x - aim.start_x
+    dy = y - aim.start_y
+    straight = aim.least_multiplier * math.sqrt(dx * dx + dy * dy)
+    row = y >> aim.shift
+    column = x >> aim.shift
+    middle = aim.middle_height[row, column]
+    if middle == np.inf:
+        return middle
+    # From the middle of the tile to that of the cell, in sides of tiles.
+    side = 1 << aim.shift
+    right = (x + 0.5) / side - column - 0.5
+    up = (y + 0.5) / side - row - 0.5
+    # The height is linear in each of the four triangles between two corners and the
+    # middle. `far` counts from the middle to their side, `along` on that side.
+    if abs(right) >= abs(up):
+        nearest_column = column + (right > 0)
+        first = aim.corner_bound[row, nearest_column]
+        second = aim.corner_bound[row + 1, nearest_column]
+        far = abs(right)
+        along = up
+    else:
+        nearest_row = row + (up > 0)
+        first = aim.corner_bound[nearest_row, column]
+        second = aim.corner_bound[nearest_row, column + 1]
+        far = abs(up)
+        along = right
+    rise = far * (first + second - 2 * middle) + along * (second - first)
+    return max(straight, middle + rise)
 
 
 @in_place
@@ -477,9 +530,14 @@ def take_back(search: Search, tiles: NDArray[np.int64], limit: Any) -> None:
 # A lower bound from the map. The robot's origin stays in tiles that it may pass. A
 # shortest path in them bends at corners of tiles only, and each straight part of it has
 # a path over sides and diagonals of the same tiles that is longer by the factor
-# `LONGER` at most. Here a side of a tile counts 5 steps, and a diagonal 7.
+# `LONGER` at most. Here a side of a tile counts 5 steps, and a diagonal 7. Where cells
+# have costs, the steps of a tile are multiplied by the least multiplier of its cells.
 
 STRAIGHT, DIAGONAL = 5, 7
+# Of the heights: the cells in which costs count are told by steps of `FINE` along a
+# primitive, so that up to half a step at each border of tiles may count as of the other
+# tile. That is less than 0.5 % of a tile of 2 cells.
+HEIGHT_SHARE: Final = 0.99
 FURTHER: Final = 1.2  # times the path to the nearest goal, beyond which none is sought
 LONGER: Final = math.sqrt(1 + (DIAGONAL / STRAIGHT - 1) ** 2)
 
@@ -592,12 +650,35 @@ def _push_start(search: Any, box: Any) -> None:
         for x in range(column, column + 2):
             aim.corner_bound[y, x] = 0
             corner = y * aim.corner_bound.shape[1] + x
-            push_to_heap(steps_to_box(x, y, box), corner, search.heap)
+            key = aim.least_multiplier * steps_to_box(x, y, box)
+            push_to_heap(key, corner, search.heap)
+
+
+@in_place
+def write_least_multipliers(multipliers: NDArray[np.float32], world: World) -> None:
+    """Write the least multiplier of the cells of each tile that an origin may pass.
+
+    `multipliers` (R, C) is for tiles of 2 cells a side, and infinite for a tile that
+    has no such cell.
+    """
+    multipliers[:] = np.inf
+    one_float32 = np.float32(1)  # has the type in which primitives count multipliers
+    for y in range(world.height):
+        for x in range(world.width):
+            column = np.uint64(x + BORDER)
+            bits = world.occupied_bits[y + BORDER, column // WORD]
+            is_occupied = (bits >> (column & LAST_BIT)) & ONE
+            if is_occupied and world.body.has_origin_inside:
+                continue
+            multiplier = multiplier_at(x, y, one_float32, world.layers)
+            if multiplier < multipliers[y >> 1, x >> 1]:
+                multipliers[y >> 1, x >> 1] = multiplier
 
 
 @in_place
 def write_corner_bounds(
     search: Search,
+    multipliers: NDArray[np.float32],
     passability: NDArray[np.uint8],
     is_goal: NDArray[np.bool_],
     box: NDArray[np.int64],
@@ -613,7 +694,10 @@ def write_corner_bounds(
     ----------
     search : Search
         With an empty heap. The bounds are written to `search.aim.corner_bound`, (R + 1,
-        C + 1), in cells.
+        C + 1), in cells. Where cells have costs, heights are written, also to its
+        `middle_height`, (R, C).
+    multipliers : (R, C) float32
+        The least multiplier of each tile; empty where cells have no costs.
     passability : (R, C) uint8
         UNSEEN, PASSABLE or IMPASSABLE for each tile; changes in place.
     is_goal : (R + 1, C + 1) bool
@@ -623,6 +707,7 @@ def write_corner_bounds(
     """
     heap = search.heap  # of corners; a key is steps plus those that are left at least
     step_count = search.aim.corner_bound  # at first the steps from the start's tile
+    least = search.aim.least_multiplier
     corner_columns = step_count.shape[1]
     step_count[:] = np.inf
     _push_start(search, box)
@@ -633,18 +718,21 @@ def write_corner_bounds(
         corner = pop_from_heap(heap)
         y = corner // corner_columns
         x = corner - y * corner_columns
-        key = step_count[y, x] + steps_to_box(x, y, box)
+        key = np.float32(step_count[y, x] + least * steps_to_box(x, y, box))
         if last_key > key:  # the corner was queued once more, with fewer steps
             continue
         if is_goal[y, x]:
             greatest_key = min(greatest_key, FURTHER * step_count[y, x])
-        _step_over_tiles(x, y, search, passability, box)
-    _turn_into_cost(search, last_key, box)
+        _step_over_tiles(x, y, search, multipliers, passability, box)
+    if multipliers.size > 0:
+        _turn_into_height(search, last_key, multipliers, box)
+    else:
+        _turn_into_cost(search, last_key, box)
 
 
 @inlined
 def _step_over_tiles(
-    x: int, y: int, search: Any, passability: Any, box: NDArray[np.int64]
+    x: int, y: int, search: Any, multipliers: Any, passability: Any, box: Any
 ) -> None:
     """Step from corner (x, y) over the passable tiles around it, to all their corners.
 
@@ -657,6 +745,8 @@ def _step_over_tiles(
     search : Search
         Its aim's `corner_bound`, (rows + 1, columns + 1), holds the steps from the
         start to each corner; changes in place.
+    multipliers : (rows, columns)
+        By how much a step over each tile counts; empty if each counts 1.
     passability : (rows, columns)
         UNSEEN, PASSABLE or IMPASSABLE for each tile; changes in place.
     box : (4,)
@@ -669,15 +759,20 @@ def _step_over_tiles(
     steps_before = step_count[y, x]
     for row in range(max(y - 1, 0), min(y + 1, rows)):
         for column in range(max(x - 1, 0), min(x + 1, columns)):
+            multiplier = np.float32(1)
+            if multipliers.size > 0:
+                multiplier = multipliers[row, column]
             for number in range(4):  # of the tile's corners
                 end_y = row + (number >> 1)
                 end_x = column + (number & 1)
-                steps_to_end = steps_before + steps(abs(end_x - x), abs(end_y - y))
+                step = multiplier * steps(abs(end_x - x), abs(end_y - y))
+                steps_to_end = np.float32(steps_before + step)
                 if steps_to_end >= step_count[end_y, end_x]:
                     continue
                 if is_passable(row, column, shift, passability, search.world):
                     step_count[end_y, end_x] = steps_to_end
-                    key = steps_to_end + steps_to_box(end_x, end_y, box)
+                    steps_left = steps_to_box(end_x, end_y, box)
+                    key = steps_to_end + search.aim.least_multiplier * steps_left
                     push_to_heap(key, end_y * (columns + 1) + end_x, search.heap)
 
 
@@ -716,3 +811,52 @@ def _turn_into_cost(search: Any, last_key: Any, box: Any) -> None:
             # The start is no farther than a diagonal from that corner.
             from_start = from_corner - math.sqrt(2.0)
             aim.corner_bound[y, x] = from_start * (1 << aim.shift)
+
+
+@inlined
+def _turn_into_height(search: Any, last_key: Any, multipliers: Any, box: Any) -> None:
+    """Turn the steps in `aim.corner_bound` into heights, and write `middle_height`.
+
+    Parameters
+    ----------
+    search : Search
+        As for `_turn_into_cost`.
+    last_key : float
+        Likewise.
+    multipliers : (R, C)
+        The least multiplier of each tile.
+    box : (4,)
+        Likewise.
+    """
+    aim = search.aim
+    corner = aim.corner_bound
+    was_stopped = search.heap.size[0] > 0
+    # The cost of a side of a tile where a cell costs 1.
+    side = (1 << aim.shift) * search.world.body.cost_per_cell * HEIGHT_SHARE / LONGER
+    for y in range(corner.shape[0]):
+        for x in range(corner.shape[1]):
+            # As in `_turn_into_cost`.
+            least_steps = np.inf
+            if was_stopped:
+                least_steps = last_key - aim.least_multiplier * steps_to_box(x, y, box)
+            corner[y, x] = min(corner[y, x], least_steps) / STRAIGHT * side
+    for y in range(multipliers.shape[0]):
+        for x in range(multipliers.shape[1]):
+            first = corner[y, x]
+            second = corner[y, x + 1]
+            third = corner[y + 1, x]
+            fourth = corner[y + 1, x + 1]
+            lowest = min(first, second, third, fourth)
+            lowest_side = min(
+                first + second, third + fourth, first + third, second + fourth
+            )
+            # The greatest height to which no straight line climbs by more than the
+            # tile's cells cost, from a corner or from the middle of a side.
+            straight = side * multipliers[y, x]
+            from_corner = lowest + straight * DIAGONAL / STRAIGHT / 2
+            middle = min(from_corner, lowest_side / 2 + straight / 2)
+            if max(first, second, third, fourth) == np.inf:
+                middle = np.float32(np.inf)  # no state lies in this tile
+            aim.middle_height[y, x] = middle
+    # All of the start's tile has the height 0, as its corners.
+    aim.middle_height[aim.start_y >> aim.shift, aim.start_x >> aim.shift] = 0

@@ -75,6 +75,10 @@ class Body(NamedTuple):
     # Cells that a primitive, or its origin, gets to any side of its begin or end, at
     # most.
     reach: int
+    # The least cost of a primitive per cell of its origin's path, 1 at most: a lattice
+    # file may count less than the length.
+    cost_per_cell: float
+    has_origin_inside: bool  # whether all cells that the origin passes must be free
 
 
 class World(NamedTuple):
@@ -152,6 +156,7 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
         rows_of(np.ones((1, side, side), dtype=np.bool_)),
     ]
     row_counts = np.concatenate([part.counts for part in rows])  # (M,): of each mask
+    middle = swept.shape[1] // 2
 
     # All poses but the first of each primitive, and their shares of its cost.
     pose_rows = [
@@ -185,7 +190,20 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
         lowest_passed=lowest,
         highest_passed=highest,
         reach=reach,
+        cost_per_cell=_cost_per_cell(motions),
+        has_origin_inside=bool(masks.core[:, middle, middle].all()),
     )
+
+
+def _cost_per_cell(motions: Motions) -> float:
+    """Return the least cost of a primitive per cell of its path, but 1 at most."""
+    least = 1.0
+    for poses, cost in zip(motions.poses, motions.cost.tolist(), strict=True):
+        steps = np.diff(poses[:, :2], axis=0)
+        length = float(np.hypot(steps[:, 0], steps[:, 1]).sum())
+        if length > 0:  # not a turn on the spot
+            least = min(least, cost / length)
+    return least
 
 
 def _masks_of(

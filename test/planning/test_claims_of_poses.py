@@ -5,8 +5,10 @@ Each plan is also compared with that of a planner that has planned nothing befor
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any, NamedTuple
 
+import bodies
 import numpy as np
 import pytest
 from bodies import least_costs
@@ -19,7 +21,7 @@ from ddqn_planner.planning.plan import PlanStatus, PosePlan
 from ddqn_planner.planning.planner import last_step
 from ddqn_planner.planning.pose_field import NOWHERE, PoseField
 from ddqn_planner.planning.pose_planner import Pose, PosePlanner, PoseRequest
-from ddqn_planner.planning.pose_space import remaining_cost
+from ddqn_planner.planning.pose_space import Aim, height_at, remaining_cost
 from ddqn_planner.planning.pose_world import State, world_of
 
 CELL = 0.1  # metres
@@ -212,6 +214,17 @@ def test_a_path_in_reverse_is_kept_at_what_reversing_costs(planner: Planner) -> 
     assert kept.bound == pytest.approx(cost_of_reversing / new.cost, rel=0.02)
 
 
+def look(
+    planner: Planner, grid: GridMap, cell: tuple[int, int], goal: State, shift: int
+) -> Aim:
+    """The lower bounds toward a cell, found in tiles of 2**shift cells of a side."""
+    field = PoseField(
+        np.array([goal]), grid, world_of(grid, PosePlanner(planner.network).body)
+    )
+    x, y = cell
+    return field.with_look_at_map(NOWHERE._replace(start_x=x, start_y=y), shift)
+
+
 def lower_bounds(
     planner: Planner, grid: GridMap, start: State, goal: State, shift: int
 ) -> NDArray[np.float64]:
@@ -219,11 +232,8 @@ def lower_bounds(
 
     It comes from the map, in tiles of 2**shift cells of a side.
     """
-    field = PoseField(
-        np.array([goal]), grid, world_of(grid, PosePlanner(planner.network).body)
-    )
     x, y, _ = start
-    aim = field.with_look_at_map(NOWHERE._replace(start_x=x, start_y=y), shift)
+    aim = look(planner, grid, (x, y), goal, shift)
     cells = np.ndindex(grid.occupancy.shape)
     bounds = [remaining_cost(column, row, aim) for row, column in cells]
     return np.array(bounds).reshape(grid.occupancy.shape)
@@ -256,3 +266,84 @@ def test_a_passage_along_the_border_of_the_map_is_no_wall(planner: Planner) -> N
             planner, GridMap(grid, CELL), (10, row, 0), (50, row, 0), 2
         )
         assert bounds[row, 50] <= 40
+
+
+def with_random_costs(occupancy: NDArray[np.bool_], seed: int) -> GridMap:
+    """A map whose cells cost something at random, in patches of random size."""
+    random = np.random.default_rng(seed)
+    patch = int(random.choice([1, 3, 8, 20]))
+    shape = occupancy.shape
+    values = random.random([math.ceil(length / patch) for length in shape]) ** 3
+    values = np.kron(values, np.ones((patch, patch)))[: shape[0], : shape[1]]
+    costs = np.rint(99 * values).astype(np.int8)
+    slowness = (random.choice([1.0, 1.5]) + 30 * values).astype(np.float32)
+    layers: list[dict[str, Any]] = [
+        {"cost": costs},
+        {"slowness": slowness},
+        {"cost": costs.T[::-1].copy().reshape(shape), "slowness": slowness},
+    ]
+    return GridMap(occupancy, CELL, **layers[seed % 3])
+
+
+@pytest.fixture
+def same_shares(planner: Planner, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the oracle count the cells of a primitive by the planner's own shares.
+
+    Else both differ by the steps into which they divide the origin's path.
+    """
+    body = PosePlanner(planner.network).body
+    ways: list[dict[tuple[int, int], float]] = []
+    for first, last in pairwise(body.first_passed.tolist()):
+        way: dict[tuple[int, int], float] = {}
+        for place in range(first, last):
+            x, y, _ = body.passed_cells[place].tolist()
+            way[x, y] = way.get((x, y), 0.0) + float(body.passed_shares[place])
+        ways.append(way)
+    monkeypatch.setattr(bodies, "ways", lambda _: ways)
+
+
+@pytest.mark.usefixtures("same_shares")
+@pytest.mark.parametrize("seed", range(3))
+def test_no_difference_of_heights_is_above_the_true_cost(
+    planner: Planner, seed: int
+) -> None:
+    occupancy = np.zeros((40, 60), np.bool_)
+    occupancy[8:, 24:27] = occupancy[:30, 44] = True
+    grid = with_random_costs(occupancy, seed)
+    starts = np.random.default_rng(seed).choice(np.argwhere(~occupancy), 2)
+    cells = list(np.ndindex(occupancy.shape))
+    for y, x in starts.tolist():
+        every_heading = [(x, y, heading) for heading in range(16)]
+        least = true_costs(planner, grid, *every_heading).min(axis=2)
+        for root_y, root_x in ((y, x), *starts[:1].tolist()):
+            for shift, goal in ((4, (2, 30, 0)), (2, (55, 5, 0)), (1, (2, 30, 0))):
+                aim = look(planner, grid, (root_x, root_y), goal, shift)
+                height = height_at(x, y, aim)
+                if height == math.inf:
+                    continue
+                aim = aim._replace(start_height=height)
+                bounds = [remaining_cost(column, row, aim) for row, column in cells]
+                is_above = np.reshape(bounds, least.shape) > least * (1 + ROUNDED)
+                assert not is_above[least < math.inf].any()
+
+
+@pytest.mark.usefixtures("same_shares")
+@pytest.mark.parametrize("seed", range(3))
+def test_plans_with_costs_keep_the_bound_that_they_prove(
+    planner: Planner, seed: int
+) -> None:
+    body = fresh(planner)
+    grid = with_random_costs(obstacles(seed).occupancy, seed)
+    least = true_costs(body, grid, GOAL_STATE)
+    goal = pose_of(body, grid, GOAL_STATE)
+    reachable = np.argwhere(least < math.inf)
+    random = np.random.default_rng(seed)
+    for y, x, heading in random.choice(reachable, 8).tolist():
+        start = pose_of(body, grid, (x, y, heading))
+        for bound in (math.inf, 1.3, 1.05, 1.0):
+            plan = body.plan_poses(grid, start, goal, bound=bound)
+            assert plan.status is PlanStatus.SUCCEEDED
+            assert plan.cost is not None
+            assert plan.bound <= bound * (1 + ROUNDED)
+            cells_of_least = least[y, x, heading] * (grid.seconds_per_cell or 1)
+            assert plan.cost <= plan.bound * cells_of_least * (1 + ROUNDED)
