@@ -30,8 +30,10 @@ from tables import table
 from ddqn_planner import GridMap, Planner, load_map
 from ddqn_planner.commands.options import file_of
 from ddqn_planner.grid import MOVES, Cell, MoveRule
+from ddqn_planner.grid.inflation import inflate
 from ddqn_planner.model import ModelMetadata, RobotNetwork
-from ddqn_planner.planning.plan import PosePlan
+from ddqn_planner.planning.path_finder import last_step
+from ddqn_planner.planning.plan import PosePlan, PoseRequest
 from ddqn_planner.robot.footprint import read_footprint
 from ddqn_planner.robot.motions import HEADINGS, Motion, Motions, make_motions
 from ddqn_planner.version import __version__
@@ -57,6 +59,9 @@ LONGEST_REQUEST: Final = 60.0
 BOX_AHEAD: Final = 2.0  # metres on the path to the box that is put on it
 ORACLE_METRES: Final = 0.02  # between two poses that the oracle tries
 ORACLE_RADIANS: Final = math.radians(2)
+SHAPE_RADIUS: Final = 0.75  # metres of free space around starts and goals
+BEND_METRES: Final = 0.25  # on which a curvature is measured
+STRAIGHT: Final = 0.05  # per metre: a smaller curvature is none
 SHRUNK: Final = 1e-6  # metres, so that a body that only touches does not collide
 
 Pose = tuple[float, float, float]
@@ -402,6 +407,82 @@ def collisions(options: argparse.Namespace) -> Iterator[list[Any]]:
         yield [name, motion.value, len(plans), solved, colliding, sum(plans)]
 
 
+class Shape(NamedTuple):
+    """How a path bends, per 10 m except for the ends."""
+
+    turning: float  # degrees
+    flips: float  # changes between bends to the left and to the right
+    cusps: float  # changes between ahead and reverse
+    off: float  # centimetres from the start or the goal: the greater of both
+    turned: float  # degrees, likewise
+
+
+def shape_of(poses: NDArray[np.float64], start: Pose, goal: Pose) -> Shape:
+    """Return how a path (N, 3) from a start to a goal bends; all in metres."""
+    dx, dy = np.diff(poses[:, :2], axis=0).T
+    lengths = np.hypot(dx, dy)
+    yaw = np.unwrap(poses[:, 2])
+    mean_yaw = (yaw[1:] + yaw[:-1]) / 2
+    is_moving = lengths > 1e-4
+    is_ahead = (dx * np.cos(mean_yaw) + dy * np.sin(mean_yaw) > 0)[is_moving]
+    # The curvature on each quarter of a metre.
+    way = np.append(0, np.cumsum(lengths))
+    marks = np.arange(0, way[-1], BEND_METRES)
+    curvature = np.diff(np.interp(marks, way, yaw)) / BEND_METRES
+    sides = np.sign(curvature[np.abs(curvature) >= STRAIGHT])
+    off = np.abs(poses[[0, -1]] - [start, goal])  # (2, 3)
+    turned = np.abs((off[:, 2] + math.pi) % (2 * math.pi) - math.pi)
+    per_10_m = 10 / way[-1]
+    return Shape(
+        turning=per_10_m * float(np.degrees(np.abs(np.diff(yaw)).sum())),
+        flips=per_10_m * float((np.diff(sides) != 0).sum()),
+        cusps=per_10_m * float((np.diff(is_ahead.astype(int)) != 0).sum()),
+        off=100 * float(np.hypot(off[:, 0], off[:, 1]).max()),
+        turned=float(np.degrees(turned.max())),
+    )
+
+
+def shapes(options: argparse.Namespace) -> Iterator[list[Any]]:
+    """Yield two rows for each kind of map: paths of primitives, and finished ones."""
+    planner = Planner.load(options.model)
+    assert isinstance(planner.network, RobotNetwork)
+    assert planner.pose_planner is not None
+    random = np.random.default_rng(options.seed)
+    maps = {"empty": GridMap(np.zeros((280, 280), np.bool_), CELL)}
+    maps |= worlds(options.maps, random)
+    maps |= {f"{name}, costs": inflate(grid, 0.0, 1.0) for name, grid in maps.items()}
+    footprint = str(planner.network.footprint.tolist())
+    for name, grid in maps.items():
+        obstacles = GridMap(grid.uninflated, CELL)
+        oracle = Oracle(occupied_cells(obstacles), footprint)
+        drawn = requests(obstacles, SHAPE_RADIUS, random)
+        pairs = (pair for pair in drawn if math.dist(pair[0][:2], pair[1][:2]) > 4)
+        results: dict[bool, list[tuple[float, ...]]] = {False: [], True: []}
+        for start, goal in islice(pairs, options.requests):
+            costs = []
+            for is_finished, rows in results.items():
+                request = PoseRequest(grid, start, (goal,), finished=is_finished)
+                began = time.process_time()
+                plan = last_step(planner.pose_planner.steps(request))
+                ms = 1e3 * (time.process_time() - began)
+                if not plan.poses.size:
+                    break
+                costs.append(plan.cost or 0.0)
+                shape = shape_of(plan.poses, start, goal)
+                is_exact = shape.off < 1e-6 and shape.turned < 1e-6
+                hits = oracle.collisions(plan.poses)
+                rows.append((*shape, is_exact, costs[-1] / costs[0], ms, hits))
+        if not results[True]:
+            continue
+        for is_finished, rows in results.items():
+            *figures, ms, _ = np.mean(rows, axis=0)
+            median_ms = np.median(np.array(rows)[:, -2])
+            hits = int(sum(row[-1] > 0 for row in rows))
+            kind = "finished" if is_finished else "of primitives"
+            words = [f"{figure:.2f}" for figure in (*figures, median_ms)]
+            yield [name, kind, len(rows), *words, hits]
+
+
 class Speed(NamedTuple):
     """What one request took: milliseconds of CPU time, if no unit is named."""
 
@@ -509,6 +590,11 @@ def blocks(share: float, seed: int) -> GridMap:
 
 
 FIGURES: Final = {
+    "shapes": (
+        "map | paths | requests | degrees per 10 m | flips | cusps | ends off, cm "
+        "| degrees | exact | cost | ms | with a collision",
+        shapes,
+    ),
     "collisions": (
         "body | motion | requests | plans | with a collision | poses",
         collisions,

@@ -203,10 +203,6 @@ class Posterior:
             self.expected += np.quantile(known_beyond, OPEN_QUANTILE)
         else:
             self.expected += open_log
-        # No place is expected to be faster than the fastest one that is known: features
-        # that no driven place had would predict any speed.
-        fastest = log[sums.is_known()].min(initial=open_log)
-        self.expected = np.maximum(self.expected, fastest)
         self.variance = self._variance(sums, log - self.expected, noise)
         self._solve(sums.weight / noise, log - self.expected)
         self.known: Float64 = np.clip(self._solution[:, 1], 0, 1)

@@ -114,6 +114,7 @@ class PoseRequest(PathRequest[Pose]):
     bound: float = 1.2
     start_clearing_radius: float = 0.0  # metres
     either_direction: bool = False  # a goal may be reached forwards or backwards
+    finished: bool = False  # with exact ends, see `pose_finish`
 
     @property
     def has_any_heading(self) -> bool:

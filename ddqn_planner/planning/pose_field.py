@@ -426,7 +426,8 @@ class PoseField(Field[Search]):
             poses=np.column_stack([grid.centres(in_cells), yaw_in_frame]),
             cells=cells_of(in_cells),
             costs=costs.copy(),
-            least_cost=float(costs[-1]) / proved_bound,
+            # If the rest could cost less, so could the whole path.
+            least_costs=float(costs[-1]) / proved_bound - costs,
             escape=escape,
         )
         return self.path

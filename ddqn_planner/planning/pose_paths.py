@@ -38,9 +38,21 @@ class PosePath(NamedTuple):
     poses: Float64  # (N, 3), in metres and radians
     cells: NDArray[np.int32]  # (N, 2)
     costs: Float64  # (N,): from the first pose to each, in cells
-    least_cost: float  # a lower bound of the cost of any path between its ends
+    # (N,): a lower bound of the cost of any path from each pose to the end; 0 or less
+    # where nothing is proved.
+    least_costs: Float64
     # Poses that lead out of the obstacles on which the path starts.
     escape: int = 0
+
+    def part(self, first: int, end: int) -> "PosePath":
+        """Return the path from pose number `first` to before `end`, without escape."""
+        part = slice(first, end)
+        return PosePath(
+            self.poses[part],
+            self.cells[part],
+            self.costs[part],
+            self.least_costs[part],
+        )
 
     def plan(self, first: int, grid: GridMap) -> PosePlan:
         """Return the plan along the rest of the path, from pose number `first` on.
@@ -54,8 +66,7 @@ class PosePath(NamedTuple):
         # Costs are in cells, from the first pose of the path to each pose.
         cost_before = float(self.costs[first])
         cost = float(self.costs[-1]) - cost_before
-        # If the rest could cost less, so could the whole path.
-        least_cost = self.least_cost - cost_before
+        least_cost = float(self.least_costs[first])
         bound = math.inf  # of the ratio of the cost to the least cost of any path
         if cost <= least_cost * SAME:
             bound = 1.0

@@ -26,6 +26,7 @@ from ddqn_planner.planning.plan import (
 )
 from ddqn_planner.planning.pose_escape import is_drivable, poses_of_escape
 from ddqn_planner.planning.pose_field import PoseField, may_escape
+from ddqn_planner.planning.pose_finish import Finish
 from ddqn_planner.planning.pose_world import (
     State,
     World,
@@ -73,6 +74,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         self.footprint = network.footprint
         self.body = body_of(network.motions, network.swept())
         self.points = paths.points_of(self.footprint, self.motions.resolution)
+        self._finish = Finish(self.motions, self.footprint, self.points)
         # A request compares the same two maps for its path, its world and its field.
         self._differences = lru_cache(maxsize=1)(differences)
         self.fields = FieldCache[PoseField](0, self._differences)
@@ -184,8 +186,33 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         clock.end_field()
         if bound == math.inf:
             return PosePlan(PlanStatus.NO_PATH, field_ms=clock.field_ms)
-        plan = field.rollout(start.state, request.bound).plan(0, grid)
+        path = field.rollout(start.state, request.bound)
+        if request.finished:
+            path = self._finished(path, request, start.world)
+            field.path = path
+        plan = path.plan(0, grid)
         return replace(plan, field_ms=clock.field_ms, rollout_ms=clock.rollout_ms)
+
+    def _finished(
+        self, path: paths.PosePath, request: PoseRequest, world: World
+    ) -> paths.PosePath:
+        """Return a path that begins and ends exactly where the request says, with room.
+
+        A path that ends beside the goal, within its tolerance, ends there.
+        """
+        if path.escape:
+            return path
+        grid = request.grid
+        goals = np.array(request.goals, np.float64)  # (G, 3)
+        last_pose = path.poses[-1]
+        if request.has_any_heading:
+            goals[:, 2] = last_pose[2]
+        elif request.either_direction:
+            reversed_goals = goals + np.array([0, 0, math.pi])
+            goals = np.concatenate([goals, reversed_goals])
+        number = paths.nearest_pose(goals, last_pose, grid, SAME_END)
+        goal = goals[number] if number >= 0 else last_pose
+        return self._finish.finished(path, request.start, goal, grid, world)
 
     def _reason(self, request: PoseRequest, plan: PosePlan) -> PausingGenerator[str]:
         """Return why there is no path, in words.
@@ -390,7 +417,9 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         costs = np.linspace(0, rest_cost, len(rest))
         escape = poses_of_escape(rest, grid, self.points)
         return replace(
-            paths.PosePath(rest, cells, costs, least_cost, escape).plan(0, grid),
+            paths.PosePath(rest, cells, costs, least_cost - costs, escape).plan(
+                0, grid
+            ),
             extra_cost=ratio - 1,
             field_ms=plan.field_ms,
             rollout_ms=plan.rollout_ms,
@@ -593,6 +622,11 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
             # depends on its start.
             if first < path.escape:
                 continue
+            if request.finished:
+                rest = path.part(first, len(path.poses))
+                world = self._world(request.grid)
+                path = self._finish.joined(rest, request.start, request.grid, world)
+                first = 0
             plan = path.plan(first, request.grid)
             if plan.bound <= request.bound * paths.SAME:
                 return plan

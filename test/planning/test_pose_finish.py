@@ -1,0 +1,135 @@
+"""Finished paths of bodies: exact ends, no hit, no sharper bend, no greater cost."""
+
+import math
+
+import numpy as np
+import pytest
+from bodies import Oracle, occupied_cells
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from planning.test_poses import BODIES, CELL, planner
+
+from ddqn_planner import GridMap
+from ddqn_planner.planning.path_finder import last_step
+from ddqn_planner.planning.plan import Pose, PosePlan, PoseRequest
+from ddqn_planner.planning.pose_finish import END_COST, rates_of, write_pieces
+from ddqn_planner.planning.pose_planner import PosePlanner
+from ddqn_planner.robot.motions import turn_between
+
+MOTIONS = ("ackermann", "differential", "omnidirectional")
+SIDE = 60  # cells
+
+
+def plan(
+    body: PosePlanner, grid: GridMap, start: Pose, goal: Pose, finished: bool
+) -> PosePlan:
+    return last_step(body.steps(PoseRequest(grid, start, (goal,), finished=finished)))
+
+
+def ends_off(plan: PosePlan, start: Pose, goal: Pose) -> tuple[float, float]:
+    off = np.abs(plan.poses[[0, -1]] - (start, goal))
+    turned = np.abs(turn_between(0, off[:, 2]))
+    return float(np.hypot(off[:, 0], off[:, 1]).max()), float(turned.max())
+
+
+@settings(max_examples=6)
+@given(
+    motion=st.sampled_from(MOTIONS),
+    seed=st.integers(0, 2**32 - 1),
+    has_costs=st.booleans(),
+    has_forbidden=st.booleans(),
+)
+def test_a_finished_path_is_free_and_no_worse(
+    motion: str, seed: int, has_costs: bool, has_forbidden: bool
+) -> None:
+    random = np.random.default_rng(seed)
+    occupancy = random.random((SIDE, SIDE)) < random.choice([0, 0.002, 0.006])
+    cost = random.integers(0, 60, (SIDE, SIDE)) if has_costs else None
+    forbidden = None
+    if has_forbidden:
+        forbidden = np.where(random.random((SIDE, SIDE)) < 0.01, 255, 0)
+    origin = (*random.uniform(-3, 3, 2), random.choice([0, 0.5]))
+    grid = GridMap(occupancy, CELL, origin, cost=cost, forbidden=forbidden)
+    body = planner(motion)
+    _, radius = rates_of(body.motions)
+    oracle = Oracle(occupied_cells(GridMap(occupancy, CELL)), BODIES[motion])
+    for _ in range(4):
+        cells = random.uniform(8, SIDE - 8, (2, 2))
+        yaws = random.uniform(-math.pi, math.pi, 2)
+        points = grid.centres(cells)
+        start, goal = (
+            (float(x), float(y), float(yaw))
+            for (x, y), yaw in zip(points, yaws, strict=True)
+        )
+        before = plan(body, grid, start, goal, finished=False)
+        after = plan(planner(motion), grid, start, goal, finished=True)
+        assert after.status is before.status
+        if len(before.poses) < 2:
+            continue
+        # 1. Costs and bound.
+        end_cost = END_COST * before.cost / max(before.driven, 1)
+        assert after.cost <= before.cost * (1 + 1e-6) + 2 * end_cost
+        least = before.cost / before.bound
+        assert after.bound == pytest.approx(max(after.cost / least, 1), rel=1e-3)
+        # 2. Ends: exact, or those of the path of primitives.
+        off, turned = ends_off(after, start, goal)
+        most_off, most_turned = ends_off(before, start, goal)
+        assert off <= most_off + 1e-9
+        assert turned <= most_turned + 1e-9
+        # 3. No hit, also between the poses; in the frame of the oracle's map.
+        cells = grid.in_cells(after.poses[:, :2]) * CELL
+        yaw = after.poses[:, 2] - origin[2]
+        assert oracle.collisions(np.column_stack([cells, yaw])) == 0
+        # 4. The sharpest bend.
+        dx, dy, _ = np.diff(after.poses, axis=0).T
+        turn = np.abs(turn_between(after.poses[:-1, 2], after.poses[1:, 2]))
+        length = np.hypot(dx, dy) / CELL
+        is_bend = (turn > 1e-6) & (length > 1e-6)
+        if is_bend.any():
+            assert (length[is_bend] / turn[is_bend]).min() >= radius * 0.99
+        if motion == "ackermann":
+            assert not ((turn > 1e-6) & (length <= 1e-6)).any()
+        assert length.max() <= 0.51
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_ends_are_exact_where_nothing_is_near(motion: str) -> None:
+    random = np.random.default_rng(1)
+    grid = GridMap(np.zeros((SIDE, SIDE), np.bool_), CELL)
+    body = planner(motion)
+    exact = 0
+    for _ in range(10):
+        start, goal = (
+            (*random.uniform(1.2, SIDE * CELL - 1.2, 2), random.uniform(-3, 3))
+            for _ in range(2)
+        )
+        if math.dist(start[:2], goal[:2]) < 1.5:
+            exact += 1
+            continue
+        found = plan(body, grid, start, goal, finished=True)
+        exact += ends_off(found, start, goal) == (0.0, 0.0)
+        again = plan(body, grid, start, goal, finished=True)
+        assert np.array_equal(found.poses, again.poses)
+    assert exact >= 9
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_the_pieces_of_each_word_lead_to_the_end(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    begin, end = random.uniform(-20, 20, (2, 3))
+    pieces = np.empty((3, 2))
+    for word in range(10):
+        length = write_pieces(begin, end, word, 4.0, pieces)
+        if length == math.inf:
+            continue
+        way = -1 if 4 <= word < 8 or word == 9 else 1
+        x, y, yaw = begin
+        for turn, piece_length in pieces.tolist():
+            half = turn / 2
+            chord = way * piece_length * np.sinc(half / math.pi)
+            x += chord * math.cos(yaw + half)
+            y += chord * math.sin(yaw + half)
+            yaw += turn
+        assert (x, y) == pytest.approx(tuple(end[:2]), abs=1e-5)
+        assert abs(turn_between(yaw, end[2])) < 1e-5
+        assert length == pytest.approx(pieces[:, 1].sum())
