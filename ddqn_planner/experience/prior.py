@@ -16,7 +16,7 @@ STEEPNESS = 7  # of the step from narrow to wide passages
 # A feature whose deviation is 1 raises the log slowness by 0, with this inverse
 # variance; and it is taken to vary at least so much.
 RIDGE = 1.25
-LEAST_VARIANCE = 0.01
+LEAST_VARIANCE = 0.16
 # Of what older coefficients predict, this share is expected to be right, with this
 # inverse variance.
 SHARE_OF_OLDER = 0.5

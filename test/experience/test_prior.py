@@ -89,7 +89,7 @@ def test_what_walls_govern_is_foretold_on_another_map(seed: int, level: int) -> 
     features = rooms(seed)
     log = by_clearance(features) + level + random.normal(0, 0.3, 600)
     coefficients = regression(features, log, random.uniform(0.1, 0.2, 600), NOTHING)
-    assert share_foretold(coefficients, rooms(seed + 1)) > 0.75
+    assert share_foretold(coefficients, rooms(seed + 1)) > 0.6
 
 
 def test_few_places_say_little_and_none_says_nothing() -> None:
