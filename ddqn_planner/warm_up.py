@@ -71,6 +71,9 @@ def _plan_poses(planner: Planner) -> None:
     start = (0.5 * side * resolution, 0.5 * side * resolution, 0.0)
     goal = (1.5 * side * resolution, 0.5 * side * resolution, 0.0)
     planner.plan_poses(grid, start, goal)
+    # Lower bounds where cells have costs need other code.
+    costs = np.ones(walled.shape, np.int8)
+    planner.plan_poses(GridMap(walled, resolution, cost=costs), start, goal)
     opened = grid.with_patch(np.zeros((side, 1), np.bool_), side, 0)
     planner.plan_poses(opened, start, goal)
     plan = planner.plan_poses(opened.with_patch([[True]], side, 0), start, goal)
