@@ -7,7 +7,7 @@ PLACES: Final = "places are slow"
 WAITS: Final = "rare or goal's waits"
 TURNS: Final = "turns and directions"
 NOTHING: Final = "nothing is slow"
-# Two people, who had not read how the library learns, chose twenty laws. The names of
+# Twenty laws were written without a look at how the library learns. The names of
 # each class were sorted, and `numpy.random.default_rng(20491129).permutation` drew its
 # halves, class by class in this order, before anything was measured in their worlds.
 LAWS_FOR_CHOOSING: Final = {
