@@ -143,7 +143,7 @@ def test_one_version_everywhere(capsys: pytest.CaptureFixture[str]) -> None:
     release = r"^## \[(.+)\] - (\d{4}-\d\d-\d\d)$"
     newest, date = re.findall(release, changes, re.M)[0]
     assert newest == VERSION
-    assert f"/v{VERSION}\n" in changes  # the address of its tag
+    assert f"v{VERSION}\n" in changes  # the address of its tag
     citation = (ROOT / "CITATION.cff").read_text()
     assert f"\nversion: {VERSION}\ndate-released: {date}\n" in citation
     assert ddqn_planner.__version__ == VERSION
