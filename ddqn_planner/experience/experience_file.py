@@ -29,6 +29,8 @@ VERSION = 4
 LOG_VERSION = 3  # of one robot, with the logarithms of slowness alone
 FIRST_VERSION = 1  # until 0.4.0; 2 was never released
 LOG_RANGE = -math.log(MAX_SLOWNESS), math.log(MAX_SLOWNESS)
+MOST = 1e12  # no sum of what drives showed is greater: seconds, weights or squares
+MOST_OF_PRIOR = 100.0  # so much no feature of a map raises the log slowness
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -138,6 +140,10 @@ def changes_from_bytes(data: bytes, side: float) -> Changes:
     seconds: list[float] = arrays["seconds"].tolist()
     if not all(0 < share <= 1 for share in shares):
         raise ValueError("its shares cannot be true")
+    if not all(0 <= spent <= MOST for spent in seconds):
+        raise ValueError("its seconds cannot be true")
+    if not all(0 <= token < 2**63 for token in tokens):
+        raise ValueError("its tokens cannot be true")
     changes = [
         Change(token, share, spent, *part)
         for token, share, spent, part in zip(
@@ -218,8 +224,16 @@ def _check(part: Part) -> None:
     are_positive = all(
         (array >= 0).all() for name, array in columns.items() if name != "sum_of_log"
     )
+    are_small = all((np.abs(array) <= MOST).all() for array in values)
+    # Of places that did not fade away. Rounding may change a sum a little.
+    is_there = places.weight > LEAST_WEIGHT
+    slowness = places.sum_of_slowness[is_there] / places.weight[is_there]
+    is_slow_enough = slowness > 0.5 / MAX_SLOWNESS
+    is_fast_enough = slowness < 2 * MAX_SLOWNESS
+    has_speeds = (is_slow_enough & is_fast_enough).all()
     is_near = (np.abs(places.position) <= FARTHEST).all()
-    if not (are_finite and are_positive and is_near and places.are_in_order()):
+    is_possible = are_finite and are_positive and are_small and has_speeds
+    if not (is_possible and is_near and places.are_in_order()):
         raise ValueError("its evidence cannot be true")
 
 
@@ -236,7 +250,8 @@ def _members(arrays: Arrays, side: float) -> list[RobotEvidence]:
         and len(set(identities)) == len(identities)
         and all((values >= 0).all() for values in (versions, driven, faded))
         and priors.shape == (len(identities), FEATURES)
-        and all(np.isfinite(values).all() for values in (driven, faded, priors))
+        and all((np.abs(values) <= MOST).all() for values in (driven, faded))
+        and (np.abs(priors) <= MOST_OF_PRIOR).all()
     )
     if not is_possible:
         raise ValueError("its robots cannot be true")

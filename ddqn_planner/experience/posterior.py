@@ -203,6 +203,9 @@ class Posterior:
             self.expected += np.quantile(known_beyond, OPEN_QUANTILE)
         else:
             self.expected += open_log
+        # Nobody drives faster than on the open floor: features that no driven place had
+        # would predict any speed.
+        self.expected = np.maximum(self.expected, min(open_log, 0.0))
         self.variance = self._variance(sums, log - self.expected, noise)
         self._solve(sums.weight / noise, log - self.expected)
         self.known: Float64 = np.clip(self._solution[:, 1], 0, 1)
