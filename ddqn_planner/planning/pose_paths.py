@@ -43,6 +43,7 @@ class PosePath(NamedTuple):
     least_costs: Float64
     # Poses that lead out of the obstacles on which the path starts.
     escape: int = 0
+    is_finished: bool = False  # see `pose_finish`
 
     def part(self, first: int, end: int) -> "PosePath":
         """Return the path from pose number `first` to before `end`, without escape."""

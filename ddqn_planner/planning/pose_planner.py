@@ -189,6 +189,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         path = field.rollout(start.state, request.bound)
         if request.finished:
             path = self._finished(path, request, start.world)
+            path = path._replace(is_finished=True)
             field.path = path
         plan = path.plan(0, grid)
         return replace(plan, field_ms=clock.field_ms, rollout_ms=clock.rollout_ms)
@@ -611,6 +612,8 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
             goals, reach, *_ = field.key
             is_for_goals = goals == request.goals and reach == request.reach
             if path is None or not is_for_goals:
+                continue
+            if path.is_finished != request.finished:
                 continue
             # (N, 2); None for another place, and after too many changes.
             changed = self._differences(field.grid, request.grid)
