@@ -577,7 +577,7 @@ class Experience:
 
     @property
     def state(self) -> int:
-        """A checksum of the evidence, equal where the same evidence is known."""
+        """A checksum of the evidence: a copy that knows as much has the same one."""
         return self._fleet.state
 
     def changes_since(self, state: int) -> bytes | None:

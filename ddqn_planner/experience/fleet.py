@@ -132,7 +132,7 @@ class Fleet:
 
     @property
     def state(self) -> int:
-        """A checksum, equal for fleets that have the same evidence."""
+        """A checksum, equal for copies of a fleet that have the same evidence."""
         parts = [
             (evidence.identity, *evidence.version, evidence.faded)
             for evidence in self.members

@@ -11,37 +11,32 @@ from ddqn_planner.nodes.outcome import PathQuery, Request
 from ddqn_planner.planning import Plan, PlanMethod, PlanStatus, unknown_space
 from ddqn_planner.planning.exact_paths import NO_PATH, ExactPath
 from ddqn_planner.planning.plan import PosePlan, PoseRequest
+from ddqn_planner.planning.pose_paths import ESCAPE_IN_WORDS
 
 THE_START = "the start"  # in errors
 THE_GOAL = "the goal"  # in errors, where there is one goal
 MOST_CELLS = 5  # of goals that a reason lists
-# No remedy for several goals: none of them moves.
+# Another remedy, but not for several goals: none of them moves.
 TOLERANCE = ", or a greater tolerance"
-# No remedy if all cells under the body are ignored.
+# Another remedy, unless all cells under the body are ignored.
 CLEARING_RADIUS = ", or a greater start_clearing_radius"
 REMEDIES = {
     PlanStatus.START_OUTSIDE_MAP: "set the start on the map",
     PlanStatus.GOAL_OUTSIDE_MAP: "set the goal on the map",
-    PlanStatus.START_OCCUPIED: (
-        "set the start on a free cell, or a greater start_clearing_radius"
-    ),
-    PlanStatus.GOAL_OCCUPIED: f"set the goal on a free cell{TOLERANCE}",
+    PlanStatus.START_OCCUPIED: "set the start on a free cell",
+    PlanStatus.GOAL_OCCUPIED: "set the goal on a free cell",
     PlanStatus.MAP_SIZE_UNSUPPORTED: (
         "set the parameter 'model' to one trained for this size"
     ),
-    PlanStatus.NO_PATH: f"set the goal where free cells lead to{TOLERANCE}",
+    PlanStatus.NO_PATH: "set the goal where free cells lead to",
     PlanStatus.ROLLOUT_TRAPPED: (
         "train the model longer, or set mode to 'astar_fallback'"
     ),
 }
 REMEDIES_OF_BODY = {
     **REMEDIES,
-    PlanStatus.START_OCCUPIED: (
-        f"set the start where the robot's body has room{CLEARING_RADIUS}"
-    ),
-    PlanStatus.GOAL_OCCUPIED: (
-        f"set the goal where the robot's body has room{TOLERANCE}"
-    ),
+    PlanStatus.START_OCCUPIED: "set the start where the robot's body has room",
+    PlanStatus.GOAL_OCCUPIED: "set the goal where the robot's body has room",
 }
 
 
@@ -126,15 +121,11 @@ def reason_of_failure(
     if is_unknown:
         problem, _, remedy = plan.reason.partition("; ")
     else:
-        remedies = REMEDIES_OF_BODY if isinstance(plan, PosePlan) else REMEDIES
         problem = plan.reason if has_several_goals else plan.status.value
-        remedy = remedies[plan.status]
-        if math.isinf(_clearing_radius(request)):
-            remedy = remedy.removesuffix(CLEARING_RADIUS)
+        remedy = _remedy_of(plan, request)
     goals_in_words = f"goal: {_place(goal, goal_cells[0])}"
     if has_several_goals:
         problem = f"no path to any of {len(goal_cells)} goals: {problem}"
-        remedy = remedy.removesuffix(TOLERANCE)
         goals_in_words = _cells_in_words(goal_cells)
     size = f"map: {grid.width} x {grid.height} cells"
     place = f"start: {_place(start, start_cell)}; {goals_in_words}; {size}"
@@ -148,6 +139,20 @@ def reason_of_failure(
     if plan.status is PlanStatus.START_OCCUPIED and _clearing_radius(request):
         reason += _depth_in_words(_clearing_radius(request))
     return f"{reason}; {remedy}"
+
+
+def _remedy_of(plan: Plan, request: Request) -> str:
+    """Return in words what to do about a status that ended a request without a path."""
+    remedies = REMEDIES_OF_BODY if isinstance(plan, PosePlan) else REMEDIES
+    remedy = remedies[plan.status]
+    _, *goal_cells = request.cells
+    has_one_goal = len(goal_cells) == 1
+    if plan.status is PlanStatus.START_OCCUPIED:
+        if not math.isinf(_clearing_radius(request)):
+            remedy += CLEARING_RADIUS
+    elif plan.status in (PlanStatus.GOAL_OCCUPIED, PlanStatus.NO_PATH) and has_one_goal:
+        remedy += TOLERANCE
+    return remedy
 
 
 def reason_of_path(request: Request, plan: Plan, path: ExactPath) -> str:
@@ -173,8 +178,8 @@ def reason_of_path(request: Request, plan: Plan, path: ExactPath) -> str:
         metres = math.dist(plan.goal, goal_cells[0]) * grid.resolution
         reason += f"; the goal {problem} and moved {metres:.3g} m"
     if isinstance(plan, PosePlan):
-        _, _, escape = plan.reason.partition("; ")
-        reason += f"; {escape}" if escape else ""
+        if plan.escape:
+            reason += f"; {ESCAPE_IN_WORDS}"
     elif grid.is_obstacle(plan.path[0]):
         radius = f"{_clearing_radius(request):.3g} m"
         reason += (

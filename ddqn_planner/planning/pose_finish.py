@@ -268,6 +268,23 @@ def _half_turn(angle: float) -> float:
 
 
 @in_place
+def _write_line_between_turns(
+    begin: Float64, end: Float64, word: int, pieces: Float64
+) -> float:
+    """Write the pieces of a line between two turns on the spot; return its length."""
+    dx = end[0] - begin[0]
+    dy = end[1] - begin[1]
+    yaw = math.atan2(dy, dx)
+    if word == SPIN_BEHIND:
+        yaw += math.pi
+    distance = math.sqrt(dx * dx + dy * dy)
+    pieces[0] = (_half_turn(yaw - begin[2]), 0.0)
+    pieces[1] = (0.0, distance)
+    pieces[2] = (_half_turn(end[2] - yaw), 0.0)
+    return distance
+
+
+@in_place
 def write_pieces(
     begin: Float64, end: Float64, word: int, radius: float, pieces: Float64
 ) -> float:
@@ -276,15 +293,10 @@ def write_pieces(
     The curve leads from one pose (3,) to another. The length is infinite if there is no
     such curve.
     """
+    if word >= SPIN_AHEAD:
+        return _write_line_between_turns(begin, end, word, pieces)
     dx = end[0] - begin[0]
     dy = end[1] - begin[1]
-    if word >= SPIN_AHEAD:
-        yaw = math.atan2(dy, dx) + (math.pi if word == SPIN_BEHIND else 0.0)
-        distance = math.sqrt(dx * dx + dy * dy)
-        pieces[0] = (_half_turn(yaw - begin[2]), 0.0)
-        pieces[1] = (0.0, distance)
-        pieces[2] = (_half_turn(end[2] - yaw), 0.0)
-        return distance
     # In reverse, the robot drives where its back points.
     back = math.pi if word >= DUBINS_WORDS else 0.0
     begin_yaw = begin[2] + back
@@ -646,7 +658,8 @@ class Finish:
         self._points = points
         self._corners = np.ascontiguousarray(footprint / motions.resolution)
         self._far = float(np.hypot(*self._corners.T).max())
-        self._rates, self._radius = rates_of(motions)
+        self._rates = rates_of(motions)
+        self._radius = least_radius_of(motions)
         self._words = words_of(self._rates)
         self._mask = np.empty((0, 0, 0), np.uint64)
 
@@ -702,7 +715,7 @@ class Finish:
         planned[:, 2] = np.unwrap(planned[:, 2])
         ends = in_cells(np.array([start, goal], np.float64), grid)  # (2, 3)
         ends[:, 2] = planned[[0, -1], 2] + turn_between(planned[[0, -1], 2], ends[:, 2])
-        tracks = [_track(planned, path.costs)]
+        tracks = [Track(planned, path.costs - path.costs[0])]
         for number, end in zip((0, len(planned) - 1), ends, strict=True):
             tracks.append(self._moved(tracks[PLANNED], number, end, grid, course))
         chain = self._chain(tracks, course)
@@ -780,34 +793,57 @@ class Finish:
         return chain if chain.cost <= cost * (1 + SAME_END) else None
 
 
-def rates_of(motions: Motions) -> tuple[Rates, float]:
-    """Return what a robot's motions cost, and the radius of the sharpest bend.
+class PrimitiveRate(NamedTuple):
+    """What one primitive costs, and how sharply it bends."""
 
-    Of several primitives of a kind, the dearest counts. The radius is in cells.
+    kind: str  # the field of `Rates` that it belongs to
+    rate: float  # per cell of length, or per radian on the spot
+    radius: float  # of its sharpest bend in cells; infinite without one
+
+
+def _rate_of_primitive(poses: Float64, cost: float) -> PrimitiveRate:
+    """Return the rate of a primitive with these poses (N, 3) and this cost."""
+    dx, dy, turn = np.diff(poses, axis=0).T  # (N - 1,) each
+    lengths = np.hypot(dx, dy)
+    length = float(lengths.sum())
+    if length < ON_THE_SPOT:
+        return PrimitiveRate("spin", cost / float(np.abs(turn).sum()), math.inf)
+    rate = cost / length
+    yaw = poses[:-1, 2] + turn / 2
+    ahead = float((dx * np.cos(yaw) + dy * np.sin(yaw)).sum())
+    if abs(ahead) <= AHEAD * length:
+        return PrimitiveRate("aside", rate, math.inf)
+    direction = "ahead" if ahead > 0 else "behind"
+    is_bend = np.abs(turn) > ON_THE_SPOT
+    if not is_bend.any():
+        return PrimitiveRate(direction, rate, math.inf)
+    radii = lengths[is_bend] / np.abs(turn[is_bend])
+    return PrimitiveRate(f"bend_{direction}", rate, float(radii.min()))
+
+
+def _rates_of_primitives(motions: Motions) -> list[PrimitiveRate]:
+    """Return the rate of each of a robot's primitives."""
+    costs = motions.cost.tolist()
+    return list(map(_rate_of_primitive, motions.poses, costs))
+
+
+def least_radius_of(motions: Motions) -> float:
+    """Return the radius of a robot's sharpest bend, in cells; infinite without one.
+
+    It is a little greater, so that no curve bends more sharply than a primitive.
     """
+    radii = [primitive.radius for primitive in _rates_of_primitives(motions)]
+    return min(radii, default=math.inf) * (1 + 1e-3)
+
+
+def rates_of(motions: Motions) -> Rates:
+    """Return what a robot's motions cost: of a kind, the dearest primitive counts."""
     rates = dict.fromkeys(Rates._fields, 0.0)
-    radius = math.inf
-    for poses, cost in zip(motions.poses, motions.cost.tolist(), strict=True):
-        dx, dy, turn = np.diff(poses, axis=0).T  # (N - 1,) each
-        lengths = np.hypot(dx, dy)
-        length = float(lengths.sum())
-        is_bend = np.abs(turn) > ON_THE_SPOT
-        if length < ON_THE_SPOT:
-            rates["spin"] = max(rates["spin"], cost / float(np.abs(turn).sum()))
-            continue
-        yaw = poses[:-1, 2] + turn / 2
-        ahead = float((dx * np.cos(yaw) + dy * np.sin(yaw)).sum())
-        kind = "aside"
-        if abs(ahead) > AHEAD * length:
-            direction = "ahead" if ahead > 0 else "behind"
-            kind = f"bend_{direction}" if is_bend.any() else direction
-            if is_bend.any():
-                bends = lengths[is_bend] / np.abs(turn[is_bend])
-                radius = min(radius, float(bends.min()))
-        rates[kind] = max(rates[kind], cost / length)
+    for primitive in _rates_of_primitives(motions):
+        rates[primitive.kind] = max(rates[primitive.kind], primitive.rate)
     # A kind without a primitive cannot be driven.
-    known = {name: rate or math.inf for name, rate in rates.items()}
-    return Rates(**known), radius * (1 + 1e-3)
+    drivable_rates = {kind: rate or math.inf for kind, rate in rates.items()}
+    return Rates(**drivable_rates)
 
 
 def words_of(rates: Rates) -> Int64:
@@ -822,11 +858,6 @@ def words_of(rates: Rates) -> Int64:
     if math.isfinite(rates.behind + rates.spin):
         words.append(SPIN_BEHIND)
     return np.array(words if math.isfinite(rates.ahead) else [], np.int64)
-
-
-def _track(planned: Float64, costs: Float64) -> Track:
-    """Return the planned path (N, 3) with its costs from the first pose on."""
-    return Track(planned, costs - costs[0])
 
 
 def _moved_poses(poses: Float64, number: int, end: Float64) -> Float64:
@@ -904,7 +935,7 @@ def _nodes_of(tracks: list[Track]) -> Nodes:
     is_after = np.append(is_behind, is_behind[-1])[indices]
     is_before = is_behind[np.maximum(indices - 1, 0)]
     return Nodes(
-        pose=np.array([tracks[number].poses[at] for number, at in rows]),
+        pose=np.array([tracks[number].poses[pose] for number, pose in rows]),
         path=path.copy(),
         pose_index=index.copy(),
         next_node=next_node,

@@ -25,9 +25,9 @@ FILL_SPACING: Final = 0.7
 SAME: Final = 1 + 1e-6  # what is rounded in sums of float32 is less
 # The cosine above which a robot drives ahead, not behind or sideways.
 AHEAD: Final = 0.9
-ESCAPED: Final = (
-    f"{PlanStatus.SUCCEEDED}; the start is occupied: cells that the robot's body covers"
-    " there do not count until it has left them"
+ESCAPE_IN_WORDS: Final = (
+    "the start is occupied: cells that the robot's body covers there do not count until"
+    " it has left them"
 )
 ON_THE_SPOT: Final = 1e-6  # cells: a shorter step is a turn
 
@@ -85,7 +85,7 @@ class PosePath(NamedTuple):
             driven=float(np.hypot(steps[:, 0], steps[:, 1]).sum()) / grid.resolution,
             bound=bound,
             escape=escape,
-            reason=ESCAPED if escape else "",
+            reason=f"{PlanStatus.SUCCEEDED}; {ESCAPE_IN_WORDS}" if escape else "",
         )
 
 

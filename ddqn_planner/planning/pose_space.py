@@ -395,6 +395,33 @@ def follow(
 
 
 @in_place
+def _queue_ends(
+    x: int,
+    y: int,
+    heading: int,
+    mark: NDArray[np.uint8],
+    queue: NDArray[np.int64],
+    count: int,
+    world: Any,
+) -> int:
+    """Queue the new states to which primitives lead from a state.
+
+    Return how many states the queue has then; `count` is their number before. See
+    `leads_to_room` for `mark` and `queue`.
+    """
+    first_starting = world.body.first_starting
+    for primitive in range(first_starting[heading], first_starting[heading + 1]):
+        end = end_of(x, y, primitive, world)
+        if end == OUTSIDE or mark[end] == OPEN or count == queue.size:
+            continue
+        if has_room(x, y, primitive, world):
+            queue[count] = end
+            mark[end] = OPEN
+            count += 1
+    return count
+
+
+@in_place
 def leads_to_room(
     start: int, mark: NDArray[np.uint8], queue: NDArray[np.int64], world: World
 ) -> bool:
@@ -420,16 +447,7 @@ def leads_to_room(
         if not stands_on_obstacle(x, y, heading, world):
             return True
         expanded += 1
-        for primitive in range(
-            world.body.first_starting[heading], world.body.first_starting[heading + 1]
-        ):
-            end = end_of(x, y, primitive, world)
-            if end == OUTSIDE or mark[end] == OPEN or count == queue.size:
-                continue
-            if has_room(x, y, primitive, world):
-                queue[count] = end
-                mark[end] = OPEN
-                count += 1
+        count = _queue_ends(x, y, heading, mark, queue, count, world)
     return bool(count == queue.size)
 
 
@@ -456,16 +474,7 @@ def count_reachable(
     while expanded < count < queue.size:
         x, y, heading = state_of(queue[expanded], world)
         expanded += 1
-        for primitive in range(
-            world.body.first_starting[heading], world.body.first_starting[heading + 1]
-        ):
-            end = end_of(x, y, primitive, world)
-            if end == OUTSIDE or mark[end] == OPEN or count == queue.size:
-                continue
-            if has_room(x, y, primitive, world):
-                queue[count] = end
-                mark[end] = OPEN
-                count += 1
+        count = _queue_ends(x, y, heading, mark, queue, count, world)
     return count
 
 

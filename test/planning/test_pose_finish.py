@@ -12,7 +12,7 @@ from planning.test_poses import BODIES, CELL, planner
 from ddqn_planner import GridMap
 from ddqn_planner.planning.path_finder import last_step
 from ddqn_planner.planning.plan import Pose, PosePlan, PoseRequest
-from ddqn_planner.planning.pose_finish import END_COST, rates_of, write_pieces
+from ddqn_planner.planning.pose_finish import END_COST, least_radius_of, write_pieces
 from ddqn_planner.planning.pose_planner import PosePlanner
 from ddqn_planner.robot.motions import turn_between
 
@@ -51,7 +51,7 @@ def test_a_finished_path_is_free_and_no_worse(
     origin = (*random.uniform(-3, 3, 2), random.choice([0, 0.5]))
     grid = GridMap(occupancy, CELL, origin, cost=cost, forbidden=forbidden)
     body = planner(motion)
-    _, radius = rates_of(body.motions)
+    radius = least_radius_of(body.motions)
     oracle = Oracle(occupied_cells(GridMap(occupancy, CELL)), BODIES[motion])
     for _ in range(4):
         cells = random.uniform(8, SIDE - 8, (2, 2))
