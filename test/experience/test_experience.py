@@ -615,8 +615,13 @@ def test_changes_that_no_drive_makes_are_refused(name: str, value: float) -> Non
 
 def test_a_hall_that_nobody_drove_is_expected_to_be_no_faster_than_the_open() -> None:
     hall = GridMap(np.zeros((80, 80), dtype=np.bool_), 0.25)
-    ways = [straight((1, y), (19, y)) for y in (6, 14)]
-    experience = driven(*ways, straight((1, 10), (19, 10), 8))
+    x = np.arange(1, 19, 0.05)
+    slow_in_the_middle = np.where(np.abs(x - 10) < 3, 8.0, 1.0)
+    seconds = np.cumsum(0.05 / SPEED * slow_in_the_middle)
+    slow_drive = seconds, np.column_stack([x, np.full(len(x), 10.0)])
+    experience = driven(
+        straight((1, 6), (19, 6)), straight((1, 14), (19, 14)), slow_drive
+    )
     fastest = SPEED / experience.learned_speed
     assert experience.slowness(hall).min() > 0.9 * min(fastest, 1)
     plan = PLANNER.plan(experience.apply(hall), (73, 34), (76, 60))
