@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ddqn_planner.experience.fleet import Change, Fleet, RobotEvidence, new_token
+from ddqn_planner.experience.fleet import Fleet, RobotEvidence
 from ddqn_planner.experience.places import (
     KNOWN_WEIGHT,
     Float64,
@@ -33,11 +33,11 @@ USUAL_RANGE = 4.0
 # earlier drives.
 UNUSUAL = 2.5
 SURPRISE_QUANTILE = 0.95
-# The share of all evidence that remains after a change: other places may have changed.
-SHARE_AFTER_CHANGE = 0.01
-
-# Of all evidence after a drive, also after one that took many half-lives.
-LEAST_SHARE = 1e-30
+# By which all evidence fades after a change: other places may have changed. Hardly
+# 1 % remains.
+HALF_LIVES_OF_CHANGE = 6.7
+# By which all evidence fades at most after a drive, which may take longer.
+MOST_HALF_LIVES = 100.0
 
 # A drive through fewer places says little about how sure expected times are.
 FEWEST_VISITS = 8
@@ -122,7 +122,7 @@ class Evidence:
         """The seconds that all robots have driven."""
         return math.fsum(robot.driven for robot in self.fleet.members)
 
-    def add(self, visits: Visits) -> Change:
+    def add(self, visits: Visits) -> RobotEvidence:
         """Learn from a drive: its V visits of places and its W waits.
 
         If the drive differs from what was seen before, older evidence hardly counts any
@@ -131,28 +131,27 @@ class Evidence:
 
         Returns
         -------
-        Change
-            How the evidence has changed.
+        RobotEvidence
+            What the drive showed, as it was added to the fleet.
         """
         slowness = visits.seconds / visits.metres * self.nominal_speed  # (V,)
         log = np.log(np.clip(slowness, 1 / MAX_SLOWNESS, MAX_SLOWNESS))  # (V,)
         errors = self._errors_of_expected_time(visits)
         surprises = self._surprises_of(visits.position, log)  # one for each part
         largest_surprise = max(surprises, default=0.0)
-        share = max(0.5 ** (visits.total_seconds / self.half_life), LEAST_SHARE)
+        half_lives = min(visits.total_seconds / self.half_life, MOST_HALF_LIVES)
         if largest_surprise > self._usual_surprise(errors):
-            share *= SHARE_AFTER_CHANGE
-        change = Change(
-            token=new_token(),
-            share=share,
-            seconds=visits.total_seconds,
+            half_lives += HALF_LIVES_OF_CHANGE
+        drive = self.fleet.own.renewed()._replace(
+            driven=visits.total_seconds,
+            faded=half_lives,
             places=self._sums_of(visits, log),
             errors=errors,
             surprises=np.array([largest_surprise] if surprises else []),
         )
-        self.fleet.add(change)
+        self.fleet.add(drive)
         self.sum_up()
-        return change
+        return drive
 
     def _sums_of(self, visits: Visits, log: Float64) -> Places:
         """Return the sums over the places of a drive.

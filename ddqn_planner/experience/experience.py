@@ -16,12 +16,10 @@ from ddqn_planner.experience.evidence import Evidence
 from ddqn_planner.experience.experience_file import (
     MAX_FILE_BYTES,
     Content,
-    changes_from_bytes,
-    changes_to_bytes,
     content_from_bytes,
     content_to_bytes,
 )
-from ddqn_planner.experience.fleet import Change, Fleet, Version
+from ddqn_planner.experience.fleet import Fleet, RobotEvidence, Version
 from ddqn_planner.experience.places import FARTHEST, Float32, Float64, Int64
 from ddqn_planner.experience.posterior import Posterior
 from ddqn_planner.experience.prior import FEATURES
@@ -168,12 +166,12 @@ class Experience:
             self.nominal_speed, self.robot_width, self.half_life, _as_name(robot)
         )
         # The file in which this experience was saved or from which it was loaded, the
-        # evidence that the file had of each robot then, and the changes since then.
+        # evidence that the file had of each robot then, and the drives since then.
         self._saved_path: Path | None = None
         self._saved_versions: dict[str, Version] = {}
-        self._unsaved: list[Change] = []
-        # The last changes, each with the state of the fleet before.
-        self._recent = deque[tuple[int, Change]](maxlen=RECENT_CHANGES)
+        self._unsaved: list[RobotEvidence] = []
+        # The last drives, each with the state of the fleet before.
+        self._recent = deque[tuple[int, RobotEvidence]](maxlen=RECENT_CHANGES)
 
     @property
     def robot(self) -> str:
@@ -267,8 +265,8 @@ class Experience:
             return f"{backwards} times are earlier than those before; sort them"
         if (elapsed > self.max_pause).any():
             return (
-                f"the times are up to {elapsed.max():.3g} s apart; give at most "
-                f"{self.max_pause:g}"
+                f"the times are up to {elapsed.max():.10g} s apart; give at most "
+                f"max_pause, {self.max_pause:.10g} s"
             )
         metres = np.hypot(step[:, 0], step[:, 1])
         fastest = float((metres / elapsed).max())
@@ -315,16 +313,16 @@ class Experience:
         self._learn(visits)
 
     def _learn(self, visits: Visits) -> None:
-        """Add visits to the evidence, and remember the change.
+        """Add visits to the evidence, and remember the drive.
 
-        If another process saves to the same file, `save` needs the changes; messages
-        to others tell of them, too.
+        If another process saves to the same file, `save` needs the last drives;
+        messages to others tell of them, too.
         """
         state = self.state
-        change = self.evidence.add(visits)
-        self._recent.append((state, change))
+        drive = self.evidence.add(visits)
+        self._recent.append((state, drive))
         if self._saved_path is not None:
-            self._unsaved.append(change)
+            self._unsaved.append(drive)
 
     def merge(self, other: Experience) -> None:
         """Take what another experience knows of each robot, where that is newer.
@@ -398,8 +396,8 @@ class Experience:
             whole=False,
             remedy="what `prior_of` returns",
         )
-        own = self._fleet.own
-        self._fleet.own = own.with_prior(coefficients.astype(np.float64))
+        own = self._fleet.own.renewed()
+        self._fleet.own = own._replace(prior=coefficients.astype(np.float64))
         self._recent.clear()
 
     def prior_of(self, grid: GridMap) -> Float64:
@@ -546,7 +544,8 @@ class Experience:
     def _remember_saved(self, path: Path) -> None:
         """Remember that the file at `path` holds this experience."""
         self._saved_path = path
-        self._saved_versions = self._fleet.versions
+        members = self._fleet.members
+        self._saved_versions = {robot.identity: robot.version for robot in members}
         self._unsaved = []
 
     def _join_content_of(self, path: Path) -> None:
@@ -589,8 +588,8 @@ class Experience:
         states = [before for before, _ in self._recent]
         if state not in states:
             return None
-        changes = [change for _, change in self._recent]
-        return changes_to_bytes(state, changes[states.index(state) :])
+        drives = [drive for _, drive in self._recent][states.index(state) :]
+        return content_to_bytes(Content(list(self.options.values()), drives, state))
 
     def apply_changes(self, data: bytes) -> bool:
         """Change this copy of an experience as `changes_since` tells.
@@ -603,13 +602,15 @@ class Experience:
             If the bytes are broken, or no changes.
         """
         try:
-            state, changes = changes_from_bytes(data, self.evidence.side)
+            _, drives, state = content_from_bytes(data)
+            if state is None:
+                raise ValueError("it is an experience; use `from_bytes`")
         except Exception as error:  # of many kinds
             raise ExperienceFileError(f"no changes of experience: {error}") from error
         if state != self.state:
             return False
-        for change in changes:
-            self._fleet.add(change)
+        for drive in drives:
+            self._fleet.add(drive)
         self.evidence.sum_up()
         return True
 
@@ -630,12 +631,12 @@ class Experience:
             If the bytes are broken, or no experience.
         """
         try:
-            content = content_from_bytes(data)
-            options = dict(zip(OPTIONS, content.options, strict=True))
-            experience = cls(**options, robot="")
+            options, (own, *others), state = content_from_bytes(data)
+            if state is not None:
+                raise ValueError("it is changes alone; use `apply_changes`")
+            experience = cls(**dict(zip(OPTIONS, options, strict=True)), robot="")
         except Exception as error:  # of many kinds
             raise ExperienceFileError(f"no experience: {error}") from error
-        own, *others = content.members
         evidence = experience.evidence
         evidence.fleet = Fleet(own)
         evidence.fleet.merge(others)
@@ -674,8 +675,9 @@ def _as_option(name: str, value: Any) -> float:
 
 def _as_name(robot: str) -> str:
     """Return the name of a robot; a ValueError if it is no name."""
-    if not isinstance(robot, str) or len(robot) > LONGEST_NAME:
-        remedy = f"give a name of up to {LONGEST_NAME} characters, or ''"
+    # Arrays of text lose a NUL at the end.
+    if not isinstance(robot, str) or len(robot) > LONGEST_NAME or "\0" in robot:
+        remedy = f"give a name of up to {LONGEST_NAME} characters without NUL, or ''"
         raise ValueError(f"robot is {reprlib.repr(robot)}; {remedy}")
     return robot
 

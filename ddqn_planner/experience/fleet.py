@@ -26,26 +26,15 @@ class Version(NamedTuple):
     token: int
 
 
-class Change(NamedTuple):
-    """How a drive changes the evidence of its robot, see `RobotEvidence.changed`."""
-
-    token: int  # of the evidence after the change
-    share: float  # of all older evidence that remains, 0 to 1
-    seconds: float  # of the drive
-    places: Places  # the sums of the drive alone
-    errors: Float64  # (1,), or (0,) if there is none; so are the surprises
-    surprises: Float64
-
-
 class RobotEvidence(NamedTuple):
-    """What the drives of one robot have shown. A change makes another, newer object."""
+    """What the drives of one robot have shown: all of them, or one drive alone."""
 
     identity: str  # drawn at random when the robot began: names may be the same
     robot: str  # its name, for people; perhaps empty
-    version: Version
+    version: Version  # of one drive: that of the robot's evidence after the drive
     driven: float  # seconds
     # The half-lives by which the evidence has faded since the robot's last drive, as
-    # other robots drove.
+    # other robots drove. Of one drive: those by which all older evidence fades.
     faded: float
     # (FEATURES,): by how much features of other maps raised the log slowness
     prior: Float64
@@ -59,7 +48,6 @@ class RobotEvidence(NamedTuple):
 
         `robot` is its name, and `side` that of a place, metres.
         """
-        no_drives = np.zeros(0)
         return cls(
             identity=secrets.token_hex(16),
             robot=robot,
@@ -68,8 +56,8 @@ class RobotEvidence(NamedTuple):
             faded=0.0,
             prior=np.zeros(FEATURES),
             places=Places.none(side),
-            errors=no_drives,
-            surprises=no_drives,
+            errors=np.zeros(0),
+            surprises=np.zeros(0),
         )
 
     @property
@@ -77,34 +65,33 @@ class RobotEvidence(NamedTuple):
         """The share of the evidence that has not faded since the last drive."""
         return math.pow(0.5, self.faded)
 
-    def changed(self, change: Change) -> RobotEvidence:
+    def renewed(self) -> RobotEvidence:
+        """Return the evidence in a newer version, in which it is to be changed."""
+        version = Version(self.version.drives + 1, secrets.randbits(63))
+        return self._replace(version=version)
+
+    def faded_by(self, half_lives: float) -> RobotEvidence:
+        """Return the evidence after it has faded by so many half-lives more."""
+        return self._replace(faded=self.faded + half_lives)
+
+    def with_drive(self, drive: RobotEvidence) -> RobotEvidence:
         """Return the evidence after a drive.
 
-        The result follows to the last bit from the evidence and the change: so whoever
-        receives all changes has the same evidence.
+        The result follows to the last bit from the evidence and the drive: so whoever
+        receives all drives has the same evidence.
         """
-        older = self.places.faded(change.share * self.share)
-        errors = np.append(self.errors, change.errors)
-        surprises = np.append(self.surprises, change.surprises)
+        older = self.faded_by(drive.faded)
+        places = [self.places.faded(older.share), drive.places]
+        errors = np.append(self.errors, drive.errors)
+        surprises = np.append(self.surprises, drive.surprises)
         return self._replace(
-            version=Version(self.version.drives + 1, change.token),
-            driven=self.driven + change.seconds,
+            version=drive.version,
+            driven=self.driven + drive.driven,
             faded=0.0,
-            places=Places.summed([older, change.places]).with_few_passages(),
+            places=Places.summed(places).with_few_passages(),
             errors=errors[-LAST_DRIVES:],
             surprises=surprises[-LAST_DRIVES:],
         )
-
-    def with_prior(self, prior: Float64) -> RobotEvidence:
-        """Return the evidence with another prior, (FEATURES,)."""
-        version = Version(self.version.drives + 1, new_token())
-        return self._replace(prior=prior, version=version)
-
-    def forgotten(self) -> RobotEvidence:
-        """Return no evidence, which is newer than this evidence of the robot."""
-        empty = RobotEvidence.new(self.robot, self.places.side)
-        version = Version(self.version.drives + 1, new_token())
-        return empty._replace(identity=self.identity, version=version)
 
 
 class Fleet:
@@ -126,23 +113,17 @@ class Fleet:
         return [members[identity] for identity in sorted(members)]
 
     @property
-    def versions(self) -> dict[str, Version]:
-        """The version of each robot's evidence, by the robot's identity."""
-        return {evidence.identity: evidence.version for evidence in self.members}
-
-    @property
     def state(self) -> int:
         """A checksum, equal for copies of a fleet that have the same evidence."""
-        parts = [
-            (evidence.identity, *evidence.version, evidence.faded)
-            for evidence in self.members
+        versions = [
+            (robot.identity, robot.version, robot.faded) for robot in self.members
         ]
-        return crc32(repr((self.own.identity, parts)).encode())
+        return crc32(repr((self.own.identity, versions)).encode())
 
     def places(self) -> Places:
         """Return the sums of what all robots have seen, as far as it has not faded."""
         return Places.summed(
-            [evidence.places.faded(evidence.share) for evidence in self.members]
+            [robot.places.faded(robot.share) for robot in self.members]
         )
 
     @property
@@ -151,52 +132,44 @@ class Fleet:
         priors = [robot.prior for robot in self.members if robot.prior.any()]
         return np.asarray(np.mean(priors or [np.zeros(FEATURES)], axis=0))
 
-    def add(self, change: Change) -> None:
-        """Add a drive of the own robot. All other evidence fades by the same share."""
-        self.own = self.own.changed(change)
-        half_lives = -math.log2(change.share)
-        for identity, evidence in self._others.items():
-            faded = evidence.faded + half_lives
-            self._others[identity] = evidence._replace(faded=faded)
+    def add(self, drive: RobotEvidence) -> None:
+        """Add a drive of the own robot. The evidence of all robots fades by it."""
+        self.own = self.own.with_drive(drive)
+        for identity, robot in self._others.items():
+            self._others[identity] = robot.faded_by(drive.faded)
 
     def merge(self, members: Iterable[RobotEvidence]) -> None:
-        """Take the evidence of other robots where it is newer than what is here."""
-        for evidence in members:
-            if evidence.identity == self.own.identity:
-                self.own = _newer(self.own, evidence)
-                continue
-            present = self._others.get(evidence.identity, evidence)
-            self._others[evidence.identity] = _newer(present, evidence)
+        """Take the evidence of robots where it is newer than what is here.
+
+        Of the same version, that counts which has faded more.
+        """
+        for robot in members:
+            if robot.identity == self.own.identity:
+                self.own = max(self.own, robot, key=_age)
+            else:
+                present = self._others.get(robot.identity, robot)
+                self._others[robot.identity] = max(present, robot, key=_age)
 
     def forget(self) -> None:
         """Forget the evidence of the own robot for ever, and that of others for now.
 
         Others' evidence returns when it is merged again.
         """
-        self.own = self.own.forgotten()
+        empty = RobotEvidence.new(self.own.robot, self.own.places.side)
+        version = self.own.renewed().version
+        self.own = empty._replace(identity=self.own.identity, version=version)
         self._others = {}
 
-    def separate(self, changes: Iterable[Change]) -> None:
-        """Let the last changes of the own evidence be those of another robot.
+    def separate(self, drives: Iterable[RobotEvidence]) -> None:
+        """Let the last drives of the own robot be those of another robot.
 
-        Another process has continued the own evidence before these changes were made.
+        Another process has continued the own evidence before these drives were added.
         """
-        own = RobotEvidence.new(self.own.robot, self.own.places.side)
-        for change in changes:
-            own = own.changed(change)
-        self.own = own
+        self.own = RobotEvidence.new(self.own.robot, self.own.places.side)
+        for drive in drives:
+            self.own = self.own.with_drive(drive)
 
 
-def new_token() -> int:
-    """Return a random number for `Version`."""
-    return secrets.randbits(63)
-
-
-def _newer(first: RobotEvidence, second: RobotEvidence) -> RobotEvidence:
-    """Return the newer of two pieces of evidence of one robot.
-
-    Of the same version, that counts which has faded more.
-    """
-    if (second.version, second.faded) > (first.version, first.faded):
-        return second
-    return first
+def _age(robot: RobotEvidence) -> tuple[Version, float]:
+    """Return by what pieces of evidence of one robot are compared: newer is greater."""
+    return robot.version, robot.faded

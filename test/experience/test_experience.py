@@ -597,7 +597,7 @@ def test_sums_that_no_drive_shows_are_no_experience(
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("seconds", math.nan), ("seconds", -1), ("tokens", -1)]
+    ("name", "value"), [("driven", math.nan), ("driven", -1), ("versions", -1)]
 )
 def test_changes_that_no_drive_makes_are_refused(name: str, value: float) -> None:
     experience = driven(straight((2, 5), (12, 5)))
@@ -605,7 +605,7 @@ def test_changes_that_no_drive_makes_are_refused(name: str, value: float) -> Non
     state = experience.state
     experience.record_failure((2.0, 2.0))
     arrays = dict(np.load(io.BytesIO(experience.changes_since(state))))
-    arrays[name] = np.array([value])
+    arrays[name] = np.full_like(arrays[name], value)
     forged = io.BytesIO()
     np.savez(forged, **arrays)
     with pytest.raises(ExperienceFileError, match="cannot be true"):

@@ -224,14 +224,14 @@ def test_broken_changes_are_refused() -> None:
     original.record(*straight((2, 5), (12, 5)))
     changes = original.changes_since(state)
     assert changes is not None
-    for broken in (b"", changes[:-20], original.to_bytes()):
+    for broken in (b"", changes[:-20], original.to_bytes(), "x", None):
         with pytest.raises(ExperienceFileError, match="no changes of experience"):
-            copy.apply_changes(broken)
+            copy.apply_changes(broken)  # type: ignore[arg-type]
     with pytest.raises(ExperienceFileError, match="no experience"):
         Experience.from_bytes(changes)
 
 
-@pytest.mark.parametrize("robot", [3, None, "r" * 101])
+@pytest.mark.parametrize("robot", [3, None, "r" * 101, "r\0", "\0"])
 def test_a_wrong_name_is_refused(robot: object) -> None:
     with pytest.raises(ValueError, match=r"robot is .*; give a name"):
         Experience(SPEED, robot=robot)  # type: ignore[arg-type]
