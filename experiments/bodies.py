@@ -370,8 +370,8 @@ def _compare(
     result: Optimality,
 ) -> None:
     """Plan with the bounds 1.2 and 1, and add the plans to the result."""
-    first = planner.plan_poses(grid, start, goal, bound=1.2)
-    last = planner.plan_poses(grid, start, goal, bound=1.0)
+    first = plan_of_primitives(planner, grid, start, goal, bound=1.2)
+    last = plan_of_primitives(planner, grid, start, goal, bound=1.0)
     first_ratio = (first.cost or np.nan) / least_cost
     last_ratio = (last.cost or np.nan) / least_cost
     result.requests += 1
@@ -381,6 +381,15 @@ def _compare(
     result.first_ratio = float(np.maximum(result.first_ratio, first_ratio))
     result.last_ratio = float(np.maximum(result.last_ratio, last_ratio))
     result.bound = max(result.bound, first.bound)
+
+
+def plan_of_primitives(
+    planner: Planner, grid: GridMap, start: Pose, goal: Pose, bound: float
+) -> PosePlan:
+    """Return a path that is not finished: Dijkstra's costs are those of primitives."""
+    assert planner.pose_planner is not None
+    request = PoseRequest(grid, start, (goal,), bound=bound, finished=False)
+    return last_step(planner.pose_planner.steps(request))
 
 
 def collisions(options: argparse.Namespace) -> Iterator[list[Any]]:

@@ -45,7 +45,7 @@ from ddqn_planner.nodes.reasons import (
 from ddqn_planner.nodes.worker import Worker
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest
 from ddqn_planner.planning.exact_paths import NO_PATH, ExactPath, exact_path
-from ddqn_planner.planning.plan import PosePlan, joined
+from ddqn_planner.planning.plan import PosePlan, are_joined, joined
 from ddqn_planner.planning.pose_planner import PoseRequest
 
 RETRY_WITHIN = 2.0  # seconds after a failure; later if no newer costmap came
@@ -369,6 +369,7 @@ class Requests:
 
         Each leg begins at the end of the leg before it.
         """
+        first_request = request
         plan = await self._plan(planner, request)
         plans = [plan]
         for goal in later_goals:
@@ -377,6 +378,12 @@ class Requests:
             request = next_request(request, plan, goal)
             plan = await self._plan(planner, request)
             plans.append(plan)
+        is_finished = isinstance(first_request, PoseRequest) and first_request.finished
+        if is_finished and not are_joined(plans):
+            # No curve leads on from an exact end. Paths of primitives alone end in
+            # states, from which the next ones lead on.
+            of_primitives = replace(first_request, finished=False)
+            return await self._plan_legs(planner, of_primitives, later_goals)
         return Legs(request, plans)
 
     async def _plan(self, planner: Planner, request: Request) -> Plan:

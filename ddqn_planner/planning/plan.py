@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, Generic, TypeAlias, TypeVar
 
 import numpy as np
@@ -14,7 +15,9 @@ from numpy.typing import NDArray
 from ddqn_planner.grid import Cell, GridMap, MoveRule, path_length
 from ddqn_planner.grid.arguments import Choice, numbers
 from ddqn_planner.planning.segments import SAME_COST
+from ddqn_planner.robot.motions import turn_between
 
+SAME_POSE = 1e-6  # metres and radians
 ROUNDING = 1 + 1e-6  # so that 0.15 m in cells of 0.05 m reach 3 cells, not 2.9999999
 
 
@@ -114,7 +117,7 @@ class PoseRequest(PathRequest[Pose]):
     bound: float = 1.2
     start_clearing_radius: float = 0.0  # metres
     either_direction: bool = False  # a goal may be reached forwards or backwards
-    finished: bool = False  # with exact ends, see `pose_finish`
+    finished: bool = True  # with exact ends, see `pose_finish`
 
     @property
     def has_any_heading(self) -> bool:
@@ -329,6 +332,19 @@ def joined(plans: Sequence[Plan]) -> Plan:
         field_ms=sum(plan.field_ms for plan in plans),
         rollout_ms=sum(plan.rollout_ms for plan in plans),
     )
+
+
+def are_joined(plans: Sequence[Plan]) -> bool:
+    """Return whether each leg with poses begins where the leg before it ends."""
+    legs = [plan.poses for plan in plans if isinstance(plan, PosePlan)]
+    for leg, next_leg in pairwise(legs):
+        if not len(next_leg):  # the last leg has no path
+            return True
+        dx, dy, _ = next_leg[0] - leg[-1]
+        turn = float(turn_between(leg[-1, 2], next_leg[0, 2]))
+        if max(abs(dx), abs(dy), abs(turn)) > SAME_POSE:
+            return False
+    return True
 
 
 def _with_poses_of(plans: Sequence[Plan]) -> PosePlan:

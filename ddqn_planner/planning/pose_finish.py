@@ -738,23 +738,13 @@ class Finish:
         if np.abs(path.poses[0] - start).max() < SAME_END:
             return path
         lengths = _lengths(in_cells(path.poses, grid))
-        count = int(np.searchsorted(lengths, NODES_OF_END * NODE_SPACING)) + 1
+        count = int(np.searchsorted(lengths[:-1], NODES_OF_END * NODE_SPACING)) + 1
         head = path.part(0, count)
         joint = head.poses[-1]
         new_head = self.finished(head, start, joint, grid, world)
         if new_head is head:
             return path
-        extra_cost = new_head.costs[-1] - (head.costs[-1] - path.costs[0])
-        return PosePath(
-            poses=np.concatenate([new_head.poses, path.poses[count:]]),
-            cells=np.concatenate([new_head.cells, path.cells[count:]]),
-            costs=np.concatenate(
-                [new_head.costs, path.costs[count:] - path.costs[0] + extra_cost]
-            ),
-            least_costs=np.concatenate(
-                [new_head.least_costs, path.least_costs[count:]]
-            ),
-        )
+        return new_head.followed_by(path.part(count - 1, len(path.poses)))
 
     def _moved(
         self,

@@ -55,6 +55,16 @@ class PosePath(NamedTuple):
             self.least_costs[part],
         )
 
+    def followed_by(self, rest: "PosePath") -> "PosePath":
+        """Return the path and then another one, which begins in its last pose."""
+        costs_of_rest = rest.costs[1:] - rest.costs[0]
+        return self._replace(
+            poses=np.concatenate([self.poses, rest.poses[1:]]),
+            cells=np.concatenate([self.cells, rest.cells[1:]]),
+            costs=np.concatenate([self.costs, self.costs[-1] + costs_of_rest]),
+            least_costs=np.concatenate([self.least_costs, rest.least_costs[1:]]),
+        )
+
     def plan(self, first: int, grid: GridMap) -> PosePlan:
         """Return the plan along the rest of the path, from pose number `first` on.
 

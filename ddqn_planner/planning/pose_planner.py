@@ -199,10 +199,9 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
     ) -> paths.PosePath:
         """Return a path that begins and ends exactly where the request says, with room.
 
-        A path that ends beside the goal, within its tolerance, ends there.
+        A path that ends beside the goal, within its tolerance, ends there. A path out
+        of obstacles stays as it is up to its first free pose.
         """
-        if path.escape:
-            return path
         grid = request.grid
         goals = np.array(request.goals, np.float64)  # (G, 3)
         last_pose = path.poses[-1]
@@ -213,7 +212,13 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
             goals = np.concatenate([goals, reversed_goals])
         number = paths.nearest_pose(goals, last_pose, grid, SAME_END)
         goal = goals[number] if number >= 0 else last_pose
-        return self._finish.finished(path, request.start, goal, grid, world)
+        if not path.escape:
+            return self._finish.finished(path, request.start, goal, grid, world)
+        escape = path.part(0, path.escape + 1)
+        rest = path.part(path.escape, len(path.poses))
+        start = rest.poses[0]
+        finished_rest = self._finish.finished(rest, start, goal, grid, world)
+        return escape.followed_by(finished_rest)._replace(escape=path.escape)
 
     def _reason(self, request: PoseRequest, plan: PosePlan) -> PausingGenerator[str]:
         """Return why there is no path, in words.

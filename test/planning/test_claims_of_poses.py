@@ -47,6 +47,16 @@ def pose_of(planner: Planner, grid: GridMap, state: State) -> Pose:
     return (*grid.cell_to_world((x, y)), float(planner.network.motions.angles[heading]))
 
 
+def plan_of_primitives(
+    planner: Planner, grid: GridMap, start: Any, goal: Pose, bound: float
+) -> PosePlan:
+    """A path that Dijkstra finds, too: not finished."""
+    request = PoseRequest(grid, start, (goal,), bound=bound, finished=False)
+    plan = last_step(planner.steps(request))
+    assert isinstance(plan, PosePlan)
+    return plan
+
+
 def true_costs(planner: Planner, grid: GridMap, *goals: State) -> NDArray[np.float64]:
     """The least cost in cells from every state to the nearest goal: (H, W, 16)."""
     assert isinstance(planner.network, RobotNetwork)
@@ -129,7 +139,7 @@ def loose_path(planner: Planner, seed: int) -> LoosePath:
     body = fresh(planner)
     start, goal = (pose_of(body, grid, state) for state in (START_STATE, GOAL_STATE))
     least = true_costs(body, grid, GOAL_STATE)
-    path = body.plan_poses(grid, start, goal, bound=3.0)
+    path = plan_of_primitives(body, grid, start, goal, bound=3.0)
     return LoosePath(grid, body, goal, least, path)
 
 
@@ -142,7 +152,7 @@ def test_the_rest_of_a_path_is_as_good_as_it_claims(
     states = states_on(body, grid, path)
     compared = 0
     for place, (x, y, heading) in states:
-        rest = body.plan_poses(grid, tuple(path.poses[place]), goal, bound=1e6)
+        rest = plan_of_primitives(body, grid, tuple(path.poses[place]), goal, bound=1e6)
         if not np.array_equal(rest.poses, path.poses[place:]):
             break  # so near to the goal nothing is proved of the rest
         assert rest.cost is not None
@@ -160,7 +170,7 @@ def test_the_rest_of_a_path_is_planned_anew_where_its_bound_does_not_do(
     assert path.cost is not None
     assert path.cost > 1.1 * least[y, x, heading]
     place, (x, y, heading) = states_on(body, grid, path)[5]
-    cheapest = body.plan_poses(grid, tuple(path.poses[place]), goal, bound=1.0)
+    cheapest = plan_of_primitives(body, grid, tuple(path.poses[place]), goal, bound=1.0)
     assert cheapest.bound == 1.0
     assert cheapest.cost == pytest.approx(least[y, x, heading], rel=ROUNDED)
 
@@ -174,10 +184,10 @@ def test_the_rest_of_a_cheapest_path_costs_the_least(
     grid = obstacles(seed).with_layers(cost=np.kron(cost, np.ones((10, 10), np.int8)))
     start, goal = (pose_of(body, grid, state) for state in (START_STATE, GOAL_STATE))
     least = true_costs(body, grid, GOAL_STATE)
-    path = body.plan_poses(grid, start, goal, bound=1.0)
+    path = plan_of_primitives(body, grid, start, goal, bound=1.0)
     costs = []
     for place, pose in enumerate(path.poses):
-        rest = body.plan_poses(grid, tuple(pose), goal, bound=1.0)
+        rest = plan_of_primitives(body, grid, tuple(pose), goal, bound=1.0)
         if not np.array_equal(rest.poses, path.poses[place:]):
             break  # the last cells of the path are planned anew, as sums are rounded
         costs.append(rest.cost or 0.0)
@@ -341,7 +351,7 @@ def test_plans_with_costs_keep_the_bound_that_they_prove(
     for y, x, heading in random.choice(reachable, 8).tolist():
         start = pose_of(body, grid, (x, y, heading))
         for bound in (math.inf, 1.3, 1.05, 1.0):
-            plan = body.plan_poses(grid, start, goal, bound=bound)
+            plan = plan_of_primitives(body, grid, start, goal, bound=bound)
             assert plan.status is PlanStatus.SUCCEEDED
             assert plan.cost is not None
             assert plan.bound <= bound * (1 + ROUNDED)

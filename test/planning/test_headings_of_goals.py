@@ -43,9 +43,16 @@ def pose_of(planner: Planner, grid: GridMap, x: int, y: int, heading: int) -> Po
 def fresh_plan(
     planner: Planner, grid: GridMap, goal: Pose | Sequence[Pose], **options: Any
 ) -> PosePlan:
+    """A path of primitives alone, by a planner that has planned nothing before."""
     start = pose_of(planner, grid, 12, 15, 2)
     planner = Planner(planner.network, planner.metadata)
-    return planner.plan_poses(grid, start, goal, bound=1.0, **options)
+    goals = [goal] if isinstance(goal, tuple) else goal
+    request = PoseRequest(
+        grid, start, tuple(goals), bound=1.0, finished=False, **options
+    )
+    plan = last_step(planner.steps(request))
+    assert isinstance(plan, PosePlan)
+    return plan
 
 
 @pytest.mark.parametrize("heading", [7])

@@ -155,8 +155,21 @@ def test_a_way_out_touches_what_the_start_covers_and_the_rest_nothing(
     if is_as_asked:
         assert plan.escape > 0
         assert "the start is occupied" in plan.reason
-        assert plan.cost is not None
-        assert least_cost / 1.0001 <= plan.cost <= plan.bound * least_cost * 1.0001
+        request = PoseRequest(
+            grid,
+            start_pose,
+            (goal_pose,),
+            start_clearing_radius=math.inf,
+            finished=False,
+        )
+        of_primitives = last_step(body.poses.steps(request))
+        cost, bound = of_primitives.cost, of_primitives.bound
+        assert cost is not None
+        assert least_cost / 1.0001 <= cost <= bound * least_cost * 1.0001
+        # Only what comes after the way out is finished.
+        assert of_primitives.escape == plan.escape
+        way_out = slice(plan.escape + 1)
+        assert np.array_equal(plan.poses[way_out], of_primitives.poses[way_out])
         for pose in plan.poses[: plan.escape]:
             assert cells_under(pose, occupancy) <= under_start
         for pose in plan.poses[plan.escape :]:

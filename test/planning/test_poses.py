@@ -74,6 +74,8 @@ def planner(motion: str, footprint: str = "") -> PosePlanner:
 def plan(
     planner: PosePlanner, grid: GridMap, start: Pose, *goals: Pose, **how: Any
 ) -> PosePlan:
+    """A path of primitives alone: so Dijkstra over these tells its least cost."""
+    how = {"finished": False, **how}
     return last_step(planner.steps(PoseRequest(grid, start, goals, **how)))
 
 
@@ -757,7 +759,8 @@ def test_a_search_under_way_does_not_see_the_map_of_a_later_request() -> None:
         for state in ((45, 5, 0), (115, 5, 0), (10, 10, 0), (20, 10, 0))
     )
     body = planner("differential")
-    steps = body.steps(PoseRequest(walled, start, (goal,), bound=1.0))
+    request = PoseRequest(walled, start, (goal,), bound=1.0, finished=False)
+    steps = body.steps(request)
     while not body.fields.kept:
         assert next(steps) is None  # a pause: other requests have a turn
     other = plan(body, closed, start_of_other, goal_of_other)
