@@ -378,8 +378,12 @@ class Requests:
             request = next_request(request, plan, goal)
             plan = await self._plan(planner, request)
             plans.append(plan)
-        is_finished = isinstance(first_request, PoseRequest) and first_request.finished
-        if is_finished and not are_joined(plans):
+        has_gap = not are_joined(plans)
+        if (
+            has_gap
+            and isinstance(first_request, PoseRequest)
+            and first_request.finished
+        ):
             # No curve leads on from an exact end. Paths of primitives alone end in
             # states, from which the next ones lead on.
             of_primitives = replace(first_request, finished=False)
