@@ -37,6 +37,8 @@ def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
         yield  # there is no other code
         return
     planner.plan(grid, start, goal, simplified=True)
+    if learns:  # that turns take time
+        planner.plan(grid.with_layers(turn_cost=1.0), start, goal)
     rule = planner.metadata.move_rule
     leg = np.array([start, goal], np.int32)
     exact_path([leg], grid, [(0.6, 0.7), grid.cell_to_world(goal)])

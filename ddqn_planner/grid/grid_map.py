@@ -426,6 +426,7 @@ class GridMap:
             slowness=other.slowness,
             seconds_per_cell=other.seconds_per_cell,
             exploration=exploration,
+            turn_cost=other.turn_cost,
         )
 
     def with_layers(self, **layers: object) -> GridMap:
@@ -476,6 +477,11 @@ class GridMap:
     def exploration(self) -> Exploration | None:
         """How sure the times are, added by `Experience.apply` through `with_layers`."""
         return None  # unless `with_layers` has set the attribute
+
+    @cached_property
+    def turn_cost(self) -> float:
+        """What turning costs, in cells per radian; set as `exploration` is."""
+        return 0.0
 
     def labels(self, move_rule: MoveRule | str) -> NDArray[np.int32]:
         """Return the number of each free cell's component, from 1 on: (H, W) int32.

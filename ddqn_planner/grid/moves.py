@@ -113,6 +113,18 @@ def positions(parts: NDArray[np.int64]) -> NDArray[np.float64]:
     return np.append(starts, float(len(parts)))
 
 
+def turning_along(path: Cells) -> float:
+    """Return by how much a path turns, the sum over all its corners, in radians.
+
+    `path` is (N, 2): the x and y of its cells, or of its corners.
+    """
+    steps = np.diff(np.asarray(path, np.float64), axis=0)  # (N - 1, 2)
+    moves = steps[steps.any(axis=1)]  # without steps from a cell to itself
+    heading = np.arctan2(moves[:, 1], moves[:, 0])
+    turn = (np.diff(heading) + np.pi) % (2 * np.pi) - np.pi  # -pi to pi
+    return float(np.abs(turn).sum())
+
+
 def cells_along(
     path: NDArray[np.signedinteger[Any]],
 ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:

@@ -290,7 +290,7 @@ def _roll_out(task: _Task, field: QField) -> Plan | None:
     request = task.request
     task.clock.end_field()  # the time from here on is that of the rollout
     start = task.escape_path[-1] if task.escape_path else request.start
-    outcome = field.greedy_path(start, request.simplified)
+    outcome = field.greedy_path(start, request.simplified, request.grid.turn_cost)
     if not isinstance(outcome, PlanStatus):
         return _finished(task, outcome, PlanMethod.GREEDY)
     # The field has looked at the whole map: no path leads from a free start to these

@@ -114,7 +114,10 @@ class PathFinder(ABC, Generic[Request, AnyPlan]):
         is_kept = best.extra_cost is not None
         if is_kept or best.cost is None:
             return best
-        shortest_request = replace(request, grid=exploration.untimed)
+        untimed = exploration.untimed
+        if request.grid.turn_cost > 0:
+            untimed = untimed.with_layers(turn_cost=request.grid.turn_cost)
+        shortest_request = replace(request, grid=untimed)
         shortest = yield from self._find_on_map(shortest_request, clock)
         if not shortest.path.size:
             return best

@@ -20,7 +20,7 @@ from ddqn_planner.grid.layers import (
     has_costs,
     multiplier_at,
 )
-from ddqn_planner.grid.moves import NO_ACTION
+from ddqn_planner.grid.moves import NO_ACTION, turning_along
 
 Path: TypeAlias = NDArray[np.int32]  # (N, 2): cells, joined by moves or by segments
 CellArray: TypeAlias = NDArray[np.int64]  # (N, 2): the same for compiled code
@@ -98,12 +98,15 @@ def straightened(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> Path:
 
 
 def cost_along(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> float:
-    """Return what a path of segments costs, legal or not.
+    """Return what a path of segments costs with its turns, legal or not.
 
     Each cell counts by the share of the segment that lies in it.
     """
     layers = grid.layers(move_rule)
-    return float(_segment_costs(path, layers, must_be_legal=False).sum())
+    cost = float(_segment_costs(path, layers, must_be_legal=False).sum())
+    if grid.turn_cost > 0:
+        cost += grid.turn_cost * turning_along(path)
+    return cost
 
 
 def legal_segments(
