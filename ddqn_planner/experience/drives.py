@@ -38,13 +38,16 @@ RECORD = "episodes.csv"
 LOCK = "driving.lock"  # a folder with this file belongs to a robot's drives
 
 HEADER = b"episode,outcome,start_time,seconds,metres,samples\r\n"
+# A drive is cut there, so that the robot learns while it drives for hours.
+MOST_SAMPLES = 2000
 NUMBER = rb"-?\d{1,12}(?:\.\d{1,9})?"  # below `LATEST`
 SAMPLE = rb"%b:%b:%b" % ((NUMBER,) * 3)
-# One blank between samples: else a row could be divided in too many ways to try.
+# Editors leave a mark of the encoding, and other ends of lines. One blank between
+# samples: else a row could be divided in too many ways to try.
 ROW = re.compile(
-    rb"(?P<number>\d{1,18}),(?P<outcome>[a-z_]{1,20}),"
-    rb"(?P<start>%b),(?P<seconds>%b),(?P<metres>%b),(?P<samples>%b(?: %b)*)\r\n"
-    % (NUMBER, NUMBER, NUMBER, SAMPLE, SAMPLE)
+    rb"(?:\xef\xbb\xbf)?(\d{1,18}),([a-z_]{1,20}),(%b),(%b),(%b),"
+    rb"(%b(?: %b){,%d})[ \t]*\r?\n"
+    % (NUMBER, NUMBER, NUMBER, SAMPLE, SAMPLE, MOST_SAMPLES - 1)
 )
 
 # A sample is recorded this many metres, or seconds, after the last one.
@@ -54,8 +57,6 @@ STAND_PERIOD = 2.0  # seconds after which a robot that stands at its goal has ar
 ARRIVAL_DISTANCE = 0.5  # metres from the goal
 PAUSE = 120.0  # seconds: a robot that stands for longer waits for no door and no crowd
 SHORTEST = 0.5  # metres: a robot that went no farther away has not driven
-# A drive is cut there, so that the robot learns while it drives for hours.
-MOST_SAMPLES = 2000
 # Seconds back by which a clock begins anew: a bag loops, a simulator is reset.
 JUMP = 1.0
 ROUNDING = 0.002  # seconds: files have milliseconds
@@ -101,8 +102,13 @@ class Drive(NamedTuple):
         means = averaged(Poses(self.seconds, self.positions), WINDOW).position  # (M, 2)
         corners = means[indices_apart(means, STEP)]  # (K, 2), K <= M
         path = np.concatenate([self.positions[:1], corners, self.positions[-1:]])
-        steps: Float64 = np.diff(path, axis=0)
-        return float(np.hypot(steps[:, 0], steps[:, 1]).sum())
+        return _length(path)
+
+    @property
+    def extent(self) -> float:
+        """How far from its start the robot came, metres."""
+        from_start = self.positions - self.positions[:1]
+        return float(np.linalg.norm(from_start, axis=1).max(initial=0))
 
     def teach(self, experience: Experience, grid: GridMap | None = None) -> Learned:
         """Let `experience` learn from this drive, and return what it has learned.
@@ -128,12 +134,16 @@ class Drive(NamedTuple):
         ``seconds:x:y``, with the seconds since the start.
         """
         start = self.seconds[0]
-        elapsed = self.seconds - start  # (N,)
-        table = np.column_stack([elapsed, self.positions])  # (N, 3)
-        samples = [f"{seconds:.3f}:{x:.3f}:{y:.3f}" for seconds, x, y in table.tolist()]
-        measures = f"{start:.3f},{elapsed[-1]:.3f},{self.metres:.3f}"
+        table = np.column_stack([self.seconds - start, self.positions])  # (N, 3)
+        samples = [":".join(map("{:.3f}".format, row)) for row in table.tolist()]
+        measures = f"{start:.3f},{table[-1, 0]:.3f},{self.metres:.3f}"
         columns = f"{number},{self.outcome.value},{measures},{' '.join(samples)}"
         return f"{columns}\r\n".encode()
+
+
+def _length(path: Float64) -> float:
+    """Return the length of a path (N, 2), metres."""
+    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
 
 
 def read_drives(
@@ -146,7 +156,7 @@ def read_drives(
     read.
     """
     for number, line in enumerate(read_rows(as_path(path)), 1):
-        if line == HEADER:
+        if HEADER.strip() in line:
             continue
         try:
             yield _drive_in(line)
@@ -158,23 +168,32 @@ def _drive_in(line: bytes) -> Drive:
     """Return the drive in a row of ``episodes.csv``; a ValueError if it has none."""
     row = ROW.fullmatch(line)
     if row is None:
-        raise ValueError("it is incomplete, or has other columns")
-    outcome = DriveEnd(row["outcome"].decode())
-    sample_count = row["samples"].count(b" ") + 1
-    if sample_count > MOST_SAMPLES:
-        raise ValueError(f"it has {sample_count} samples, more than {MOST_SAMPLES}")
-    numbers = [sample.split(b":") for sample in row["samples"].split(b" ")]
-    samples = np.array(numbers, dtype=np.float64)  # (N, 3): seconds, x, y
-    elapsed = samples[:, 0]  # (N,): from the start of the drive
-    seconds = float(row["seconds"])
-    if abs(elapsed[-1] - seconds) > ROUNDING:
-        raise ValueError(f"it takes {seconds:g} s, but ends after {elapsed[-1]:g} s")
-    if (np.diff(elapsed, prepend=0) < -JUMP).any():
-        raise ValueError("its times run backwards")
-    positions = samples[:, 1:]
-    if (np.abs(positions) > FARTHEST).any():
-        raise ValueError(f"it has positions beyond {FARTHEST:g} m")
-    return Drive(outcome, elapsed + float(row["start"]), positions)
+        raise ValueError(
+            f"it is incomplete, has other columns, or more than {MOST_SAMPLES} samples"
+        )
+    _, outcome, *measures, samples = row.groups()
+    start, seconds, metres = map(float, measures)
+    numbers = samples.replace(b" ", b":").split(b":")
+    table = np.array(numbers, np.float64).reshape(-1, 3)  # seconds, x, y of N samples
+    elapsed = table[:, 0]  # (N,): from the start of the drive
+    positions = table[:, 1:]
+    drive = Drive(DriveEnd(outcome.decode()), elapsed + start, positions)
+    # The oldest rows have the length with the noise of the poses.
+    length = _length(positions)
+    conditions = {
+        f"it takes {seconds:g} s, but ends after {elapsed[-1]:g} s": (
+            abs(elapsed[-1] - seconds) <= ROUNDING
+        ),
+        "its times run backwards": (np.diff(elapsed, prepend=0) >= -JUMP).all(),
+        f"it has positions beyond {FARTHEST:g} m": (np.abs(positions) < FARTHEST).all(),
+        f"it has {metres:g} m, but its samples lead over {length:g} m": (
+            drive.metres - STEP <= metres <= length + STEP
+        ),
+    }
+    for reason, is_true in conditions.items():
+        if not is_true:
+            raise ValueError(reason)
+    return drive
 
 
 class DriveRecorder:
@@ -219,30 +238,28 @@ class DriveRecorder:
         if self._stand is None or _distance(self._stand, sample) > STAND_DISTANCE:
             self._stand = sample
             if self._last is not None and not self._samples:
-                self._samples.append(self._last)  # a drive begins there
+                self._samples = [self._last]  # a drive begins there
         self._last = sample
         if self._samples:
-            self._continue(sample, self._stand)
+            self._continue(sample, abs(seconds - self._stand.seconds))
 
-    def _continue(self, sample: Sample, stand: Sample) -> None:
+    def _continue(self, sample: Sample, stood: float) -> None:
         """Continue the drive to a pose, and end the drive if it is over.
 
         `sample` is the pose, which is recorded if it is far enough or late enough after
-        the last one. `stand` is the first pose of the time for which the robot stands.
+        the last one. The robot has `stood` there for so many seconds.
         """
         recorded = self._samples[-1]
         is_far = _distance(recorded, sample) >= SAMPLE_DISTANCE
-        is_late = abs(sample.seconds - recorded.seconds) >= SAMPLE_PERIOD
-        if is_far or is_late:
+        if is_far or abs(sample.seconds - recorded.seconds) >= SAMPLE_PERIOD:
             self._samples.append(sample)
-        stood = abs(sample.seconds - stand.seconds)
         if stood >= STAND_PERIOD and self._is_at_goal:
             self.end(DriveEnd.ARRIVED)
         elif stood >= PAUSE:
             self.end(DriveEnd.PAUSED)
         elif len(self._samples) >= MOST_SAMPLES:
             self.end(DriveEnd.CUT)
-            self._samples.append(sample)  # the next drive begins at once
+            self._samples = [sample]  # the next drive begins at once
 
     @property
     def _is_at_goal(self) -> bool:
@@ -279,14 +296,10 @@ class DriveRecorder:
         samples = np.array(self._samples).reshape(-1, 3)  # (N, 3): seconds, x, y
         self._samples = []
         self._stand = self._last
-        positions = samples[:, 1:]
-        from_start = positions - positions[:1]
-        distances = np.hypot(from_start[:, 0], from_start[:, 1])
-        distance_from_start = float(distances.max(initial=0))
-        has_driven = distance_from_start >= SHORTEST
+        drive = Drive(outcome, samples[:, 0], samples[:, 1:])
         has_failed = outcome is DriveEnd.ABORTED and len(samples) > 0
-        if has_driven or has_failed:
-            self._on_drive(Drive(outcome, samples[:, 0], positions))
+        if drive.extent >= SHORTEST or has_failed:
+            self._on_drive(drive)
 
 
 def _distance(first: Sample, second: Sample) -> float:
@@ -328,9 +341,10 @@ class DriveFolder(WorkFolder):
             self.drives = _cut_incomplete_row(self.record_path)
             is_new = not self.experience_path.exists()
             if not is_new:
-                self.experience = self._loaded(self.experience_path)
+                self._load(self.experience_path)
             elif older:
-                self.experience = self._loaded(older).for_robot(robot)
+                self._load(older)
+                self.experience = self.experience.for_robot(robot)
             self._record = Appender(self.record_path)
             self.callback(self._record.close)
             if self.record_path.stat().st_size == 0:
@@ -339,24 +353,22 @@ class DriveFolder(WorkFolder):
                 for drive in read_drives(self.record_path):
                     drive.teach(self.experience)
 
-    def _loaded(self, source: str | Path) -> Experience:
-        """Load the experience of a file or folder.
+    def _load(self, source: str | Path) -> None:
+        """Load the experience of a file or folder, whose path is `source`.
 
-        `source` is its path. A ValueError if it is the experience of another kind of
-        robot, with another nominal speed or width.
+        A ValueError if it is the experience of another kind of robot, with another
+        nominal speed or width.
         """
         saved = Experience.load(source)
-        options = {
-            "nominal_speed": self.experience.nominal_speed,
-            "robot_width": self.experience.robot_width,
-        }
+        options = self.experience.options
+        del options["half_life"], options["max_pause"]  # these are the file's
         changed = differences(saved.options, options)
         if changed:
             raise ValueError(
                 f"{source} holds experience with {changed}; give those values, another "
                 f"folder, or learn anew: ddqn-planner learn {self.folder} --map MAP"
             )
-        return saved
+        self.experience = saved
 
     def add(self, drive: Drive, grid: GridMap | None = None) -> Learned:
         """Record a drive, learn from it, and save; return what the drive taught.
@@ -400,5 +412,5 @@ def _cut_incomplete_row(path: Path) -> int:
     complete = content[: content.rfind(b"\n") + 1]
     if complete != content:
         os.truncate(path, len(complete))
-    rows = map(ROW.fullmatch, complete.splitlines(keepends=True))
-    return max((int(row["number"]) for row in rows if row), default=0)
+    numbers = re.findall(rb"^\d{1,18}", complete, re.MULTILINE)
+    return max(map(int, numbers), default=0)

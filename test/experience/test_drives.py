@@ -249,6 +249,8 @@ def test_a_row_that_a_crash_cut_is_left_out_and_the_others_stay(
         b"3,arrived,0.0,-9.0,1.0,0:1:1 -9:1:2\r\n",
         b"3,arrived,0.0,1.0,1.0,0:1:1 900:1:2\r\n",  # a wait longer than the drive
         b"3,arrived,0.0,1.0,1.0,0:1:1 9:1:2 1:1:2\r\n",
+        b"3,arrived,0.0,1.0,200000.0,0:1:1 1:1:2\r\n",
+        b"3,arrived,0.0,1.0,-1.0,0:1:1 1:1:2\r\n",
         b"3,arrived,0.0,1.0,1.0," + b"0:1:1 " * 2000 + b"1:1:2\r\n",
         # It could be divided into samples in 4**99 ways.
         b"3,arrived,0.0,1.0,1.0,1111:1" + b":1111:1" * 99 + b"x\r\n",
@@ -265,6 +267,39 @@ def test_a_row_of_something_else_is_left_out(tmp_path: Path, row: bytes) -> None
     assert recorded(tmp_path) == ["arrived", "stopped"]
     assert record(tmp_path, 1).drives == 5
     assert recorded(tmp_path) == ["arrived", "stopped", "arrived"]
+
+
+@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
+@pytest.mark.parametrize("has_header", [True, False])
+@pytest.mark.parametrize("end", [b"\n", b"\r\n", b"  \n", b" \t\r\n"])
+def test_rows_that_an_editor_has_saved_are_read(
+    tmp_path: Path, mark: bytes, has_header: bool, end: bytes
+) -> None:
+    path = record(tmp_path, 2).record_path
+    rows = path.read_bytes().splitlines()[0 if has_header else 1 :]
+    path.write_bytes(mark + b"".join(row + end for row in rows))
+    assert [*read_drives(path, pytest.fail)][1].outcome is DriveEnd.ARRIVED
+    assert record(tmp_path, 1).drives == 3
+    assert recorded(tmp_path) == ["arrived"] * 3
+
+
+def test_the_length_in_a_row_is_that_of_noisy_poses_or_of_the_drive(
+    tmp_path: Path,
+) -> None:
+    """As the first version wrote it, and as it is written since."""
+    folder = opened(tmp_path)
+    seconds = np.arange(0, 60, 0.1)
+    straight_on = np.column_stack([seconds / 2, np.zeros(600)])
+    noisy = np.random.default_rng(1).normal(straight_on, 0.05)
+    drive = Drive(DriveEnd.ARRIVED, seconds, noisy)
+    folder.add(drive)
+    folder.close()
+    length = float(np.hypot(*np.diff(noisy, axis=0).T).sum())
+    row = folder.record_path.read_text()
+    for metres, is_read in ((drive.metres, 1), (length, 1), (length + 1, 0), (28, 0)):
+        changed = row.replace(f",{drive.metres:.3f},", f",{metres:.3f},")
+        folder.record_path.write_text(changed)
+        assert len([*read_drives(folder.record_path)]) == is_read
 
 
 def test_experience_that_is_broken_or_of_another_robot_is_refused(
