@@ -265,8 +265,8 @@ class Experience:
             return f"{backwards} times are earlier than those before; sort them"
         if (elapsed > self.max_pause).any():
             return (
-                f"the times are up to {elapsed.max():.10g} s apart; give at most "
-                f"max_pause, {self.max_pause:.10g} s"
+                f"the times are up to {elapsed.max():.10g} s apart; give seconds, not "
+                f"milliseconds, at most max_pause, {self.max_pause:.10g} s, apart"
             )
         metres = np.hypot(step[:, 0], step[:, 1])
         fastest = float((metres / elapsed).max())

@@ -482,7 +482,7 @@ TIMES = np.linspace(0, 20, 41)
         (TIMES, LINE + 1e9, "0 of 41 poses .* metres up to"),
         (TIMES * 0, LINE, "1 of 41 poses are possible and differ in their time"),
         (TIMES[::-1], LINE, "40 times are earlier than those before; sort them"),
-        (TIMES * 100, LINE, "the times are up to 50 s apart; give at most"),
+        (TIMES * 100, LINE, "up to 50 s apart; give seconds, not"),
         (
             TIMES * 20,
             LINE * 20,

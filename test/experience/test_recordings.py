@@ -89,12 +89,16 @@ def test_recordings_add_to_older_experience(
 # A file's name and its text, and why it is refused.
 REFUSED = [
     ("drive.csv", "time,x,y\n1,2,3\n", "the columns seconds are missing"),
-    ("drive.csv", "seconds,x,y\n1,2,three\n", "'three'.* has no numbers"),
-    ("drive.csv", "seconds,x,y\n1,2\n", "'2'.* has no numbers"),
-    ("drive.csv", "seconds,x,y\n1,2,nan\n", "holds no drive"),
+    ("drive.csv", "seconds;x;y\n1;2;3\n", "are missing; .* with commas between"),
+    ("drive.csv", "seconds,x,y\n1,2,three\n", "'three' to float64 at row 0, column 3"),
+    ("drive.csv", "seconds,x,y\n1,2\n", "row 1 with 2 columns; give seconds, x and y"),
+    ("drive.csv", "seconds,x,y\n1,2,nan\n", "no drive: 0 poses have finite numbers"),
+    ("drive.csv", "seconds,x,y\n", "no drive: 0 poses have finite numbers"),
     ("drive.csv", "", "columns seconds, x, y are missing"),
-    ("drive.csv", "seconds,x,y\n99,1,1\n98,2,1\n97,3,1\n", "time .* runs backwards"),
+    ("drive.csv", "seconds,x,y\n99,1,1\n98,2,1\n97,3,1\n", "time runs backwards"),
     ("drive.csv", "seconds,x,y\n" + 9 * "7,1,1\n7,2,1\n", "time .* stands still"),
+    ("drive.csv", "seconds,x,y\n1,1,1\n2,1.2,1\n", "no farther than 0.2 m; drive on"),
+    ("episodes.csv", "", "holds no drive; drive on"),
     (
         "drive.csv",
         "seconds,x,y\n1,-50,1\n2,-51,1\n3,-52,1\n",
@@ -121,6 +125,49 @@ def test_what_cannot_be_learned_is_refused(
         file.write_text(text)
     assert re.search(reason, console("learn", file, "--map", map_file, status=2).err)
     assert not [*tmp_path.glob("experience.npz"), *tmp_path.glob("*.lock")]
+
+
+@pytest.mark.parametrize("rate", [1, 2, 10, 50, 500])
+@pytest.mark.parametrize("speed", [0.2, 0.5, 2.0])
+@pytest.mark.parametrize(("start", "unit"), [(0, 1e3), (1.7e9, 1e3), (0, 1e9)])
+def test_times_in_another_unit_are_told(
+    tmp_path: Path, rate: float, speed: float, start: float, unit: float
+) -> None:
+    """Of milliseconds and nanoseconds, whether they make drives or not."""
+    elapsed = np.arange(0, 20, 1 / rate)
+    x = 1 + speed * elapsed
+    table = np.column_stack([(start + elapsed) * unit, x, np.ones(len(x))])
+    file = tmp_path / "drive.csv"
+    np.savetxt(file, table, delimiter=",", header="seconds,x,y", comments="")
+    try:
+        drives = read_recording(file, GRID).drives
+    except ValueError as error:
+        assert "milliseconds or nanoseconds" in str(error)  # noqa: PT017 - some do
+    else:
+        for drive in drives:
+            assert re.search(
+                "give (metres and )?seconds", drive.teach(Experience(0.5)).reason
+            )
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.9])
+def test_the_share_of_poses_off_the_map_is_told_if_it_is_large(
+    tmp_path: Path, share: float
+) -> None:
+    x = np.linspace(30 * share, 30 + 30 * share, 601)
+    table = np.column_stack([np.arange(601), x, np.ones(601)])
+    file = tmp_path / "drive.csv"
+    np.savetxt(file, table, delimiter=",", header="seconds,x,y", comments="")
+    told: list[str] = []
+    assert read_recording(file, GRID, on_damage=told.append).drives
+    shares = [int(reason.split(": ")[1].split("%")[0]) for reason in told]
+    assert shares == ([pytest.approx(100 * share, abs=1)] if share > 0.1 else [])
+    in_walls = GridMap(np.arange(120)[None].repeat(40, 0) < 120 * share, 0.25)
+    told.clear()
+    table[:, 1] = np.linspace(0, 29.9, 601)
+    np.savetxt(file, table, delimiter=",", header="seconds,x,y", comments="")
+    assert read_recording(file, in_walls, on_damage=told.append).drives
+    assert len(told) == len(shares)
 
 
 def test_a_recording_of_hours_has_a_drive_for_each_way(tmp_path: Path) -> None:
