@@ -42,8 +42,7 @@ class Message(NamedTuple):
     @property
     def full_type(self) -> str:
         """The name of the type as in ROS 2: "nav_msgs/msg/Odometry"."""
-        parts = self.type.split("/")
-        return f"{parts[0]}/msg/{parts[-1]}"
+        return self.type.replace("/msg/", "/").replace("/", "/msg/")
 
     def decoded(self) -> Any:
         """Return an object with the message's fields.
@@ -120,10 +119,10 @@ def read_messages(path: Path) -> Iterator[Message]:
         After the last message that can be read, if the file is broken or cut.
     """
     open_regular(path).close()
-    reader = READERS[_plain_name(path).suffix]
+    messages_in = READERS[_plain_name(path).suffix]
     try:
         with _unpacked(path) as file:
-            for message in reader.messages(file):
+            for message in messages_in(file):
                 if message.full_type in TYPES:
                     yield message
     except (ImportError, OSError):
@@ -131,7 +130,8 @@ def read_messages(path: Path) -> Iterator[Message]:
     # Broken bytes make the libraries raise many kinds of errors.
     except Exception as error:
         raise BrokenBagError(
-            f"{path} cannot be read to its end ({error!r}); {reader.remedy}"
+            f"{path} cannot be read to its end ({error!r}); give a complete copy, or "
+            "repair it: `mcap recover`, `sqlite3 FILE .recover` or `rosbag reindex`"
         ) from error
 
 
@@ -145,19 +145,12 @@ def _unpacked(path: Path) -> Iterator[Path]:
     if path.suffix != ZSTD:
         yield path
         return
-    from zstandard import ZstdDecompressor
+    import zstandard
 
-    with TemporaryDirectory() as folder:
+    with TemporaryDirectory() as folder, zstandard.open(path) as packed:
         unpacked = Path(folder) / path.stem
-        with open_regular(path) as packed, unpacked.open("wb") as file:
-            stream = ZstdDecompressor().stream_reader(packed, read_across_frames=True)
-            try:
-                shutil.copyfileobj(stream, file)
-            except OSError as error:
-                raise OSError(
-                    f"{path} cannot be unpacked to {folder} ({error.strerror}); set "
-                    "TMPDIR to a folder with more room"
-                ) from error
+        with unpacked.open("wb") as file:
+            shutil.copyfileobj(packed, file)
         yield unpacked
 
 
@@ -174,44 +167,29 @@ def _mcap_messages(path: Path) -> Iterator[Message]:
 
 
 def _sqlite_messages(path: Path) -> Iterator[Message]:
-    """Yield the messages of the TYPES in a ``.db3`` file."""
+    """Yield the messages of a ``.db3`` file."""
     address = f"{path.absolute().as_uri()}?mode=ro"
-    places = ",".join("?" * len(TYPES))
     with closing(sqlite3.connect(address, uri=True)) as database:
+        # Images are not even read.
         rows = database.execute(
             "SELECT name, type, serialization_format, data FROM messages "
             "JOIN topics ON topics.id = topic_id "
-            f"WHERE type IN ({places}) ORDER BY messages.id",
-            TYPES,
+            f"WHERE type IN {TYPES} ORDER BY messages.id"
         )
         yield from map(Message._make, rows)
 
 
 def _ros1_messages(path: Path) -> Iterator[Message]:
-    """Yield the messages of the TYPES in a ``.bag`` file, or all if it has none."""
+    """Yield the messages of a ``.bag`` file."""
     from rosbags.rosbag1 import Reader
 
     with Reader(path) as reader:
-        connections = [
-            connection
-            for connection in reader.connections
-            if connection.msgtype in TYPES
-        ]
-        for connection, _, data in reader.messages(connections):
+        for connection, _, data in reader.messages():
             yield Message(connection.topic, connection.msgtype, "ros1", data)
 
 
-class BagReader(NamedTuple):
-    """How a kind of bag is read."""
-
-    messages: Callable[[Path], Iterator[Message]]
-    remedy: str  # for a broken file
-
-
-READERS: Mapping[str, BagReader] = {
-    ".mcap": BagReader(_mcap_messages, "`mcap recover` repairs it"),
-    ".db3": BagReader(
-        _sqlite_messages, "give a complete copy, or what `sqlite3 FILE .recover` saves"
-    ),
-    ".bag": BagReader(_ros1_messages, "`rosbag reindex` repairs it"),
+READERS: Mapping[str, Callable[[Path], Iterator[Message]]] = {
+    ".mcap": _mcap_messages,
+    ".db3": _sqlite_messages,
+    ".bag": _ros1_messages,
 }
