@@ -53,6 +53,9 @@ RANGES = {
     "slowness": Range(1, 0.5 / MAX_SLOWNESS, 2 * MAX_SLOWNESS),
 }
 
+# The arrays with a row for each robot, in the order of `RobotEvidence`.
+VALUES = "identities", "robots", "versions", "driven", "faded", "priors"
+
 Arrays = Mapping[str, NDArray[Any]]
 
 
@@ -72,35 +75,26 @@ def content_to_bytes(content: Content) -> bytes:
     Each value has one array, with a row for each of R robots. The places of all robots
     stand one after another, and so do the errors and the surprises.
     """
-    columns = zip(*content.members, strict=True)
-    identities, robots, versions, driven, faded, priors, *parts = columns
-    places, errors, surprises = parts
-    counts = [list(map(len, values)) for values in parts]
+    *values, places, errors, surprises = zip(*content.members, strict=True)
+    parts = places, errors, surprises
     square = np.concatenate([part.square for part in places])  # (N, 2)
     sums = [list(part.sums().values()) for part in places]  # (len(SUMS), n) each
-    state: dict[str, Any] = {}
-    if content.state is not None:
-        state["state"] = content.state
-    file = io.BytesIO()
-    np.savez_compressed(
-        file,
-        **state,
-        version=VERSION,
-        options=content.options,
-        identities=identities,
-        robots=robots,
-        versions=versions,  # (R, 2)
-        driven=driven,
-        faded=faded,
-        priors=priors,  # (R, FEATURES)
-        counts=np.transpose(counts),  # (R, 3)
-        errors=np.concatenate(errors),
-        surprises=np.concatenate(surprises),
+    arrays: dict[str, Any] = {
+        "version": VERSION,
+        "options": content.options,
+        **dict(zip(VALUES, values, strict=True)),
+        "counts": np.transpose([list(map(len, part)) for part in parts]),  # (R, 3)
+        "errors": np.concatenate(errors),
+        "surprises": np.concatenate(surprises),
         # Columns that hardly change from row to row are compressed to a few bytes.
-        squares=np.diff(square, axis=0, prepend=np.int32(0)).T,  # (2, N) int32
-        offsets=np.concatenate([part.offset for part in places]).T,  # (2, N) uint8
-        sums=np.concatenate(sums, axis=1).astype(np.float32),  # (len(SUMS), N)
-    )
+        "squares": np.diff(square, axis=0, prepend=np.int32(0)).T,  # (2, N) int32
+        "offsets": np.concatenate([part.offset for part in places]).T,  # (2, N) uint8
+        "sums": np.concatenate(sums, axis=1).astype(np.float32),  # (len(SUMS), N)
+    }
+    if content.state is not None:
+        arrays["state"] = content.state
+    file = io.BytesIO()
+    np.savez_compressed(file, **arrays)
     return file.getvalue()
 
 
@@ -131,45 +125,42 @@ def _members(arrays: Arrays, side: float) -> list[RobotEvidence]:
 
     `side` is that of a place, metres.
     """
-    counts: Int64 = arrays["counts"]  # (R, 3)
-    place_count, error_count, surprise_count = counts.T
-    squares = np.cumsum(arrays["squares"].T, axis=0, dtype=np.int32)  # (N, 2)
-    offsets = arrays["offsets"].T.astype(np.uint8, casting="same_kind")
-    sums = arrays["sums"].T.astype(np.float64, casting="same_kind")
-    places = [
-        Places(
-            **dict(zip(SUMS, part.T, strict=True)),
-            side=side,
-            square=square,
-            offset=offset,
-        )
-        for part, square, offset in zip(
-            _divided(sums, place_count),
-            _divided(squares, place_count),
-            _divided(offsets, place_count),
-            strict=True,
-        )
-    ]
-    columns = zip(
-        arrays["identities"].astype(np.str_).tolist(),
-        arrays["robots"].astype(np.str_).tolist(),
-        map(Version._make, arrays["versions"].tolist()),
-        arrays["driven"].tolist(),
-        arrays["faded"].tolist(),
-        arrays["priors"],
-        places,
-        _divided(arrays["errors"], error_count),
-        _divided(arrays["surprises"], surprise_count),
-        strict=True,
-    )
-    return list(map(RobotEvidence._make, columns))
-
-
-def _divided(rows: NDArray[Any], counts: Int64) -> list[NDArray[Any]]:
-    """Divide rows into parts with so many rows each: (R,)."""
-    if (counts < 0).any() or counts.sum() != len(rows):
+    sums = arrays["sums"].astype(np.float64, casting="same_kind")
+    columns = {
+        **dict(zip(SUMS, sums, strict=True)),  # (N,) each
+        "square": np.cumsum(arrays["squares"], axis=1, dtype=np.int32).T,  # (N, 2)
+        "offset": arrays["offsets"].astype(np.uint8, casting="same_kind").T,
+    }
+    errors = arrays["errors"]
+    surprises = arrays["surprises"]
+    # (R, 3) each: the rows at which places, errors and surprises of a robot end.
+    counts: Int64 = arrays["counts"]
+    ends = np.cumsum(counts, axis=0)
+    totals = [sums.shape[1], len(errors), len(surprises)]
+    if (counts < 0).any() or ends[-1].tolist() != totals:
         raise ValueError("its counts cannot be true")
-    return np.split(rows, np.cumsum(counts)[:-1])
+    values = [arrays[name].tolist() for name in VALUES]
+    members = []
+    for robot, start, end in zip(
+        zip(*values, strict=True), ends - counts, ends, strict=True
+    ):
+        identity, name, version, driven, faded, prior = robot
+        of_places, of_errors, of_surprises = map(slice, start, end)
+        parts = {name: column[of_places] for name, column in columns.items()}
+        members.append(
+            RobotEvidence(
+                str(identity),
+                str(name),
+                Version(*version),
+                driven,
+                faded,
+                np.array(prior),
+                Places(**parts, side=side),
+                errors[of_errors],
+                surprises[of_surprises],
+            )
+        )
+    return members
 
 
 def _check(robot: RobotEvidence) -> None:
@@ -203,29 +194,26 @@ def _old_evidence(
     _, robot_width, half_life, _ = options
     driven = float(arrays["driven"])
     table = arrays["evidence"].astype(np.float64)
-    weight = table[:, 0]
-    sum_of_log = table[:, 1]
+    # The first columns are weight and sum of the log slowness.
+    weight, sum_of_log, *others = table.T
     if arrays["version"] == FIRST_VERSION:
-        # The columns are weight, sum of the log slowness, failures, x, y, and the
-        # seconds that were driven before the last visit.
-        remaining = 0.5 ** ((driven - table[:, 5]) / half_life)
+        # Failures, x, y, and the seconds that were driven before the last visit.
+        _, x, y, driven_before = others
+        remaining = 0.5 ** ((driven - driven_before) / half_life)
         weight = weight * remaining
         sum_of_log = sum_of_log * remaining
-        passages = waited = np.zeros(len(table))
-        position = table[:, 3:5]
+        passages = waited = 0 * weight
     else:
-        # The columns are weight, sum of the log slowness, the weight of passages since
-        # a robot first waited near, the seconds waited, a prediction, and x and y.
-        passages = table[:, 2]
-        waited = table[:, 3]
-        position = table[:, 5:7]
+        # The weight of passages since a robot first waited near, the seconds waited, a
+        # prediction, and x and y.
+        passages, waited, _, x, y = others
     mean_log = sum_of_log / np.maximum(weight, LEAST_WEIGHT)
     # The mean of a lognormal, and the squares that give the variance NOISE.
     slowness = np.exp(np.clip(mean_log, *LOG_RANGE) + NOISE / 2)
     variance = NOISE * np.maximum(weight - 1, 0)
     side = robot_width / 2
     places = Places.at(
-        position,
+        np.column_stack([x, y]),
         side,
         weight=weight,
         sum_of_slowness=weight * slowness,
