@@ -256,7 +256,7 @@ def test_the_cost_of_a_plan_is_its_expected_time_and_no_path_is_faster(
     goal = free_cells[5]
     distances = shortest_distances(applied, goal, MoveRule.ROBOT_SAFE)
     seconds = distances * applied.seconds_per_cell
-    for start in free_cells[::211]:
+    for start in free_cells[::401]:
         plan = PLANNER.plan(applied, start, goal, MoveRule.ROBOT_SAFE)
         if plan.cells:
             assert plan.cost == pytest.approx(

@@ -70,8 +70,9 @@ def test_the_posterior_is_that_of_a_gaussian_markov_random_field(
     log[row, column] = places.log_of_mean()
     expected = posterior.expected[posterior.place[free]]  # (F,), as the following
     precision = precision_of_map(free, posterior.variance) + np.diag(visits[free])
-    expected_known = np.linalg.solve(precision, visits[free])
-    beyond = np.linalg.solve(precision, visits[free] * (log[free] - expected))
+    beyond_expected = visits[free] * (log[free] - expected)
+    sides = np.column_stack([visits[free], beyond_expected])  # (F, 2)
+    expected_known, beyond = np.linalg.solve(precision, sides).T
 
     place = posterior.place[free]  # of each free cell
     np.testing.assert_allclose(posterior.known[place], expected_known, atol=0.01)
