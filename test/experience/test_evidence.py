@@ -211,9 +211,13 @@ def door() -> Callable[[Experience], float]:
     wall[19:22, 28] = False
     grid = GridMap(wall, 0.25)
     planner = Planner.load("any_map")
-    return lambda experience: (
-        planner.plan(experience.apply(grid), (8, 20), (48, 20)).cost
-    )
+
+    def seconds(experience: Experience) -> float:
+        cost = planner.plan(experience.apply(grid), (8, 20), (48, 20)).cost
+        assert cost is not None
+        return cost
+
+    return seconds
 
 
 @pytest.fixture(scope="module")
