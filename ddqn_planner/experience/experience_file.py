@@ -32,27 +32,19 @@ LOG_RANGE = -math.log(MAX_SLOWNESS), math.log(MAX_SLOWNESS)
 MOST = 1e12  # no sum of what drives showed is greater: seconds, weights or squares
 
 
-class Range(NamedTuple):
-    """What a value of a robot's evidence can be."""
-
-    dimensions: int
-    lowest: float
-    highest: float
-
-
-# Of the values of a robot's evidence and of its places.
+# The dimensions of each value of a robot's evidence and of its places, and the least
+# and the greatest number that can be true.
 RANGES = {
-    **dict.fromkeys(("driven", "faded"), Range(0, 0, MOST)),
-    **dict.fromkeys(SUMS, Range(1, 0, MOST)),
+    **dict.fromkeys(("driven", "faded"), (0, 0, MOST)),
+    **dict.fromkeys(SUMS, (1, 0, MOST)),
     # Logarithms, and what follows from them, may be negative.
-    **dict.fromkeys(("sum_of_log", "errors", "surprises"), Range(1, -MOST, MOST)),
-    "version": Range(1, 0, math.inf),
-    "prior": Range(1, -100, 100),  # no feature of a map raises the log slowness more
-    "position": Range(2, -FARTHEST, FARTHEST),
+    **dict.fromkeys(("sum_of_log", "errors", "surprises"), (1, -MOST, MOST)),
+    "version": (1, 0, math.inf),
+    "prior": (1, -100, 100),  # no feature of a map raises the log slowness by more
+    "position": (2, -FARTHEST, FARTHEST),
     # Rounding may change a sum a little.
-    "slowness": Range(1, 0.5 / MAX_SLOWNESS, 2 * MAX_SLOWNESS),
+    "slowness": (1, 0.5 / MAX_SLOWNESS, 2 * MAX_SLOWNESS),
 }
-
 # The arrays with a row for each robot, in the order of `RobotEvidence`.
 VALUES = "identities", "robots", "versions", "driven", "faded", "priors"
 

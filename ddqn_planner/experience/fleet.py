@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import secrets
 from collections.abc import Iterable
+from operator import attrgetter
 from typing import NamedTuple
 from zlib import crc32
 
@@ -143,12 +144,13 @@ class Fleet:
 
         Of the same version, that counts which has faded more.
         """
+        age = attrgetter("version", "faded")
         for robot in members:
             if robot.identity == self.own.identity:
-                self.own = max(self.own, robot, key=_age)
+                self.own = max(self.own, robot, key=age)
             else:
                 present = self._others.get(robot.identity, robot)
-                self._others[robot.identity] = max(present, robot, key=_age)
+                self._others[robot.identity] = max(present, robot, key=age)
 
     def forget(self) -> None:
         """Forget the evidence of the own robot for ever, and that of others for now.
@@ -168,8 +170,3 @@ class Fleet:
         self.own = RobotEvidence.new(self.own.robot, self.own.places.side)
         for drive in drives:
             self.own = self.own.with_drive(drive)
-
-
-def _age(robot: RobotEvidence) -> tuple[Version, float]:
-    """Return by what pieces of evidence of one robot are compared: newer is greater."""
-    return robot.version, robot.faded

@@ -17,7 +17,6 @@ from ddqn_planner.experience.drives import (
     Sample,
     read_drives,
 )
-from ddqn_planner.experience.experience import LATEST
 from ddqn_planner.experience.posterior import cells_of
 from ddqn_planner.files import open_regular
 from ddqn_planner.grid import GridMap
@@ -25,9 +24,6 @@ from ddqn_planner.grid import GridMap
 MAX_CSV_BYTES = 2**28  # of a recording: some 8 million poses
 COLUMNS = "seconds", "x", "y"
 
-# More than this share of poses earlier than the pose before is no recording of a drive:
-# a clock jumps back less often.
-BACKWARD_SHARE = 0.1
 # More than this share of poses in walls or outside: the map is another one.
 OFF_MAP_SHARE = 0.1
 
@@ -89,45 +85,23 @@ def read_recording(
 def _divided_into_drives(path: Path, poses: RobotPoses) -> Recording:
     """Divide the poses of the recording at `path` into drives.
 
-    Poses that cannot be true are left out. A ValueError if there is no drive: its text
-    says why.
+    Poses that are not finite are left out. If the robot moves, but no part is a drive,
+    as with times in milliseconds, all is one drive: learning says why it cannot be.
     """
-    samples = [
-        sample
-        for sample in poses.samples
-        if all(abs(value) < LATEST for value in sample)  # False for NaN
-    ]
+    table = np.array(poses.samples, np.float64).reshape(-1, 3)  # seconds, x and y
+    table = table[np.isfinite(table).all(axis=1)]  # (N, 3)
+    whole = Drive(DriveEnd.STOPPED, table[:, 0], table[:, 1:])
+    if whole.extent < SHORTEST:
+        raise ValueError(
+            f"{path} holds no drive: in {len(table)} poses the robot comes no farther "
+            f"than {whole.extent:.2g} m; drive on, and give metres"
+        )
     drives: list[Drive] = []
     recorder = DriveRecorder(drives.append)
-    for sample in samples:
+    for sample in table.tolist():
         recorder.add(*sample)
     recorder.end()
-    reason = _why_no_drive(samples, drives)
-    if reason:
-        raise ValueError(f"{path} holds no drive: {reason}")
-    return Recording(f"{len(samples)} poses of {poses.source}", drives)
-
-
-def _why_no_drive(samples: Sequence[Sample], drives: Sequence[Drive]) -> str:
-    """Return why poses are no drive, and what to do; empty if they are one."""
-    if len(samples) < 2:
-        return (
-            f"{len(samples)} poses have finite numbers below {LATEST:g}; give more, in "
-            "metres and in seconds, not in milliseconds or nanoseconds"
-        )
-    table = np.array(samples)  # (N, 3): seconds, x, y
-    elapsed = np.diff(table[:, 0])
-    if (elapsed < 0).mean() > BACKWARD_SHARE or not elapsed.any():
-        return "its time runs backwards or stands still; sort the poses by their times"
-    if drives:
-        return ""
-    extent = Drive(DriveEnd.STOPPED, table[:, 0], table[:, 1:]).extent
-    if extent < SHORTEST:
-        return f"the robot comes no farther than {extent:.2g} m; drive on"
-    return (
-        f"the robot takes {np.ptp(table[:, 0]) / extent:.3g} s per metre; give seconds "
-        "if its times are milliseconds or nanoseconds"
-    )
+    return Recording(f"{len(table)} poses of {poses.source}", drives or [whole])
 
 
 def _check_on_map(
@@ -144,14 +118,12 @@ def _check_on_map(
     cells, is_inside = cells_of(positions, grid)
     is_free = is_inside & ~grid.occupancy[cells[:, 1], cells[:, 0]]
     share = 1 - is_free.mean()
-    lowest = positions.min(axis=0).round(1).tolist()
-    highest = positions.max(axis=0).round(1).tolist()
-    width = grid.width * grid.resolution
-    height = grid.height * grid.resolution
+    corners = np.round([positions.min(axis=0), positions.max(axis=0)], 1).tolist()
     reason = (
         f"{path}: {share:.0%} of the poses lie in walls, in unknown space or outside: "
-        f"they go from {lowest} to {highest}, the map has {width:.1f} x {height:.1f} m "
-        f"from {grid.origin[:2]}; give the map of these poses"
+        f"they go from {' to '.join(map(str, corners))}, the map has {grid.width} x "
+        f"{grid.height} cells of {grid.resolution:g} m from {grid.origin[:2]}; give "
+        "the map of these poses"
     )
     if not is_free.any():
         raise ValueError(reason)

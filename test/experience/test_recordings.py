@@ -92,17 +92,25 @@ REFUSED = [
     ("drive.csv", "seconds;x;y\n1;2;3\n", "are missing; .* with commas between"),
     ("drive.csv", "seconds,x,y\n1,2,three\n", "'three' to float64 at row 0, column 3"),
     ("drive.csv", "seconds,x,y\n1,2\n", "row 1 with 2 columns; give seconds, x and y"),
-    ("drive.csv", "seconds,x,y\n1,2,nan\n", "no drive: 0 poses have finite numbers"),
-    ("drive.csv", "seconds,x,y\n", "no drive: 0 poses have finite numbers"),
+    ("drive.csv", "seconds,x,y\n1,2,nan\n", "in 0 poses the robot comes no farther"),
+    ("drive.csv", "seconds,x,y\n", "no drive: in 0 poses the robot comes no farther"),
     ("drive.csv", "", "columns seconds, x, y are missing"),
-    ("drive.csv", "seconds,x,y\n99,1,1\n98,2,1\n97,3,1\n", "time runs backwards"),
-    ("drive.csv", "seconds,x,y\n" + 9 * "7,1,1\n7,2,1\n", "time .* stands still"),
+    (
+        "drive.csv",
+        "seconds,x,y\n99,1,1\n98,2,1\n97,3,1\n",
+        "2 times are earlier .* sort them",
+    ),
+    (
+        "drive.csv",
+        "seconds,x,y\n" + 9 * "7,1,1\n7,2,1\n",
+        "1 of 18 poses .* differ in their time",
+    ),
     ("drive.csv", "seconds,x,y\n1,1,1\n2,1.2,1\n", "no farther than 0.2 m; drive on"),
     ("episodes.csv", "", "holds no drive; drive on"),
     (
         "drive.csv",
         "seconds,x,y\n1,-50,1\n2,-51,1\n3,-52,1\n",
-        r"\[-52.0, 1.0\] to .* map has 30.0 x",
+        r"\[-52.0, 1.0\] to .* map has 120 x 40 cells of 0.25 m",
     ),
     ("drive.txt", "", r"no \.csv file, no bag, .* give files that end in .csv, .mcap"),
     ("missing.csv", None, "No such file"),
@@ -142,7 +150,7 @@ def test_times_in_another_unit_are_told(
     try:
         drives = read_recording(file, GRID).drives
     except ValueError as error:
-        assert "milliseconds or nanoseconds" in str(error)  # noqa: PT017 - some do
+        assert "not milliseconds or nanoseconds" in str(error)  # noqa: PT017 - some do
     else:
         for drive in drives:
             assert re.search(
