@@ -6,9 +6,10 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from ddqn_planner.experience.bags import (
+    TRANSFORM_TYPES,
     BrokenBagError,
     Message,
     bag_files,
@@ -125,14 +126,16 @@ class _Bag:
         self._frame = frame
         self._robot_frame = robot_frame
         self.samples: dict[PoseSource, list[Sample]] = defaultdict(list)
-        self._frames_of_topic: dict[str, set[str]] = defaultdict(set)
         # Of each topic: the last transform of each frame, by its name.
         self._trees: dict[str, dict[str, Transform]] = defaultdict(dict)
 
     def topics_in_words(self) -> str:
         """Return the topics of poses and transforms with their frames, for an error."""
-        topics = sorted(self._frames_of_topic.items())
-        return ", ".join(f"{topic} in {sorted(frames)}" for topic, frames in topics)
+        words = []
+        for topic, tree in sorted(self._trees.items()):
+            frames = {frame.child or frame.parent for frame in tree.values()}
+            words.append(f"{topic} in {sorted(frames) or '(cannot be decoded)'}")
+        return ", ".join(words)
 
     def add(self, message: Message) -> None:
         """Add the poses that follow from a message.
@@ -143,14 +146,9 @@ class _Bag:
         """
         # Transforms on "tf_static" belong to the tree of the topic "tf".
         topic = message.topic.removesuffix("_static")
-        content = message.decoded()
-        if content is None:
-            self._frames_of_topic[topic].add("(cannot be decoded)")
-            return
         tree = self._trees[topic]
-        for transform in _transforms_in(content):
+        for transform in _transforms_in(message):
             child = transform.child
-            self._frames_of_topic[topic].add(child or transform.parent)
             tree[child] = transform
             for robot in filter(self._is_robot, tree):
                 chain = _chain(robot, self._frame, tree)
@@ -166,18 +164,21 @@ class _Bag:
         return frame.rpartition("/")[2] == BASE or not frame
 
 
-def _transforms_in(message: Any) -> Iterator[Transform]:
-    """Yield the transforms of a decoded message, or its pose.
+def _transforms_in(message: Message) -> Iterator[Transform]:
+    """Yield the transforms of a message, or its pose; nothing if it is not decoded.
 
     Transforms whose quaternions are no rotations are left out, as tf2 does.
     """
-    if not hasattr(message, "transforms"):
+    content = message.decoded()
+    if content is None:
+        return
+    if message.full_type not in TRANSFORM_TYPES:
         # With covariance, the pose lies one level deeper.
-        position = getattr(message.pose, "pose", message.pose).position
-        seconds, frame = _stamp(message.header)
+        position = getattr(content.pose, "pose", content.pose).position
+        seconds, frame = _stamp(content.header)
         yield Transform(seconds, frame, "", position.x, position.y)
         return
-    transforms: Sequence[TransformStamped] = message.transforms
+    transforms: Sequence[TransformStamped] = content.transforms
     for stamped in transforms:
         seconds, parent = _stamp(stamped.header)
         child = stamped.child_frame_id.lstrip("/")
