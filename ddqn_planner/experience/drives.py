@@ -221,7 +221,7 @@ class DriveRecorder:
         if not all(abs(value) < LATEST for value in sample):  # NaN fails too
             raise ValueError(
                 f"the robot is at {(x, y)} at {seconds} s; give metres and seconds up "
-                f"to {LATEST:g}, not milliseconds or nanoseconds"
+                f"to {LATEST:g}"
             )
         if self._last is not None and seconds < self._last.seconds - JUMP:
             self.end()

@@ -17,6 +17,7 @@ from ddqn_planner.experience.drives import (
     Sample,
     read_drives,
 )
+from ddqn_planner.experience.experience import LATEST
 from ddqn_planner.experience.posterior import cells_of
 from ddqn_planner.files import open_regular
 from ddqn_planner.grid import GridMap
@@ -24,8 +25,9 @@ from ddqn_planner.grid import GridMap
 MAX_CSV_BYTES = 2**28  # of a recording: some 8 million poses
 COLUMNS = "seconds", "x", "y"
 
-# More than this share of poses in walls or outside: the map is another one.
-OFF_MAP_SHARE = 0.1
+# More than this share of poses in walls or outside: the map is another one. The middle
+# of a robot keeps away from walls.
+OFF_MAP_SHARE = 0.03
 
 
 class Recording(NamedTuple):
@@ -85,16 +87,19 @@ def read_recording(
 def _divided_into_drives(path: Path, poses: RobotPoses) -> Recording:
     """Divide the poses of the recording at `path` into drives.
 
-    Poses that are not finite are left out. If the robot moves, but no part is a drive,
-    as with times in milliseconds, all is one drive: learning says why it cannot be.
+    Poses with numbers that cannot be true are left out. If the robot moves, but no part
+    is a drive, as with times in milliseconds, all is one drive: learning says why it
+    cannot be.
     """
     table = np.array(poses.samples, np.float64).reshape(-1, 3)  # seconds, x and y
-    table = table[np.isfinite(table).all(axis=1)]  # (N, 3)
+    is_possible = (np.abs(table) < LATEST).all(axis=1)
+    table = table[is_possible]  # (N, 3)
     whole = Drive(DriveEnd.STOPPED, table[:, 0], table[:, 1:])
     if whole.extent < SHORTEST:
         raise ValueError(
-            f"{path} holds no drive: in {len(table)} poses the robot comes no farther "
-            f"than {whole.extent:.2g} m; drive on, and give metres"
+            f"{path} holds no drive: in {len(table)} poses with numbers below "
+            f"{LATEST:g} the robot comes no farther than {whole.extent:.2g} m; drive "
+            "on, and give metres and seconds, not milliseconds or nanoseconds"
         )
     drives: list[Drive] = []
     recorder = DriveRecorder(drives.append)

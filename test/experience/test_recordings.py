@@ -92,8 +92,8 @@ REFUSED = [
     ("drive.csv", "seconds;x;y\n1;2;3\n", "are missing; .* with commas between"),
     ("drive.csv", "seconds,x,y\n1,2,three\n", "'three' to float64 at row 0, column 3"),
     ("drive.csv", "seconds,x,y\n1,2\n", "row 1 with 2 columns; give seconds, x and y"),
-    ("drive.csv", "seconds,x,y\n1,2,nan\n", "in 0 poses the robot comes no farther"),
-    ("drive.csv", "seconds,x,y\n", "no drive: in 0 poses the robot comes no farther"),
+    ("drive.csv", "seconds,x,y\n1,2,nan\n", "in 0 poses .* comes no farther"),
+    ("drive.csv", "seconds,x,y\n", "no drive: in 0 poses"),
     ("drive.csv", "", "columns seconds, x, y are missing"),
     (
         "drive.csv",
@@ -158,7 +158,7 @@ def test_times_in_another_unit_are_told(
             )
 
 
-@pytest.mark.parametrize("share", [0.05, 0.3, 0.9])
+@pytest.mark.parametrize("share", [0.01, 0.1, 0.9])
 def test_the_share_of_poses_off_the_map_is_told_if_it_is_large(
     tmp_path: Path, share: float
 ) -> None:
@@ -169,7 +169,7 @@ def test_the_share_of_poses_off_the_map_is_told_if_it_is_large(
     told: list[str] = []
     assert read_recording(file, GRID, on_damage=told.append).drives
     shares = [int(reason.split(": ")[1].split("%")[0]) for reason in told]
-    assert shares == ([pytest.approx(100 * share, abs=1)] if share > 0.1 else [])
+    assert shares == ([pytest.approx(100 * share, abs=1)] if share > 0.03 else [])
     in_walls = GridMap(np.arange(120)[None].repeat(40, 0) < 120 * share, 0.25)
     told.clear()
     table[:, 1] = np.linspace(0, 29.9, 601)
