@@ -1,6 +1,7 @@
 """Finished paths of bodies: exact ends, no hit, no sharper bend, no greater cost."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from planning.test_poses import BODIES, CELL, planner
 from ddqn_planner import GridMap
 from ddqn_planner.planning.path_finder import last_step
 from ddqn_planner.planning.plan import Pose, PosePlan, PoseRequest
-from ddqn_planner.planning.pose_finish import END_COST, least_radius_of, write_pieces
+from ddqn_planner.planning.pose_curves import write_pieces
+from ddqn_planner.planning.pose_finish import END_COST, least_radius_of, rates_of
 from ddqn_planner.planning.pose_planner import PosePlanner
 from ddqn_planner.robot.motions import turn_between
 
@@ -112,6 +114,30 @@ def test_ends_are_exact_where_nothing_is_near(motion: str) -> None:
         again = plan(body, grid, start, goal, finished=True)
         assert np.array_equal(found.poses, again.poses)
     assert exact >= 9
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_curve_costs_no_less_than_any_primitive_of_its_kind(seed: int) -> None:
+    """So a path with curves costs no less than it would by the model's costs."""
+    random = np.random.default_rng(seed)
+    made = planner("omnidirectional").motions
+    factors = random.uniform(1, 2, len(made.cost)).astype(np.float32)
+    motions = replace(made, cost=made.cost * factors)
+    rates = rates_of(motions)
+    for poses, cost in zip(motions.poses, motions.cost.tolist(), strict=True):
+        dx, dy, turn = np.diff(poses, axis=0).T
+        length = np.hypot(dx, dy).sum()
+        yaw = (poses[0, 2] + poses[-1, 2]) / 2
+        ahead = (poses[-1, :2] - poses[0, :2]) @ (math.cos(yaw), math.sin(yaw))
+        if length == 0:
+            least = np.abs(turn).sum() * rates.spin
+        elif abs(ahead) < 0.9 * length:
+            least = length * rates.aside
+        elif np.abs(turn).max() > 1e-6:
+            least = length * (rates.bend_ahead if ahead > 0 else rates.bend_behind)
+        else:
+            least = length * (rates.ahead if ahead > 0 else rates.behind)
+        assert least >= cost * (1 - 1e-6)
 
 
 @given(st.integers(0, 2**32 - 1))

@@ -1,0 +1,515 @@
+"""Curves of a body: Dubins curves, lines between turns, the room and the cost of each.
+
+Dubins curves (Dubins 1957; the words of Shkel and Lumelsky 2001 without three arcs) are
+driven ahead or in reverse; a robot that can turn on the spot drives a line between two
+turns, too.
+"""
+
+import math
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.compiled import in_place
+from ddqn_planner.grid.layers import forbids, has_costs, multiplier_at
+from ddqn_planner.grid.moves import ACTION_OF_STEP
+from ddqn_planner.planning.pose_paths import AHEAD, ON_THE_SPOT, Float64
+from ddqn_planner.planning.pose_world import (
+    BORDER,
+    LAST_BIT,
+    ONE,
+    WORD,
+    World,
+    is_far,
+    is_inside,
+)
+from ddqn_planner.robot.motions import ANGLE, SPACING
+
+Int64 = NDArray[np.int64]
+
+# Cells that a point of the body moves between two poses that are checked, at most.
+STEP: Final = 0.25
+# So far is a point of the body, between two poses that are checked, from where it is at
+# the nearer of them; and the poses of a path are joined by straight lines, not by arcs.
+MARGIN: Final = STEP / 2 + 0.01
+# The poses of masks: yaws, and places in a cell along each axis.
+YAWS: Final = 128
+PLACES: Final = 4
+SAME_END: Final = 1e-9  # cells and radians
+# Dubins curves ahead are the words 0 to 3, those in reverse 4 to 7.
+DUBINS_WORDS: Final = 4
+SPIN_AHEAD: Final = 8
+SPIN_BEHIND: Final = 9
+FINE: Final = 0.02  # cells between points of a curve that tell the cells that it passes
+COARSE: Final = 0.5  # likewise, where no cell forbids a move
+
+
+class Rates(NamedTuple):
+    """What a cell of length and a radian cost; infinite where a robot cannot drive."""
+
+    ahead: float
+    bend_ahead: float
+    behind: float
+    bend_behind: float
+    aside: float
+    spin: float  # a radian on the spot
+
+
+class Course(NamedTuple):
+    """A robot on a map, as the kernels of this file use it."""
+
+    corners: Float64  # (K, 2): of the body, in cells
+    # (YAWS * PLACES**2, S, W): the cells that the outline may touch at all poses that
+    # are rounded to one; bit b of word w is the cell in column 64 w + b of S.
+    mask: NDArray[np.uint64]
+    far: float  # cells from the origin to the farthest corner
+    radius: float  # of the sharpest bend, in cells
+    words: Int64  # that the robot can drive
+    rates: Rates
+    steps_when_far: int  # that lead from a tile far from obstacles to free poses alone
+    world: World
+    placed: Float64  # (K, 2): a buffer for the corners at a pose
+    pieces: Float64  # (3, 2): a buffer for a curve, see `write_pieces`
+
+
+# The body, exactly
+
+
+@in_place
+def _overlap(
+    begin: Float64, end: Float64, row: float, half: float
+) -> tuple[float, float]:
+    """Return the columns, least and greatest, whose squares in a row meet a segment.
+
+    A square has the half side `half` around the centre of its cell. Without such a
+    column, the least is greater than the greatest.
+    """
+    rise = end[1] - begin[1]
+    first_share = 0.0  # of the segment between the two sides of the row
+    last_share = 1.0
+    if rise == 0.0:
+        if abs(begin[1] - row) > half:
+            return np.inf, -np.inf
+    else:
+        share_below = (row - half - begin[1]) / rise
+        share_above = (row + half - begin[1]) / rise
+        first_share = max(first_share, min(share_below, share_above))
+        last_share = min(last_share, max(share_below, share_above))
+        if first_share > last_share:
+            return np.inf, -np.inf
+    run = end[0] - begin[0]
+    first_x = begin[0] + first_share * run
+    last_x = begin[0] + last_share * run
+    return min(first_x, last_x) - half, max(first_x, last_x) + half
+
+
+@in_place
+def _place(x: float, y: float, yaw: float, corners: Float64, placed: Float64) -> None:
+    """Write the corners of a body at a pose."""
+    cos = math.cos(yaw)
+    sin = math.sin(yaw)
+    for corner in range(len(corners)):
+        ahead = corners[corner, 0]
+        left = corners[corner, 1]
+        placed[corner, 0] = x + cos * ahead - sin * left
+        placed[corner, 1] = y + sin * ahead + cos * left
+
+
+@in_place
+def write_masks(
+    corners: Float64, placed: Float64, half: float, mask: NDArray[np.uint64]
+) -> None:
+    """Write the cells whose squares of half side `half` the outline meets, by poses."""
+    middle = mask.shape[1] // 2
+    for number in range(len(mask)):
+        x = (number % PLACES + 0.5) / PLACES - 0.5
+        y = (number // PLACES % PLACES + 0.5) / PLACES - 0.5
+        yaw = 2 * math.pi * (number // PLACES**2) / YAWS
+        _place(x, y, yaw, corners, placed)
+        for side in range(len(corners)):
+            begin = placed[side - 1]
+            end = placed[side]
+            for row in range(mask.shape[1]):
+                lowest, highest = _overlap(begin, end, row - middle, half)
+                if lowest > highest:
+                    continue
+                for column in range(math.ceil(lowest), math.floor(highest) + 1):
+                    bit = np.uint64(column + middle)
+                    mask[number, row, bit // WORD] |= ONE << (bit & LAST_BIT)
+
+
+@in_place
+def _touches_cell(column: int, row: int, placed: Float64) -> bool:
+    """Return whether an outline comes nearer than `MARGIN` to a cell."""
+    for side in range(len(placed)):
+        lowest, highest = _overlap(placed[side - 1], placed[side], row, 0.5 + MARGIN)
+        if lowest <= column <= highest:
+            return True
+    return False
+
+
+@in_place
+def free_steps(x: float, y: float, yaw: float, course: Any) -> int:
+    """Return how many steps from a pose on are free, or 0 if it is not.
+
+    It is free if no occupied cell is nearer than `MARGIN` to the body's outline.
+    """
+    column = math.floor(x + 0.5)
+    row = math.floor(y + 0.5)
+    world = course.world
+    if not is_inside(column, row, world):
+        return 0
+    if course.steps_when_far > 0 and is_far(column, row, world):
+        return int(course.steps_when_far)
+    number = round(yaw * YAWS / (2 * math.pi)) % YAWS
+    place_x = min(int((x + 0.5 - column) * PLACES), PLACES - 1)
+    place_y = min(int((y + 0.5 - row) * PLACES), PLACES - 1)
+    number = (number * PLACES + place_y) * PLACES + place_x
+    mask = course.mask
+    middle = mask.shape[1] // 2
+    is_placed = False
+    for mask_row in range(mask.shape[1]):
+        for mask_word in range(mask.shape[2]):
+            bits = mask[number, mask_row, mask_word]
+            if not bits:
+                continue
+            # 64 cells of the map lie in two words, see `pose_world.touches`.
+            map_row = row + mask_row - middle
+            first_column = column + 64 * mask_word - middle
+            place = np.uint64(first_column + BORDER)
+            word = place // WORD
+            bit = place & LAST_BIT
+            occupied = world.occupied_bits[map_row + BORDER, word] >> bit
+            next_word = world.occupied_bits[map_row + BORDER, word + ONE]
+            occupied |= (next_word << ONE) << (LAST_BIT - bit)
+            # Cells that the outline may touch at the rounded pose: at the exact one?
+            occupied &= bits
+            cell_column = first_column
+            while occupied:
+                if occupied & ONE:
+                    if not is_placed:
+                        _place(x, y, yaw, course.corners, course.placed)
+                        is_placed = True
+                    if _touches_cell(cell_column, map_row, course.placed):
+                        return 0
+                occupied >>= ONE
+                cell_column += 1
+    return 1
+
+
+# Curves: a curve has three pieces, each an arc, a line or a turn on the spot
+
+
+@in_place
+def _whole_turn(angle: float) -> float:
+    """Return an angle from 0 to 2 pi; 0 for an angle that is rounded below 2 pi."""
+    positive = angle % (2 * math.pi)
+    return 0.0 if positive > 2 * math.pi - 1e-7 else positive
+
+
+@in_place
+def _half_turn(angle: float) -> float:
+    """Return an angle from -pi to pi."""
+    return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+@in_place
+def _write_line_between_turns(
+    begin: Float64, end: Float64, word: int, pieces: Float64
+) -> float:
+    """Write the pieces of a line between two turns on the spot; return its length."""
+    dx = end[0] - begin[0]
+    dy = end[1] - begin[1]
+    yaw = math.atan2(dy, dx)
+    if word == SPIN_BEHIND:
+        yaw += math.pi
+    distance = math.sqrt(dx * dx + dy * dy)
+    pieces[0] = (_half_turn(yaw - begin[2]), 0.0)
+    pieces[1] = (0.0, distance)
+    pieces[2] = (_half_turn(end[2] - yaw), 0.0)
+    return distance
+
+
+@in_place
+def write_pieces(
+    begin: Float64, end: Float64, word: int, radius: float, pieces: Float64
+) -> float:
+    """Write the turn and the length of each piece of a curve; return its length.
+
+    The curve leads from one pose (3,) to another. The length is infinite if there is no
+    such curve.
+    """
+    if word >= SPIN_AHEAD:
+        return _write_line_between_turns(begin, end, word, pieces)
+    dx = end[0] - begin[0]
+    dy = end[1] - begin[1]
+    # In reverse, the robot drives where its back points.
+    back = math.pi if word >= DUBINS_WORDS else 0.0
+    begin_yaw = begin[2] + back
+    end_yaw = end[2] + back
+    first_side = 1 if word & 1 else -1  # 1: the arc turns left
+    last_side = 1 if word & 2 else -1
+    # From the centre of the first circle to that of the last.
+    first_radius = first_side * radius
+    last_radius = last_side * radius
+    centre_x = dx - last_radius * math.sin(end_yaw) + first_radius * math.sin(begin_yaw)
+    centre_y = dy + last_radius * math.cos(end_yaw) - first_radius * math.cos(begin_yaw)
+    # The line is a tangent of both circles.
+    across = first_radius - last_radius
+    square = centre_x * centre_x + centre_y * centre_y - across * across
+    if square < 0:
+        return np.inf
+    line = math.sqrt(square)
+    line_yaw = math.atan2(centre_y, centre_x) + math.atan2(across, line)
+    first_turn = _whole_turn(first_side * (line_yaw - begin_yaw))
+    last_turn = _whole_turn(last_side * (end_yaw - line_yaw))
+    pieces[0] = (first_side * first_turn, radius * first_turn)
+    pieces[1] = (0.0, line)
+    pieces[2] = (last_side * last_turn, radius * last_turn)
+    return line + radius * (first_turn + last_turn)
+
+
+@in_place
+def is_in_reverse(word: int) -> bool:
+    """Return whether a curve is driven in reverse."""
+    return DUBINS_WORDS <= word < SPIN_AHEAD or word == SPIN_BEHIND
+
+
+@in_place
+def _is_empty(turn: float, length: float) -> bool:
+    """Return whether a piece of a curve has neither a turn nor a length."""
+    return abs(turn) < SAME_END and length < SAME_END
+
+
+@in_place
+def _pose_on(
+    pose: tuple[float, float, float], turn: float, length: float, is_behind: bool
+) -> tuple[float, float, float]:
+    """Return the pose that a turn and a length lead to from a pose."""
+    x, y, yaw = pose
+    half = turn / 2
+    chord = length * (math.sin(half) / half if abs(half) > SAME_END else 1.0)
+    direction = yaw + half + (math.pi if is_behind else 0.0)
+    return x + chord * math.cos(direction), y + chord * math.sin(direction), yaw + turn
+
+
+@in_place
+def _is_piece_free(
+    begin: tuple[float, float, float],
+    turn: float,
+    length: float,
+    is_behind: bool,
+    stride: int,
+    course: Any,
+) -> bool:
+    """Return whether the body has room along a piece, at every `stride`-th pose."""
+    count = max(math.ceil((length + course.far * abs(turn)) / STEP), 1)
+    number = min(stride, count)
+    while True:
+        share = number / count
+        x, y, yaw = _pose_on(begin, share * turn, share * length, is_behind)
+        steps = free_steps(x, y, yaw, course)
+        if steps == 0:
+            return False
+        if number == count:
+            return True
+        number = min(number + max(steps, stride), count)
+
+
+@in_place
+def is_curve_free(begin: Float64, word: int, stride: int, course: Any) -> bool:
+    """Return whether the body has room along a curve from a free pose (3,) on."""
+    is_behind = is_in_reverse(word)
+    pose = (begin[0], begin[1], begin[2])
+    for piece in range(3):
+        turn = course.pieces[piece, 0]
+        length = course.pieces[piece, 1]
+        if _is_empty(turn, length):
+            continue
+        if not _is_piece_free(pose, turn, length, is_behind, stride, course):
+            return False
+        pose = _pose_on(pose, turn, length, is_behind)
+    return True
+
+
+@in_place
+def _mean_multiplier(
+    begin: tuple[float, float, float],
+    turn: float,
+    length: float,
+    is_behind: bool,
+    world: Any,
+) -> float:
+    """Return the mean multiplier of the cells of a piece.
+
+    It is infinite if a cell forbids the piece, or lies outside the map.
+    """
+    layers = world.layers
+    has_forbidden = layers.forbidden.size > 0
+    if not has_forbidden and not has_costs(layers):
+        return 1.0
+    count = max(math.ceil(length / (FINE if has_forbidden else COARSE)), 1)
+    total = 0.0
+    last_column = math.floor(begin[0] + 0.5)
+    last_row = math.floor(begin[1] + 0.5)
+    for number in range(count):
+        share = (number + 0.5) / count
+        x, y, _ = _pose_on(begin, share * turn, share * length, is_behind)
+        column = math.floor(x + 0.5)
+        row = math.floor(y + 0.5)
+        if not is_inside(column, row, world):
+            return np.inf
+        if has_forbidden:
+            action = ACTION_OF_STEP[row - last_row + 1, column - last_column + 1]
+            if forbids(last_column, last_row, action, layers):
+                return np.inf
+            last_column = column
+            last_row = row
+        total += max(multiplier_at(column, row, np.float64(1), layers), 1.0)
+    return total / count
+
+
+@in_place
+def _least_cost_of_piece(
+    turn: float, length: float, is_behind: bool, rates: Any
+) -> float:
+    """Return what a piece costs where each cell costs 1."""
+    if length == 0:
+        cost: float = abs(turn) * rates.spin
+    elif turn == 0:
+        cost = length * (rates.behind if is_behind else rates.ahead)
+    else:
+        cost = length * (rates.bend_behind if is_behind else rates.bend_ahead)
+    return cost
+
+
+@in_place
+def least_cost_of_curve(word: int, course: Any) -> float:
+    """Return what the curve of `course.pieces` costs where each cell costs 1."""
+    is_behind = is_in_reverse(word)
+    cost = 0.0
+    for piece in range(3):
+        turn = course.pieces[piece, 0]
+        length = course.pieces[piece, 1]
+        if not _is_empty(turn, length):
+            cost += _least_cost_of_piece(turn, length, is_behind, course.rates)
+    return cost
+
+
+@in_place
+def cost_of_curve(begin: Float64, word: int, course: Any) -> float:
+    """Return what a curve costs; infinite if a cell forbids it."""
+    is_behind = is_in_reverse(word)
+    pose = (begin[0], begin[1], begin[2])
+    cost = 0.0
+    for piece in range(3):
+        turn = course.pieces[piece, 0]
+        length = course.pieces[piece, 1]
+        if _is_empty(turn, length):
+            continue
+        least = _least_cost_of_piece(turn, length, is_behind, course.rates)
+        cost += least * _mean_multiplier(pose, turn, length, is_behind, course.world)
+        pose = _pose_on(pose, turn, length, is_behind)
+    return cost
+
+
+@in_place
+def write_curve(begin: Float64, word: int, pieces: Float64, poses: Float64) -> int:
+    """Write the poses of a curve except the first; return how many, or would be."""
+    is_behind = is_in_reverse(word)
+    pose = (begin[0], begin[1], begin[2])
+    count = 0
+    for piece in range(3):
+        turn = pieces[piece, 0]
+        length = pieces[piece, 1]
+        if _is_empty(turn, length):
+            continue
+        steps_of_length = math.ceil(length / SPACING - 1e-9)
+        steps = max(steps_of_length, math.ceil(abs(turn) / ANGLE - 1e-9), 1)
+        for number in range(1, steps + 1):
+            share = number / steps
+            if count < len(poses):
+                x, y, yaw = _pose_on(pose, share * turn, share * length, is_behind)
+                poses[count] = (x, y, yaw)
+            count += 1
+        pose = _pose_on(pose, turn, length, is_behind)
+    return count
+
+
+# The planned path
+
+
+@in_place
+def count_free(path: Float64, course: Any) -> int:
+    """Return how many poses of a path (N, 3), from the first on, the body can drive."""
+    for number in range(len(path)):
+        x = path[number, 0]
+        y = path[number, 1]
+        yaw = path[number, 2]
+        if free_steps(x, y, yaw, course) == 0:
+            return number
+        if number + 1 == len(path):
+            break
+        dx = path[number + 1, 0] - x
+        dy = path[number + 1, 1] - y
+        turn = path[number + 1, 2] - yaw
+        movement = math.sqrt(dx * dx + dy * dy) + course.far * abs(turn)
+        parts = math.ceil(movement / STEP)
+        for part in range(1, parts):
+            share = part / parts
+            steps = free_steps(
+                x + share * dx, y + share * dy, yaw + share * turn, course
+            )
+            if steps == 0:
+                return number
+    return len(path)
+
+
+@in_place
+def _least_cost_of_step(
+    dx: float, dy: float, yaw: float, turn: float, rates: Any
+) -> float:
+    """Return what a step of a path costs where each cell costs 1.
+
+    It leads by (dx, dy), in cells, and turns from a yaw on.
+    """
+    length = math.sqrt(dx * dx + dy * dy)
+    is_bend = abs(turn) > ON_THE_SPOT
+    if length < ON_THE_SPOT:
+        return abs(turn) * rates.spin if is_bend else 0.0
+    mean_yaw = yaw + turn / 2
+    ahead = dx * math.cos(mean_yaw) + dy * math.sin(mean_yaw)
+    if ahead > AHEAD * length:
+        rate: float = rates.bend_ahead if is_bend else rates.ahead
+    elif ahead < -AHEAD * length:
+        rate = rates.bend_behind if is_bend else rates.behind
+    else:
+        rate = rates.aside
+    return length * rate
+
+
+@in_place
+def write_costs(path: Float64, count: int, course: Any, costs: Float64) -> None:
+    """Write what a path (N, 3) costs up to each pose, along its first poses.
+
+    From pose number `count` on, and behind a forbidden move, the cost is infinite.
+    """
+    costs[:] = np.inf
+    if count > 0:
+        costs[0] = 0.0
+    for number in range(1, count):
+        x = path[number - 1, 0]
+        y = path[number - 1, 1]
+        yaw = path[number - 1, 2]
+        dx = path[number, 0] - x
+        dy = path[number, 1] - y
+        turn = path[number, 2] - yaw
+        least = _least_cost_of_step(dx, dy, yaw, turn, course.rates)
+        # The cells that the step passes, as those of a line.
+        direction = math.atan2(dy, dx)
+        length = math.sqrt(dx * dx + dy * dy)
+        multiplier = _mean_multiplier(
+            (x, y, direction), 0.0, length, False, course.world
+        )
+        costs[number] = costs[number - 1] + least * multiplier
