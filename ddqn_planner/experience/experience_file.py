@@ -28,7 +28,6 @@ MAX_FILE_BYTES = 2**27  # a larger file is refused before it is read
 VERSION = 4
 LOG_VERSION = 3  # of one robot, with the logarithms of slowness alone
 FIRST_VERSION = 1  # until 0.4.0; 2 was never released
-LOG_RANGE = -math.log(MAX_SLOWNESS), math.log(MAX_SLOWNESS)
 MOST = 1e12  # no sum of what drives showed is greater: seconds, weights or squares
 
 
@@ -201,7 +200,7 @@ def _old_evidence(
         passages, waited, _, x, y = others
     mean_log = sum_of_log / np.maximum(weight, LEAST_WEIGHT)
     # The mean of a lognormal, and the squares that give the variance NOISE.
-    slowness = np.exp(np.clip(mean_log, *LOG_RANGE) + NOISE / 2)
+    slowness = np.exp(mean_log + NOISE / 2)
     variance = NOISE * np.maximum(weight - 1, 0)
     side = robot_width / 2
     places = Places.at(
@@ -214,16 +213,10 @@ def _old_evidence(
         passages=np.maximum(passages, weight),
         waited=waited,
     )
-    evidence = RobotEvidence.new("", side)
-    # The first files have neither errors nor surprises. A network, which predicted
-    # slowness from the map, is left out.
-    return evidence._replace(
-        identity=identity,
-        version=Version(1, 0),
-        driven=driven,
-        places=places,
-        errors=arrays.get("errors", evidence.errors),
-        surprises=arrays.get("surprises", evidence.surprises),
+    # What older versions expected says nothing of what this one expects: their errors,
+    # surprises and networks, which predicted slowness from the map, are left out.
+    return RobotEvidence.new("", side)._replace(
+        identity=identity, version=Version(1, 0), driven=driven, places=places
     )
 
 

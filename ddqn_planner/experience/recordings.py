@@ -145,7 +145,7 @@ def read_csv(path: Path) -> list[Sample]:
     content = open_regular(path, MAX_CSV_BYTES)
     with TextIOWrapper(content, "utf-8-sig", errors="replace") as file:
         header, *rows = [line for line in file if line.strip(" ,\n")] or [""]
-    names = [name.strip(' "\n') for name in header.split(",")]
+    names = [name.strip(' #"\n') for name in header.split(",")]
     missing = sorted(set(COLUMNS) - set(names))
     if missing:
         raise ValueError(
@@ -160,7 +160,6 @@ def read_csv(path: Path) -> list[Sample]:
             rows,
             delimiter=",",
             usecols=columns,
-            comments=None,
             quotechar='"',
             ndmin=2,
         )

@@ -53,6 +53,10 @@ def test_a_csv_file_may_have_a_mark_of_its_encoding_and_blanks(tmp_path: Path) -
     text = "\ufeff\r\n seconds , x,y \r\n\r\n 1 , 2, 3 ,more\r\n ,, \r\n  \r\n4,5,6\r\n"
     file.write_text(text, encoding="utf-8", newline="")
     assert read_csv(file) == [(1, 2, 3), (4, 5, 6)]
+    np.savetxt(file, [(1, 2, 3), (4, 5, 6)], delimiter=",", header="seconds,x,y")
+    assert read_csv(file) == [(1, 2, 3), (4, 5, 6)]
+    file.write_text('"x","y","seconds"\n"2","3","1"\n')
+    assert read_csv(file) == [(1, 2, 3)]
 
 
 def test_recordings_add_to_older_experience(
