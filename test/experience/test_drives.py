@@ -302,6 +302,22 @@ def test_the_length_in_a_row_is_that_of_noisy_poses_or_of_the_drive(
         assert len([*read_drives(folder.record_path)]) == is_read
 
 
+@given(st.floats(0.1, 5), st.floats(0.05, 2), st.floats(0, 0.1))
+def test_every_drive_that_is_recorded_is_read(
+    radius: float, speed: float, noise: float
+) -> None:
+    """Also in circles, where its length depends on each rounding."""
+    angle = np.arange(0, 60, 0.1) * speed / radius
+    circle = radius * np.column_stack([np.cos(angle), np.sin(angle)])
+    positions = np.random.default_rng(1).normal(circle, noise)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "episodes.csv"
+        drive = Drive(DriveEnd.ARRIVED, 1.7e9 + np.arange(0, 60, 0.1), positions)
+        path.write_bytes(drive.row(1))
+        (read,) = read_drives(path, pytest.fail)
+    np.testing.assert_allclose(read.positions, drive.positions, atol=1e-3)
+
+
 def test_experience_that_is_broken_or_of_another_robot_is_refused(
     tmp_path: Path,
 ) -> None:
