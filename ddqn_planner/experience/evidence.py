@@ -74,8 +74,8 @@ class Evidence:
     errors, surprises : (D,) float64
         Of the last drives of each robot: the error, see `ErrorRange`, and the largest
         surprise, see `_surprises_of`.
-    levels : Levels
-        The log slowness in the open, and where the robot is fastest.
+    open_log : float
+        The log slowness in the open.
     posterior : Posterior or None
         Over the last map.
     """
@@ -115,7 +115,8 @@ class Evidence:
         self.places = self.fleet.places()
         self.errors = np.concatenate([robot.errors for robot in members])
         self.surprises = np.concatenate([robot.surprises for robot in members])
-        self.levels = self.places.levels()
+        self.open_log = self.places.open_log()
+        self._is_solved = False  # whether `posterior` follows from all that
 
     @property
     def driven(self) -> float:
@@ -249,18 +250,20 @@ class Evidence:
     def posterior_over(self, grid: GridMap) -> Posterior:
         """Return the posterior over a map, solved with all that was seen until now.
 
-        If the last map had the same cells as `grid`, its posterior is updated and
-        returned. The posterior is kept for the next call.
+        The posterior is kept for the next call: a map with the same cells is solved
+        from there, with fewer steps.
         """
         check_grid(grid)
         posterior = self.posterior
-        # An exception must not leave a posterior that is half updated.
-        self.posterior = None
         if posterior is None or not _has_cells_of(posterior.grid, grid):
             posterior = Posterior(grid, self.side, self.nominal_speed)
-        posterior.grid = grid
-        posterior.update(self.places, self.levels.open_log, self.fleet.prior)
+        elif self._is_solved:
+            return posterior
+        # An exception must not leave a posterior that is half updated.
+        self.posterior = None
+        posterior.update(self.places, self.open_log, self.fleet.prior)
         self.posterior = posterior
+        self._is_solved = True
         return posterior
 
 

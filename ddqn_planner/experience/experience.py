@@ -63,8 +63,6 @@ LATEST = 1e12  # seconds of a clock: a pose of a later time is not believed
 MAX_MEDIAN_FACTOR = 4.0
 # Times the usual speed: a faster move is not believed.
 MAX_SPEED_FACTOR = 3
-# Of the log slowness in the open: a map's fastest move changes in such steps.
-OPEN_STEP = 0.1
 # By default, the share by which the shortest path may take longer than the best one.
 EXPLORATION = 0.2
 
@@ -375,7 +373,7 @@ class Experience:
     @property
     def learned_speed(self) -> float:
         """Metres per second in the open, as drives show; at first the nominal speed."""
-        return self.nominal_speed / math.exp(self.evidence.levels.open_log)
+        return self.nominal_speed / math.exp(self.evidence.open_log)
 
     @property
     def prior(self) -> Float64:
@@ -433,31 +431,26 @@ class Experience:
         """
         share = as_number("exploration", exploration, 0, 10, "0 to 10")
         posterior = self.evidence.posterior_over(grid)
-        # No place is believed to be faster than the open floor, whose log slowness is 0
-        # or less: drives may all have been slow. A change makes all fields anew.
-        steps = round(self.evidence.levels.open_log / OPEN_STEP)
-        open_log = OPEN_STEP * min(0, steps)
-        slowness = posterior.paint(open_log)
-        seconds = grid.resolution / self.nominal_speed * math.exp(open_log)
-        expected = grid.with_times(slowness, seconds)
+        seconds = (
+            grid.resolution / self.nominal_speed * math.exp(posterior.fastest_log)
+        )
+        expected = grid.with_times(posterior.painted, seconds)
         if not share:
             return expected
-        exploration_layers = Exploration(share, grid, self.uncertainty(grid))
+        exploration_layers = Exploration(share, grid, posterior.uncertainty)
         return expected.with_layers(exploration=exploration_layers)
 
     def slowness(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: seconds, with waits, over those at nominal speed."""
         posterior = self.evidence.posterior_over(grid)
-        return posterior.to_cells(posterior.slowness.astype(np.float32), occupied=1)
+        return posterior.to_cells(posterior.slowness, occupied=1)
 
     def uncertainty(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: the standard deviation of the log slowness.
 
         It is greatest where nothing is known.
         """
-        posterior = self.evidence.posterior_over(grid)
-        unknown = posterior.to_cells(posterior.unknown.astype(np.float32), occupied=1)
-        return math.sqrt(posterior.variance) * unknown
+        return self.evidence.posterior_over(grid).uncertainty
 
     def expected_time(self, grid: GridMap, cells: Cells) -> ExpectedTime:
         """Return the time that a path takes, with an interval of 90 %.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +25,6 @@ KNOWN_WEIGHT = 0.7  # of a place's visits, from which the place is known
 # Fewer known places say nothing about the robot's speed in the open.
 SURE_PLACES = 20
 OPEN_QUANTILE = 0.25  # of the log slowness of places
-FASTEST_QUANTILE = 0.05
 
 LEAST_WEIGHT = 1e-9  # places with less have no visit
 
@@ -47,17 +45,17 @@ NO_ROW = -1  # in arrays of rows: a square that was not seen
 NO_KEY = np.iinfo(np.int64).min  # of no square
 
 
-class Levels(NamedTuple):
-    """The log slowness in the open, and where the robot is fastest."""
-
-    open_log: float
-    fastest_log: float
-
-
 @dataclass(frozen=True)
-class Sums:
-    """Sums of what was seen at N places, which fade with time."""
+class Places:
+    """Sums of what was seen at N squares of the world, in the order of the squares.
 
+    The sums fade with time. They are rounded to float32, as files hold them.
+    """
+
+    side: float  # of a place, metres
+    square: Int32  # (N, 2): x and y of each place, in sides of a place
+    # (N, 2): where in its square a robot first passed, in steps of 1 / OFFSETS of it
+    offset: UInt8
     # (N,): the sum of the weights of all visits; a visit of a side's length weighs 1
     weight: Float64
     # (N,) each: sums over all visits, times their weights
@@ -74,10 +72,6 @@ class Sums:
 
     def __len__(self) -> int:
         return len(self.weight)
-
-    def is_known(self) -> NDArray[np.bool_]:
-        """Return of which places enough was seen: (N,)."""
-        return self.weight >= KNOWN_WEIGHT
 
     def mean_log(self) -> Float64:
         """Return the mean of the log slowness of the visits: (N,), 0 without visits."""
@@ -108,29 +102,10 @@ class Sums:
         noise: Float64 = (assumed + squares) / (ASSUMED_VISITS_OF_PLACE + freedom)
         return np.asarray(np.maximum(noise, LEAST_NOISE))
 
-    def levels(self) -> Levels:
-        """Return how slow the robot is in the open, and where it is fastest.
-
-        With few known places, both are the nominal speed.
-        """
-        log = self.log_of_mean()[self.is_known()]
-        if len(log) < SURE_PLACES:
-            return Levels(0.0, 0.0)
-        open_log, fastest_log = np.quantile(log, (OPEN_QUANTILE, FASTEST_QUANTILE))
-        return Levels(float(open_log), float(fastest_log))
-
-
-@dataclass(frozen=True)
-class Places(Sums):
-    """Sums of what was seen at N squares of the world, in the order of the squares.
-
-    The sums are rounded to float32, as files hold them.
-    """
-
-    side: float  # of a place, metres
-    square: Int32  # (N, 2): x and y of each place, in sides of a place
-    # (N, 2): where in its square a robot first passed, in steps of 1 / OFFSETS of it
-    offset: UInt8
+    def open_log(self) -> float:
+        """Return the log slowness in the open; 0 if few places are known."""
+        is_known = self.weight >= KNOWN_WEIGHT
+        return open_level(self.log_of_mean()[is_known], otherwise=0.0)
 
     @classmethod
     def none(cls, side: float) -> Places:
@@ -209,6 +184,16 @@ class Places(Sums):
         excess = np.maximum(self.passages / MOST_PASSAGES, 1)  # (N,): 1: not too many
         passages = _rounded(self.passages / excess)
         return replace(self, passages=passages, waited=_rounded(self.waited / excess))
+
+
+def open_level(log: Float64, otherwise: float) -> float:
+    """Return the log slowness in the open, from those of known places, (K,).
+
+    `otherwise` is returned if they are few.
+    """
+    if len(log) < SURE_PLACES:
+        return otherwise
+    return float(np.quantile(log, OPEN_QUANTILE))
 
 
 def squares_at(position: Float64, side: float) -> Int32:

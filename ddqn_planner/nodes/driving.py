@@ -265,11 +265,7 @@ class Driving:
         experience = folder.experience
         # The log slowness is 0 where the robot drives at the nominal speed, and below 0
         # where it is faster.
-        levels = experience.evidence.levels
-        is_faster = levels.open_log < -WRONG_SPEED
-        # Many places may be slow. If even the fastest places are, the robot is slow.
-        is_slower = levels.fastest_log > WRONG_SPEED
-        is_wrong = is_faster or is_slower
+        is_wrong = abs(experience.evidence.open_log) > WRONG_SPEED
         if is_wrong and not self._is_speed_wrong:
             speeds = (
                 f"the robot drives {experience.learned_speed:.3g} m/s in the open, "

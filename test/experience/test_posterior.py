@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ddqn_planner import GridMap
 from ddqn_planner.experience.places import Places
-from ddqn_planner.experience.posterior import Posterior
+from ddqn_planner.experience.posterior import VARIANCE, Posterior
 from ddqn_planner.experience.prior import FEATURES
 
 SIDE = 0.25
@@ -32,7 +31,7 @@ def random_places(random: np.random.Generator, free_cells: np.ndarray) -> Places
     )
 
 
-def precision_of_map(free: np.ndarray, variance: float) -> np.ndarray:
+def precision_of_map(free: np.ndarray) -> np.ndarray:
     """The inverse covariance of the F free cells of a map, (F, F), before any visit."""
     count = np.count_nonzero(free)
     number = np.full(free.shape, -1)
@@ -44,7 +43,7 @@ def precision_of_map(free: np.ndarray, variance: float) -> np.ndarray:
     adjacency[cell[are_free], neighbour[are_free]] = 1
     adjacency += adjacency.T
     precision = np.diag(adjacency.sum(axis=1) + SIDE**2) - adjacency
-    return precision * np.log1p(32 / SIDE**2) / (4 * np.pi) / variance
+    return precision * np.log1p(32 / SIDE**2) / (4 * np.pi) / VARIANCE
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0, 0.6))
@@ -69,36 +68,26 @@ def test_the_posterior_is_that_of_a_gaussian_markov_random_field(
     visits[row, column] = places.weight / places.noise()
     log[row, column] = places.log_of_mean()
     expected = posterior.expected[posterior.place[free]]  # (F,), as the following
-    precision = precision_of_map(free, posterior.variance) + np.diag(visits[free])
-    beyond_expected = visits[free] * (log[free] - expected)
-    sides = np.column_stack([visits[free], beyond_expected])  # (F, 2)
-    expected_known, beyond = np.linalg.solve(precision, sides).T
+    precision = precision_of_map(free) + np.diag(visits[free])
+    beyond = np.linalg.solve(precision, visits[free] * (log[free] - expected))
 
     place = posterior.place[free]  # of each free cell
-    np.testing.assert_allclose(posterior.known[place], expected_known, atol=0.01)
     np.testing.assert_allclose(posterior.mean[place], expected + beyond, atol=0.02)
 
 
-def test_the_variance_of_places_is_learned_without_the_noise_of_visits() -> None:
-    random = np.random.default_rng(0)
-    grid = GridMap(np.zeros((60, 60), dtype=bool), SIDE)
-    position = (np.indices((60, 60)).reshape(2, -1).T + 0.5) * SIDE
-    deviations = []
-    for deviation in (0.0, 0.7):
-        log_of_places = random.normal(0, deviation, (3600, 1))
-        log = log_of_places + random.normal(0, 0.3, (3600, 3))  # of three visits
-        places = Places.at(
-            position,
-            SIDE,
-            weight=np.full(3600, 3.0),
-            sum_of_slowness=np.exp(log).sum(axis=1),
-            sum_of_log=log.sum(axis=1),
-            sum_of_squares=(log**2).sum(axis=1),
-        )
-        posterior = Posterior(grid, SIDE, nominal_speed=0.5)
+def test_places_near_visits_are_surer_and_none_is_behind_a_wall() -> None:
+    occupancy = np.zeros((9, 20), dtype=bool)
+    occupancy[4] = True
+    posterior = Posterior(GridMap(occupancy, SIDE), SIDE, nominal_speed=0.5)
+    middle = np.array([[10.5, 2.5]]) * SIDE
+    unsure = []
+    for weight in (0.0, 1.0, 10.0):
+        places = Places.at(middle, SIDE, weight=np.array([weight]))
         posterior.update(places, 0.0, np.zeros(FEATURES))
-        assert places.noise().mean() == pytest.approx(0.09, rel=0.2)
-        deviations.append(posterior.variance**0.5)
-    assert deviations[0] < 0.25
-    # About the open, which is the fastest quarter of all places.
-    assert 0.65 < deviations[1] < 1
+        unsure.append(posterior.uncertainty)
+    nothing, little, much = unsure
+    assert (nothing == 1).all()
+    assert (little <= nothing).all()
+    assert (much <= little).all()
+    assert much[2, 10] < much[2, 11] < much[2, 12] < 1
+    assert (much[4:] == 1).all()
