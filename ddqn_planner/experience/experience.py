@@ -431,9 +431,7 @@ class Experience:
         """
         share = as_number("exploration", exploration, 0, 10, "0 to 10")
         posterior = self.evidence.posterior_over(grid)
-        seconds = (
-            grid.resolution / self.nominal_speed * math.exp(posterior.fastest_log)
-        )
+        seconds = grid.resolution / self.nominal_speed * math.exp(posterior.fastest_log)
         expected = grid.with_times(posterior.painted, seconds)
         if not share:
             return expected

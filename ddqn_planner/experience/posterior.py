@@ -30,8 +30,8 @@ CORRELATION = 1.0  # metres: how far the slowness of a place tells of that of ot
 STEP = 0.02
 OPEN_STEP = 0.1  # of the log slowness of the fastest moves
 # The length of the residuals of the equations up to which they count as solved: then
-# no place's log slowness is off by much more than a step.
-RESIDUAL = 0.01
+# no place's log slowness is off by more than a step.
+RESIDUAL = 0.005
 VARIANCE = 1.0  # of the log slowness of places around the expected one
 # Neighbours are alike: so many places of a path tell as much of the map's features as
 # one place alone.
@@ -199,11 +199,12 @@ class Posterior:
         # beside the place where robots stood has the same wait.
         passages = self._sums(place, places.passages)
         waited = self._sums(place, places.waited)
-        around = np.column_stack([visits, passages, waited])
+        known = visits / (1 / VARIANCE + visits)  # the share that was seen
+        around = np.column_stack([known, passages, waited])
         for _ in range(LINKS_AROUND):
             around = around + self._ties @ around
-        visits_around, passages_around, waited_around = around.T / SUM_AROUND
-        self.unknown = 1 / np.sqrt(1 + VARIANCE * visits_around)
+        known_around, passages_around, waited_around = around.T / SUM_AROUND
+        self.unknown = np.sqrt(1 - np.clip(known_around, known, 1))
         wait = waited_around / (passages_around + ASSUMED_PASSAGES)  # seconds
         self.slowness = np.exp(self.mean) + self.nominal_speed / self.side * wait
 
