@@ -124,6 +124,7 @@ PLANNER_DEFAULTS = {
 }
 PLANNER_REMAPS = [
     ("map", "global_costmap/costmap"),
+    ("published_footprint", "global_costmap/published_footprint"),
     # bt_navigator plans for RViz's goals.
     ("goal_pose", f"{PLANNER}/goal_pose"),
 ]

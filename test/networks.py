@@ -60,9 +60,14 @@ def new_planner() -> Planner:
 BODY = 0.3, 0.2, 0.2  # metres that `robot_model` reaches ahead, behind and to each side
 
 
-def robot_model(path: Path, motion: str, cell: float) -> None:
+def robot_model(
+    path: Path,
+    motion: str,
+    cell: float,
+    body: tuple[float, float, float] = BODY,
+) -> None:
     """Write the model of a small robot that has learned its body exactly."""
-    front, back, side = BODY
+    front, back, side = body
     corners = [(front, side), (-back, side), (-back, -side), (front, -side)]
     untrained = RobotNetwork.untrained(
         read_footprint(corners), make_motions(motion, 0.4, cell)

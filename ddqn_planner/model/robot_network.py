@@ -103,6 +103,13 @@ class RobotNetwork(QNetwork):
         }
         return cls(sizes, tensors)
 
+    def of_footprint(self, footprint: Float64) -> RobotNetwork:
+        """Return the network of the same robot with another body, without a training.
+
+        The corners (K, 2) are those of `untrained`.
+        """
+        return RobotNetwork.untrained(footprint, self.motions)
+
     def __init__(
         self, sizes: Mapping[str, int], tensors: Mapping[str, NDArray[Any]]
     ) -> None:

@@ -2,7 +2,8 @@
 
 import math
 from array import array
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import field, fields
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple, TypeVar
@@ -12,6 +13,7 @@ from rclpy.exceptions import InvalidNamespaceException
 from rclpy.validate_namespace import validate_namespace
 
 NAMESPACES: Final = "namespaces"
+MODELS: Final = "models that know a body"
 NOT_EMPTY: Final = "not empty"
 ROUNDED: Final = 1e-6  # share by which a number may lie beyond its range, as ROS has it
 
@@ -88,7 +90,7 @@ class Declared(NamedTuple):
         if isinstance(value, array):  # ROS makes it of a list of numbers
             value = value.tolist()
         if isinstance(self.default, list):
-            return self._read_namespaces(name, value)
+            return self._read_list(name, value)
         value = self._in_type(value)
         if type(value) is not type(self.default):
             raise ValueError(f"{name} is {self._shown(value)}; give {self._wanted}")
@@ -136,25 +138,23 @@ class Declared(NamedTuple):
                 return type(value)(end)
         raise ValueError(f"{name} is {value}; give {self.limits}")
 
-    def _read_namespaces(self, name: str, value: Any) -> list[str]:
-        """Return a list of namespaces, without slashes at their ends; see `read`.
+    def _read_list(self, name: str, value: Any) -> list[str]:
+        """Return a list of texts without blanks at their ends; see `read`.
 
-        Empty and repeated namespaces are left out. If none is left the list is [""], as
-        ROS has no type for an empty list.
+        Namespaces have no slashes at their ends either. Empty and repeated texts are
+        left out. If none is left the list is [""], as ROS has no type for an empty
+        list.
         """
-        namespaces = [value] if isinstance(value, str) else value or []
-        is_list = isinstance(namespaces, list)
-        if not is_list or not all(isinstance(item, str) for item in namespaces):
+        texts = [value] if isinstance(value, str) else value or []
+        is_list = isinstance(texts, list)
+        if not is_list or not all(isinstance(item, str) for item in texts):
             raise ValueError(f"{name} is {self._shown(value)}; give {self._wanted}")
-        stripped = [namespace.strip().strip("/") for namespace in namespaces]
+        stripped = [text.strip() for text in texts]
+        if self.allowed == NAMESPACES:
+            stripped = [text.strip("/") for text in stripped]
         unique = [*dict.fromkeys(filter(None, stripped))]
-        for namespace in unique:
-            try:
-                validate_namespace(f"/{namespace}")
-            except InvalidNamespaceException:
-                problem = f"{name} holds {namespace!r}, which is no namespace"
-                remedy = "give letters, digits and _, such as r1"
-                raise ValueError(f"{problem}; {remedy}") from None
+        if self.allowed == NAMESPACES:
+            _check_namespaces(name, unique)
         return unique or [""]
 
     @property
@@ -164,7 +164,7 @@ class Declared(NamedTuple):
         if kind is bool:
             return "true or false"
         if kind is list:
-            return "a list of namespaces, such as [r1, r2]"
+            return f"a list of {self.allowed}, such as [r1, r2]"
         return TYPES[kind] if kind is str else f"{TYPES[kind]}, {self.limits}"
 
     def _shown(self, value: object) -> str:
@@ -177,6 +177,17 @@ class Declared(NamedTuple):
         if isinstance(value, str) and isinstance(self.default, (bool, int, float)):
             return f"{words} (a number and a truth value have no quotes)"
         return words
+
+
+def _check_namespaces(name: str, namespaces: Sequence[str]) -> None:
+    """Raise a ValueError, with a parameter's name, if one of them is no namespace."""
+    for namespace in namespaces:
+        try:
+            validate_namespace(f"/{namespace}")
+        except InvalidNamespaceException:
+            problem = f"{name} holds {namespace!r}, which is no namespace"
+            remedy = "give letters, digits and _, such as r1"
+            raise ValueError(f"{problem}; {remedy}") from None
 
 
 Parameters = Mapping[str, Declared]
@@ -194,7 +205,12 @@ def parameter(
     The arguments are the fields of `Declared`, which becomes the field's metadata.
     """
     declaration = Declared(default, description, allowed, read_only, replaced)
-    entry: T = field(default=default, metadata={"declaration": declaration})
+    metadata = {"declaration": declaration}
+    entry: T
+    if isinstance(default, list):  # each instance has a list of its own
+        entry = field(default_factory=lambda: copy(default), metadata=metadata)
+    else:
+        entry = field(default=default, metadata=metadata)
     return entry
 
 

@@ -1,12 +1,13 @@
 """The planner's parameters, in the words of its ``--help``."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 from ddqn_planner.experience.experience import EXPLORATION
 from ddqn_planner.grid import MoveRule
-from ddqn_planner.nodes.declared import Declared, declared_by, parameter
+from ddqn_planner.nodes.declared import MODELS, Declared, declared_by, parameter
 from ddqn_planner.planning import PlanMethod
 from ddqn_planner.planning.field_cache import CACHE_BYTES
 
@@ -37,6 +38,9 @@ class PlannerSettings:
     )
     model: str = parameter(
         "any_map", "A shipped model's name, or a model file", LOADABLE
+    )
+    models: Sequence[str] = parameter(
+        [""], "More models of the robot, for other footprints; []: none", MODELS
     )
     move_rule: str = parameter(
         "", "Legal diagonal moves; '' for the model's rule", ["", *MOVE_RULES]
@@ -100,7 +104,7 @@ class PlannerSettings:
         ["initialpose", "odometry", "tf"],
     )
     robot_frame: str = parameter(
-        "base_link", "The robot's frame, for the start_source tf", "not empty"
+        "base_link", "The robot's frame, for tf and published_footprint", "not empty"
     )
     transform_tolerance: float = parameter(
         0.3,

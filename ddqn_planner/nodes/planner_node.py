@@ -23,9 +23,15 @@ from ddqn_planner.nodes.conversions import (
 )
 from ddqn_planner.nodes.diagnostics import PlannerDiagnostics
 from ddqn_planner.nodes.display import FieldDisplay
+from ddqn_planner.nodes.footprint_source import FootprintSource
 from ddqn_planner.nodes.lifecycle import ManagedNode
 from ddqn_planner.nodes.map_source import MapSource
-from ddqn_planner.nodes.model_source import ModelSource, read_model
+from ddqn_planner.nodes.model_source import (
+    LoadedModel,
+    ModelSource,
+    read_bodies,
+    read_model,
+)
 from ddqn_planner.nodes.nav2 import NavigationServer, serve_nav2
 from ddqn_planner.nodes.other_planners import (
     GoalAnswer,
@@ -46,9 +52,10 @@ from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.nodes.requests import Requests, path_poses
 from ddqn_planner.nodes.spinning import spin_until_shutdown
 from ddqn_planner.nodes.worker import Worker
-from ddqn_planner.planning import PlanMethod, Planner
+from ddqn_planner.planning import PlanMethod
 from ddqn_planner.planning.plan import PosePlan
 from ddqn_planner.planning.segments import SAME_COST
+from ddqn_planner.robot.footprint import Corners
 
 CONFIGURED = ("inactive", "active")  # states with a map, a start and requests
 SOON_PERIOD = 0.1  # seconds until the next check after a change
@@ -135,6 +142,13 @@ class PlannerNode(ManagedNode):
             self._check_soon,
         )
         """Answers queries for paths; from `configure` to `cleanup`."""
+        FootprintSource(
+            self,
+            self._diagnostics,
+            frames=self.poses,
+            is_needed=lambda: self.model_source.needs_footprint,
+            on_footprint=self._on_footprint,
+        )
         self.create_subscription(PoseStamped, "goal_pose", self._on_goals, 10)
         self.create_subscription(PoseArray, "goal_poses", self._on_goals, 10)
         if self._settings.follow_trainer:
@@ -238,6 +252,8 @@ class PlannerNode(ManagedNode):
             return  # workers load the first files
         if "model" in new:
             self._new_model = read_model(new["model"])
+        if "models" in new:
+            self._new_bodies = read_bodies(new["models"])
         if "experience" in new:
             file = new["experience"]
             self._new_experience = Experience.load(file) if file else None
@@ -250,13 +266,15 @@ class PlannerNode(ManagedNode):
         if not changed or self.state not in CONFIGURED:
             return
         if "model" in changed:
-            self.model_source.use(*self._new_model)
+            self.model_source.use(self._new_model)
+        if "models" in changed:
+            self.model_source.use_bodies(self._new_bodies)
         self.poses.listen_to_source()
         self.requests.settings = self._settings
         self.map_source.apply_parameters(changed)
         if "experience" in changed:
             self.map_source.times.use(self._new_experience)
-        self._set_active_goal(self._active_goal.poses)
+        self._plan_anew()
 
     def _on_model(self, message: UInt8MultiArray) -> None:
         """Plan with the trainer's model, or report it as refused."""
@@ -264,9 +282,23 @@ class PlannerNode(ManagedNode):
             data = bytes_of("model", message)
             if message.layout == self.model_source.layout:  # the layout holds a digest
                 return
-            planner = Planner(*model_of(data))
-            self.model_source.use(planner, "trainer/model", message.layout)
-            self._set_active_goal(self._active_goal.poses)
+            model = LoadedModel(*model_of(data), "trainer/model")
+            model.check()
+            self.model_source.use(model, message.layout)
+            self._plan_anew()
+
+    def _on_footprint(self, footprint: Corners) -> None:
+        """Plan for a footprint (K, 2), metres, from now on."""
+        if self.model_source.use_footprint(footprint):
+            self._plan_anew()
+
+    def _plan_anew(self) -> None:
+        """Plan to the active goal without the last path, which may be another body's.
+
+        What requests wait for may have come, too.
+        """
+        self.requests.wake_waiting()
+        self._set_active_goal(self._active_goal.poses)
 
     # Map, start and goal
 
@@ -344,7 +376,14 @@ class PlannerNode(ManagedNode):
         """
         active = self._active_goal
         goals = active.poses
-        outcome = await self.requests.answer(goals, self.requests.plan_for(active))
+        planner = self.model_source.planner
+
+        def given_up() -> Outcome | None:
+            # The new model has a plan of its own.
+            return None if planner is self.model_source.planner else UNCHANGED
+
+        planning = self.requests.plan_for(active)
+        outcome = await self.requests.answer(goals, planning, given_up)
         if outcome.status in (UNCHANGED.status, NOT_ACTIVE.status):
             return
         self._publish(outcome, active)

@@ -20,6 +20,7 @@ from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.time import Time
+from std_msgs.msg import Header
 
 from ddqn_planner.grid.rotations import Rotation
 from ddqn_planner.nodes.base_node import BaseNode
@@ -180,6 +181,17 @@ class Frames:
                 "or give it in the map's frame"
             )
             raise RequestError("TF_ERROR", reason, self.listening_since) from None
+
+    def transform_at(self, header: Header, target: str) -> TransformStamped:
+        """Return the transform of poses from a header's frame to the frame `target`.
+
+        It is that of the time of the header's stamp, or the newest for the stamp 0. A
+        ValueError if TF has none.
+        """
+        stamp = Time.from_msg(header.stamp)
+        if stamp.nanoseconds:
+            return self._lookup(target, header.frame_id, stamp)
+        return self._newest(target, header.frame_id)
 
     def origin_of(self, frame: str, map_frame: str) -> PoseStamped:
         """Return the pose of a frame in the map's frame now; ValueError without TF."""

@@ -302,6 +302,10 @@ class Requests:
         if current is not None and len(goals) == 1:
             request = with_current_path(request, current, inputs.header.frame_id)
         legs = await self._plan_legs(inputs.planner, request, goals[1:])
+        has_body = inputs.planner.pose_planner is not None
+        if has_body and inputs.planner is not self.model.planner:
+            # The path is for a body that the robot no longer has.
+            return await self.plan_once(query, current)
 
         stops = [start, *goals]
         outcome = outcome_of(inputs, settings, legs, stops)
@@ -421,7 +425,7 @@ class Requests:
         planner = self.model.planner
         if planner is None:
             reason = self.diagnostics.refused["model"]
-            raise RequestError("NO_MODEL", f"no model is loaded: {reason}")
+            raise RequestError("NO_MODEL", f"there is no model to plan with: {reason}")
         planner.fields.max_bytes = self.settings.field_cache_bytes
         grid: GridMap = await ready
         return PlanInputs(header, grid, planner)

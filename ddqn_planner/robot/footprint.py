@@ -333,28 +333,27 @@ def _is_padded(padded: Corners, corners: Corners, padding: float) -> bool:
     if inside(padded, corners).any() or not inside(corners, padded).all():
         return False
     # The least distance is from a corner of one polygon to a side of the other.
-    gap = min(_distances(padded, corners).min(), _distances(corners, padded).min())
+    gap = min(distances(padded, corners).min(), distances(corners, padded).min())
     return bool(gap > padding * (1 - 1e-6))
 
 
-def _distances(points: Points, corners: Corners) -> NDArray[np.float64]:
-    """Return how far points (N, 2) are from each side of a polygon, (N, K).
+def distances(points: Points, corners: Corners) -> NDArray[np.float64]:
+    """Return how far points (N, 2) are from the outline of a polygon, (N,).
 
     The polygon has K corners, (K, 2). Distances have the unit of the points.
     """
-    sides = np.roll(corners, -1, axis=0) - corners  # (K, 2)
-    to_points: NDArray[np.float64] = points[:, None] - corners  # (N, K, 2)
-    # The point of a side that is nearest to a point lies at a share of the side: 0 is
-    # its begin and 1 its end.
-    # (N, K) and (K,).
-    dot_products: NDArray[np.float64] = (to_points * sides).sum(axis=2)
-    squared_lengths: NDArray[np.float64] = (sides * sides).sum(axis=1)
-    shares = (dot_products / squared_lengths).clip(0, 1)  # (N, K)
-    from_nearest = to_points - shares[..., None] * sides  # (N, K, 2)
-    distances: NDArray[np.float64] = np.hypot(
-        from_nearest[..., 0], from_nearest[..., 1]
-    )
-    return distances
+    nearest = np.full(len(points), np.inf)
+    side_ends = np.roll(corners, -1, axis=0)
+    for start, end in zip(corners, side_ends, strict=True):
+        side = end - start  # (2,)
+        from_start = points - start  # (N, 2)
+        # The point of the side that is nearest to a point lies at a share of the side:
+        # 0 is its begin and 1 its end.
+        shares = (from_start @ side / (side @ side)).clip(0, 1)  # (N,)
+        from_nearest = from_start - shares[:, None] * side  # (N, 2)
+        distance = np.hypot(from_nearest[:, 0], from_nearest[:, 1])
+        nearest = np.minimum(nearest, distance)
+    return nearest
 
 
 def inside(points: Points, corners: Corners) -> NDArray[np.bool_]:

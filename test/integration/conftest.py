@@ -206,10 +206,9 @@ def run_robot(
 
 WAITING = """
 import os, time
-from ddqn_planner.nodes import outcome
-from ddqn_planner.planning import Planner
+from ddqn_planner.nodes import model_source, outcome
 
-load, outcome.PATIENCE = Planner.load, {patience}
+load, outcome.PATIENCE = model_source.load_model, {patience}
 
 def wait_and_load(path):
     waits = os.path.basename(path) == "any_map.safetensors"
@@ -218,7 +217,7 @@ def wait_and_load(path):
         time.sleep(0.01)
     return load(path)
 
-Planner.load = wait_and_load
+model_source.load_model = wait_and_load
 """
 
 

@@ -447,7 +447,10 @@ def test_requests_wait_for_the_first_map_and_model_and_another_one_set_meanwhile
         if case == "broken":
             reason = "cannot be read as safetensors"
             assert (
-                robot.wait_for_reason(f"no model is loaded: .*{reason}").level == ERROR
+                robot.wait_for_reason(
+                    f"there is no model to plan with: .*{reason}"
+                ).level
+                == ERROR
             )
             robot.node.wait_for_log(f"model refused: .*{reason}.*set the parameter")
             return

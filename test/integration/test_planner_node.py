@@ -466,7 +466,10 @@ def test_says_what_it_waits_for(
 
         client.publish("plant", robot.map_message(), LATCHED)
         no_model = "there is no model file"
-        assert robot.wait_for_reason(f"no model is loaded: .*{no_model}").level == ERROR
+        assert (
+            robot.wait_for_reason(f"there is no model to plan with: .*{no_model}").level
+            == ERROR
+        )
         node.wait_for_log(f"model refused: .*{no_model}")
         shutil.copy(model, path)
         (loaded,) = client.set_parameters("router", model=str(path))

@@ -1,6 +1,7 @@
 """Paths for robots with a body and a heading over DDS."""
 
 import math
+import re
 from collections.abc import Iterator
 from pathlib import Path as FilePath
 from types import SimpleNamespace
@@ -10,7 +11,13 @@ import numpy as np
 import pytest
 import rclpy
 from client import map_message, pose
-from geometry_msgs.msg import PoseArray, PoseStamped
+from geometry_msgs.msg import (
+    Point32,
+    Polygon,
+    PolygonStamped,
+    PoseArray,
+    PoseStamped,
+)
 from integration.robot import NUMBERS, Robot, yaw_of
 from nav_msgs.msg import Path
 from networks import BODY, robot_model
@@ -85,11 +92,17 @@ def array_of(path: Path) -> np.ndarray:
     return np.array([(at.x, at.y, yaw_of(turned)) for at, turned in places])
 
 
-def check(path: Path, grid: GridMap, goal: Cell, yaw: float) -> np.ndarray:
+def check(
+    path: Path,
+    grid: GridMap,
+    goal: Cell,
+    yaw: float,
+    size: tuple[float, float, float] = BODY,
+) -> np.ndarray:
     """Check that no part of the body touches an obstacle, and where the path begins and
     ends.
     """
-    poses, (front, back, side) = array_of(path), BODY
+    poses, (front, back, side) = array_of(path), size
     assert ends_at(path, grid, goal, yaw)
     assert np.hypot(*np.diff(poses[:, :2], axis=0).T).max() <= CELL / 2 + 1e-6
     over, up = np.meshgrid(np.arange(-back, front, 0.02), np.arange(-side, side, 0.02))
@@ -202,6 +215,48 @@ def test_a_path_leads_round_a_box_that_stands_on_it(robot: Robot) -> None:
     robot.plans.clear()
     robot.set_map(message)
     path_to(robot, BESIDE, 0.5, grid_from_message(message))
+
+
+def test_the_model_that_covers_the_footprint_is_used_during_a_drive(
+    robot: Robot, tmp_path: FilePath
+) -> None:
+    def carry(ahead: float, side: float, behind: float = 0.2) -> str:
+        """Publish a footprint in the robot's frame; return how it is written."""
+        corners = [(ahead, side), (-behind, side), (-behind, -side), (ahead, -side)]
+        robot.plans.clear()
+        points = [Point32(x=x, y=y) for x, y in corners]
+        footprint = PolygonStamped(polygon=Polygon(points=points))
+        footprint.header.frame_id = "base_link"
+        robot.client.publish("published_footprint", footprint)
+        return re.escape(str([list(corner) for corner in corners]))
+
+    loaded, extended, torn = 0.3, tmp_path / "loaded", tmp_path / "torn.safetensors"
+    extended = extended.with_suffix(".safetensors")
+    robot_model(extended, "differential", CELL, (0.5, 0.2, loaded))
+    torn.write_bytes(extended.read_bytes()[:-9])
+    assert "torn.safetensors: cannot be read" in robot.refuse(models=[str(torn)])
+    assert "any_map.safetensors knows no body" in robot.refuse(models=["any_map"])
+    robot.set(path_bound=1.0)  # no path gets better later
+    drive_to(robot, BEYOND, 0.0)
+    carry(5.0, 5.0)  # of no consequence without other models
+    robot.set(models=[str(extended)])
+    path_to(robot, BEYOND, 0.0)
+    carry(0.45, loaded)
+    path = robot.plans.wait(lambda path: len(path.poses) > 0)
+    check(path, robot.grid, BEYOND, 0.0, (0.5, 0.2, loaded))
+    robot.wait_for_reason("", {"model file": str(extended)})
+    # A footprint that no model covers has no path, and the log says what to do.
+    words = carry(0.5, loaded, behind=0.3)
+    robot.plans.wait(lambda path: not path.poses)
+    reason = f"no model covers .*{words}.* 0.1 m beyond .*{extended.name}; train one"
+    robot.wait_for_reason(reason, {"status": "NO_MODEL"})
+    assert not robot.get_plan(at(robot, START, 0.5), at(robot, BEYOND, 0.0)).poses
+    # The smallest model that covers a footprint is used, and is told if it is larger.
+    words = carry(0.1, 0.1, behind=0.1)
+    path_to(robot, BEYOND, 0.0)
+    robot.wait_for_reason("", {"model file": str(robot.model)})
+    robot.node.wait_for_log(f"no model has .*{words}; planning with a larger body")
+    robot.set(models=[""])
 
 
 def test_bodies_along_the_path_are_shown_to_who_asks(robot: Robot) -> None:
