@@ -135,7 +135,7 @@ class _Bag:
         for topic, tree in sorted(self._trees.items()):
             frames = {frame.child or frame.parent for frame in tree.values()}
             words.append(f"{topic} in {sorted(frames) or '(cannot be decoded)'}")
-        return ", ".join(words)
+        return ", ".join(words) or "none"
 
     def add(self, message: Message) -> None:
         """Add the poses that follow from a message.

@@ -223,8 +223,8 @@ class DriveRecorder:
         sample = Sample(seconds, x, y)
         if not all(abs(value) < LATEST for value in sample):  # NaN fails too
             raise ValueError(
-                f"the robot is at {(x, y)} at {seconds} s; give metres and seconds up "
-                f"to {LATEST:g}"
+                f"the robot is at {(x, y)} at {seconds} s; give finite numbers up to "
+                f"{LATEST:g}"
             )
         if self._last is not None and seconds < self._last.seconds - JUMP:
             self.end()
