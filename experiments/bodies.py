@@ -35,7 +35,8 @@ from ddqn_planner.model import ModelMetadata, RobotNetwork
 from ddqn_planner.planning.path_finder import last_step
 from ddqn_planner.planning.plan import PosePlan, PoseRequest
 from ddqn_planner.robot.footprint import read_footprint
-from ddqn_planner.robot.motions import HEADINGS, Motion, Motions, make_motions
+from ddqn_planner.robot.motions import HEADINGS as DEFAULT_HEADINGS
+from ddqn_planner.robot.motions import Motion, Motions, make_motions
 from ddqn_planner.version import __version__
 from ddqn_planner.warm_up import warm_up
 
@@ -67,13 +68,15 @@ SHRUNK: Final = 1e-6  # metres, so that a body that only touches does not collid
 Pose = tuple[float, float, float]
 
 
-def robot(footprint: str, motion: Motion | str) -> Planner:
+def robot(
+    footprint: str, motion: Motion | str, headings: int = DEFAULT_HEADINGS
+) -> Planner:
     """Return the planner of a body that knows its swept cells exactly.
 
     It needs no training.
     """
     corners = read_footprint(footprint)
-    motions = make_motions(motion, RADII[Motion(motion)], CELL)
+    motions = make_motions(motion, RADII[Motion(motion)], CELL, headings)
     network = RobotNetwork.untrained(corners, motions)
     network.tensors["weight"] = network.swept_by_unit.astype(np.float32)
     network.tensors["threshold"] = np.full(network.sizes["units"], 0.5, np.float32)
@@ -239,13 +242,15 @@ def least_costs(
         for primitive in range(len(motions.poses))
     ]
     pose, next_pose, cost = np.concatenate(edges).T
-    size = grid.occupancy.size * HEADINGS
+    size = grid.occupancy.size * motions.headings
     # Against the drive, as the search begins at the goals.
     ends = next_pose.astype(int), pose.astype(int)
     graph = coo_matrix((cost, ends), (size, size)).tocsr()
-    numbers = [(y * grid.width + x) * HEADINGS + heading for x, y, heading in goals]
+    numbers = [
+        (y * grid.width + x) * motions.headings + heading for x, y, heading in goals
+    ]
     costs: NDArray[np.float64] = dijkstra(graph, indices=numbers, min_only=True)
-    return costs.reshape(grid.height, grid.width, HEADINGS)
+    return costs.reshape(grid.height, grid.width, motions.headings)
 
 
 def edges_of_primitive(
@@ -267,9 +272,9 @@ def edges_of_primitive(
             actions = grid.forbidden[y + dy, x + dx]  # a bit for each forbidden one
             is_allowed &= (actions >> action & 1) == 0
     dx, dy = motions.offset[primitive]
-    pose = (y * grid.width + x) * HEADINGS + motions.start[primitive]
+    pose = (y * grid.width + x) * motions.headings + motions.start[primitive]
     next_cell = (y + dy) * grid.width + x + dx
-    next_pose = next_cell * HEADINGS + motions.end[primitive]
+    next_pose = next_cell * motions.headings + motions.end[primitive]
     cost = motions.cost[primitive] * factor
     return np.column_stack([pose, next_pose, cost])[is_allowed]
 
@@ -342,7 +347,7 @@ def optimality(options: argparse.Namespace) -> Iterator[list[Any]]:
         least = np.full(1, np.inf)
         while np.isfinite(least).sum() < 1000:
             y, x = random.choice(np.argwhere(~occupancy)).tolist()
-            heading = int(random.integers(HEADINGS))
+            heading = int(random.integers(motions.headings))
             goal = (x, y, heading)
             least = least_costs(grid, motions, planner.network.swept(), goal)
         end = pose_at(grid, motions, *goal)

@@ -13,7 +13,14 @@ from ddqn_planner.grid.arguments import as_whole
 from ddqn_planner.model import save_model
 from ddqn_planner.model.model_file import check_model_path
 from ddqn_planner.robot.body_certificate import BodyCertificate
-from ddqn_planner.training.robot import MOST_STEPS, ROBOT, RobotTrainer
+from ddqn_planner.robot.motions import HEADINGS
+from ddqn_planner.training.robot import (
+    MOST_STEPS,
+    ROBOT,
+    MotionOptions,
+    RobotTrainer,
+    read_motions,
+)
 
 OPTIONS = (
     Option(
@@ -32,10 +39,16 @@ OPTIONS = (
     Option("turning-radius", float, 0.0, "of its bends, metres; ackermann needs it"),
     Option("resolution", float, 0.05, "of the maps, metres per cell"),
     Option(
+        "headings",
+        int,
+        HEADINGS,
+        "16, 32 or 64; more pass narrower gaps",
+    ),
+    Option(
         "lattice",
         Path,
         None,
-        "a file of Nav2's lattice generator, instead of these three",
+        "a file of Nav2's lattice generator, instead of these four",
     ),
     Option("allow-reverse", bool, False, "the lattice's motions also in reverse"),
     Option("out", Path, "my_robot.safetensors", "the model's file"),
@@ -57,16 +70,17 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
     check_model_path(out)  # before a long training
     check_writable(out, "--out")
     check_distinct({"--out": out}, {"--lattice": options.lattice})
-    trainer = RobotTrainer(
-        options.footprint,
-        options.motion,
-        options.turning_radius,
-        options.resolution,
-        options.lattice,
-        options.seed,
-        options.padding,
-        options.allow_reverse,
+    motions = read_motions(
+        MotionOptions(
+            options.motion,
+            options.turning_radius,
+            options.resolution,
+            options.headings,
+            options.lattice,
+            options.allow_reverse,
+        )
     )
+    trainer = RobotTrainer(options.footprint, motions, options.seed, options.padding)
     try:
         certificate = _train_with_bar(trainer, options.steps)
     except KeyboardInterrupt:

@@ -244,15 +244,14 @@ def _sizes_of(
     `values` should have an int for each of the class's `size_names`.
     """
     size_names = network_class.size_names
-    if network_class is PaperQNetwork:
-        # Missing in files of version 0.1.0, whose networks have no hidden units.
-        values = {"hidden_units": 0, **values}
+    values = {**network_class.former_sizes, **values}
     if values.keys() != set(size_names):
         raise ValueError(
             f"sizes is {reprlib.repr(dict(values))}; it must have {[*size_names]}"
         )
     sizes: dict[str, int] = {}
-    for name, size in values.items():
+    for name in size_names:
+        size = values[name]
         smallest = 0 if name == "hidden_units" else 1
         largest = network_class.max_size
         if type(size) is not int or not smallest <= size <= largest:

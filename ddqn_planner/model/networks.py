@@ -61,6 +61,8 @@ class QNetwork:
     name: ClassVar[str]  # in model files and hyper-parameters
     size_names: ClassVar[tuple[str, ...]]
     max_size: ClassVar[int] = 4096
+    # Sizes that files of older versions do not name, as theirs are always these.
+    former_sizes: ClassVar[Mapping[str, int]] = {}
     doubles: ClassVar[frozenset[str]] = frozenset()  # tensors that are float64
 
     def __init__(self, sizes: Mapping[str, int], tensors: Mapping[str, Array]) -> None:
@@ -141,6 +143,7 @@ class PaperQNetwork(QNetwork):
     # `hidden_units`; 0 stands for none.
     name = "paper"
     size_names = ("height", "width", "filters", "hidden_units")
+    former_sizes: ClassVar = {"hidden_units": 0}  # until version 0.1.0
 
     @classmethod
     def _layers(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:

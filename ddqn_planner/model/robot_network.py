@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Any, ClassVar, Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from ddqn_planner.robot.body_certificate import BodyCertificate, certify_body
 from ddqn_planner.robot.footprint import read_footprint, swept_cells
 from ddqn_planner.robot.motions import (
     HEADINGS,
+    HEADINGS_OF_LATTICES,
     Motions,
     is_too_cheap,
     turn_between,
@@ -36,7 +37,8 @@ class RobotNetwork(QNetwork):
     # Weights are at least 0: a weight below counts as 0. One unit serves all primitives
     # that are quarter turns of each other. Motions and footprint are not learned.
     name = "robot"
-    size_names = ("units", "side", "primitives", "poses", "corners")
+    size_names = ("units", "side", "primitives", "poses", "corners", "headings")
+    former_sizes: ClassVar = {"headings": HEADINGS}
     max_size = 2**16
     doubles = frozenset({"primitive", "pose", "angle", "footprint", "resolution"})
 
@@ -51,7 +53,7 @@ class RobotNetwork(QNetwork):
             "primitive": (sizes["primitives"], len(COLUMNS)),
             "pose": (sizes["poses"], 3),
             "footprint": (sizes["corners"], 2),
-            "angle": (HEADINGS,),
+            "angle": (sizes["headings"],),
             "resolution": (1,),
         }
 
@@ -100,6 +102,7 @@ class RobotNetwork(QNetwork):
             "primitives": len(motions.poses),
             "poses": len(pose_N3),
             "corners": len(footprint),
+            "headings": motions.headings,
         }
         return cls(sizes, tensors)
 
@@ -200,7 +203,7 @@ def _motions_of(tensors: Mapping[str, NDArray[Any]]) -> Motions:
     """Return the motions in a network's tensors; a ValueError if they are damaged.
 
     These are the tensors `primitive` (P, 6), `pose` (N, 3) with the poses of all
-    primitives, `angle` (16,) and `resolution` (1,), see `Motions`. All columns of
+    primitives, `angle` (H,) and `resolution` (1,), see `Motions`. All columns of
     `primitive` except the cost should be whole numbers.
     """
     column = _Primitives(*tensors["primitive"].T)  # (P,) float64 each
@@ -212,8 +215,9 @@ def _motions_of(tensors: Mapping[str, NDArray[Any]]) -> Motions:
     pose_N3 = tensors["pose"]
     angles = tensors["angle"]
     is_damaged = (
-        not _are_headings(start)
-        or not _are_headings(end)
+        len(angles) not in HEADINGS_OF_LATTICES
+        or not _are_headings(start, len(angles))
+        or not _are_headings(end, len(angles))
         or not np.array_equal(column.start, start)
         or not np.array_equal(column.end, end)
         or not np.array_equal(np.column_stack([column.dx, column.dy]), offset)
@@ -241,9 +245,9 @@ def _motions_of(tensors: Mapping[str, NDArray[Any]]) -> Motions:
     )
 
 
-def _are_headings(numbers: NDArray[np.int64]) -> bool:
-    """Return whether all numbers are headings, 0 to 15."""
-    return bool(((numbers >= 0) & (numbers < HEADINGS)).all())
+def _are_headings(numbers: NDArray[np.int64], headings: int) -> bool:
+    """Return whether all numbers are some of so many headings."""
+    return bool(((numbers >= 0) & (numbers < headings)).all())
 
 
 def _check_ends(
@@ -261,13 +265,13 @@ def _check_ends(
     cell_P2 : (P, 2)
         The cell in whose centre the pose should lie.
     heading_P : (P,)
-        The heading that the pose should have, 0 to 15. Each of these should occur.
-    angles : (16,)
+        The number of the heading that the pose should have. All should occur.
+    angles : (H,)
         The yaw of each heading, radians.
     """
     cells_off = np.abs(pose_P3[:, :2] - cell_P2).max()
     radians_off = np.abs(turn_between(pose_P3[:, 2], angles[heading_P])).max()
-    has_all_headings = len(np.unique(heading_P)) == HEADINGS
+    has_all_headings = len(np.unique(heading_P)) == len(angles)
     if cells_off > 0.01 or radians_off > 0.01 or not has_all_headings:
         raise ValueError(
             "its primitives do not begin and end where they say; train it again"

@@ -13,10 +13,9 @@ from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.nodes.outcome import Outcome, Request
 from ddqn_planner.planning import Planner, PlanStatus
 from ddqn_planner.planning.pose_planner import PoseRequest
-from ddqn_planner.robot.motions import HEADINGS
 
 # Radians by which a body turns until that is a reason to plan.
-TURN_TO_PLAN = 2 * math.pi / HEADINGS
+TURN_TO_PLAN = math.pi / 8
 UNCHANGED = Outcome("UNCHANGED", "the active goal needs no new plan")
 
 

@@ -313,7 +313,7 @@ class Planner:
         start : (x, y, yaw)
             Metres and radians in the map frame. The path begins there, or, where the
             body has no room to drive on from there, in the middle of the start's cell,
-            with one of 16 headings: the nearest one, or else the next, where the body
+            with one of the headings: the nearest one, or else the next, where the body
             has room. A planner keeps its last path to each of the goals
             used last: if the start lies within half a cell and 11.25 degrees of that
             path, the plan is the rest of it.

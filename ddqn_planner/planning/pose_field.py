@@ -111,7 +111,7 @@ class PoseField(Field[Search]):
         """Return what is known before any growth: the goals cost 0 and are open."""
         world = self.world
         tiles = world.nearness.size  # it has an element for each tile
-        states = tiles << pose_space.TILE_BITS  # on the map
+        states = pose_space.first_in_tile(tiles, world)  # on the map
         search = Search(
             distance=_untouched(states, np.float32),  # 0 everywhere
             mark=_untouched(states, np.uint8),  # UNREACHED everywhere
@@ -122,7 +122,7 @@ class PoseField(Field[Search]):
         )
         goal_numbers = self._goal_numbers()
         search.mark[goal_numbers] = wavefront.OPEN
-        search.touched[goal_numbers >> pose_space.TILE_BITS] = True
+        search.touched[pose_space.tile_of(goal_numbers, world)] = True
         return search
 
     def _goal_numbers(self) -> NDArray[np.int64]:
@@ -135,7 +135,8 @@ class PoseField(Field[Search]):
     @property
     def nbytes(self) -> int:
         """Memory, bytes, if all states of the map are reached: most never are."""
-        return 5 * self.world.nearness.size << pose_space.TILE_BITS
+        states: int = pose_space.first_in_tile(self.world.nearness.size, self.world)
+        return 5 * states
 
     def reach(self, start: State, bound: float, limit: int) -> float | None:
         """Grow until the cost from a start is known within a bound, or to be none.
@@ -224,7 +225,7 @@ class PoseField(Field[Search]):
         The states that are known stay. A lower bound of the start's cost is computed.
         """
         tiles = np.flatnonzero(self.known.touched)  # that have a reached state
-        heap = make_heap((len(tiles) << pose_space.TILE_BITS) + HEAP)
+        heap = make_heap(pose_space.first_in_tile(len(tiles), self.world) + HEAP)
         search = self.known._replace(aim=aim, heap=heap)
         self._known = search
         self._lower_bound = pose_space.queue_open_states(search, tiles)
@@ -467,7 +468,8 @@ class PoseField(Field[Search]):
         cost_from_start = _cost_from_start(search)
         tiles = np.flatnonzero(search.touched)  # that have a reached state
         near_tiles = np.flatnonzero(self._is_near(changed).ravel() & search.touched)
-        most_opened = len(tiles) << pose_space.TILE_BITS  # states that a repair opens
+        # States that a repair opens.
+        most_opened = pose_space.first_in_tile(len(tiles), self.world)
         occupied = self.grid.uninflated
         has_free_cell = not occupied[changed[:, 1], changed[:, 0]].all()
         # An origin that may lie in occupied cells counts their costs, too.
@@ -523,7 +525,7 @@ def may_escape(start: State, world: World) -> bool:
     The world has an escape, see `world_with_escape`.
     """
     number = int(pose_space.number_of_state(*start, world))
-    states = world.nearness.size << pose_space.TILE_BITS  # on the map
+    states = pose_space.first_in_tile(world.nearness.size, world)  # on the map
     mark = _untouched(states, np.uint8)
     queue = np.empty(UNGUIDED, np.int64)
     return bool(pose_space.leads_to_room(number, mark, queue, world))

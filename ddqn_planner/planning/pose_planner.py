@@ -37,7 +37,7 @@ from ddqn_planner.planning.pose_world import (
     world_of,
     world_with_escape,
 )
-from ddqn_planner.robot.motions import HEADINGS, turn_between
+from ddqn_planner.robot.motions import turn_between
 
 if TYPE_CHECKING:
     from ddqn_planner.model.robot_network import RobotNetwork
@@ -48,12 +48,10 @@ VISITS = 2**16  # states that a field visits in one step of a plan: some 30 ms
 MOST_STEPS_OF_REASON, BOUND_OF_REASON = 16, 10.0
 # Cells and radians: no yaw is farther from the two headings nearest to it.
 SAME_END = 1.0, 0.5
-# So near to its path, a robot keeps it even if there is none from the state nearest to
-# its pose: a controller has driven it a little aside, where the body of that state has
-# no room.
-BESIDE_PATH = 1.0, 2 * math.pi / HEADINGS
-# A start so near to a pose of a path, in cells and radians, lies on that path.
-ON_PATH = 0.5, math.pi / HEADINGS
+# So near to its path, in cells and radians, a robot keeps it even if there is none from
+# the state nearest to its pose: a controller has driven it a little aside, where the
+# body of that state has no room.
+BESIDE_PATH = 1.0, math.pi / 8
 
 
 class _Start(NamedTuple):
@@ -74,6 +72,8 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         self.footprint = network.footprint
         self.body = body_of(network.motions, network.swept())
         self.points = paths.points_of(self.footprint, self.motions.resolution)
+        # A start so near to a pose of a path, in cells and radians, lies on that path.
+        self._on_path = 0.5, math.pi / self.motions.headings
         self._finish = Finish(self.motions, self.footprint, self.points)
         # A request compares the same two maps for its path, its world and its field.
         self._differences = lru_cache(maxsize=1)(differences)
@@ -477,7 +477,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
     def _nearest_states(self, grid: GridMap, pose: Pose) -> list[State]:
         """Return the states of a pose's cell in the two headings nearest to its yaw."""
         x, y, yaw = pose
-        turn = np.abs(turn_between(self.motions.angles, yaw - grid.origin[2]))  # (16,)
+        turn = np.abs(turn_between(self.motions.angles, yaw - grid.origin[2]))  # (H,)
         nearest_headings: list[int] = np.argsort(turn, kind="stable")[:2].tolist()
         column, row = grid.world_to_cell(x, y)
         return [(column, row, heading) for heading in nearest_headings]
@@ -551,10 +551,10 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         goal_column, goal_row = grid.world_to_cell(x, y)
         radius = metres * ROUNDING / grid.resolution  # cells
         # In which headings a path may end: within the tolerance, or the nearest one.
-        turn = np.abs(turn_between(self.motions.angles, yaw - grid.origin[2]))  # (16,)
+        turn = np.abs(turn_between(self.motions.angles, yaw - grid.origin[2]))  # (H,)
         if request.either_direction:
             turn = np.minimum(turn, math.pi - turn)
-        may_end = turn <= max(radians, turn.min()) * ROUNDING  # (16,)
+        may_end = turn <= max(radians, turn.min()) * ROUNDING  # (H,)
         start_column, start_row, start_heading = start
         start_distance = math.hypot(start_column - goal_column, start_row - goal_row)
         if may_end[start_heading] and start_distance <= radius:
@@ -569,9 +569,9 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         distance = np.hypot(columns, rows[:, None])  # (R, C): from the goal, in cells
         # A path ends as soon as it may: in a ring, within the radius and beyond a
         # distance that depends on the heading.
-        least_distance = self._least_distance_of_ends(may_end, radius)  # (16,)
+        least_distance = self._least_distance_of_ends(may_end, radius)  # (H,)
         is_end = (least_distance[:, None, None] < distance) & (distance <= radius)
-        heading, row, column = np.nonzero(is_end)  # of (16, R, C)
+        heading, row, column = np.nonzero(is_end)  # of (H, R, C)
         states = np.column_stack(
             [goal_column + columns[column], goal_row + rows[row], heading]
         )
@@ -581,7 +581,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
     def _least_distance_of_ends(
         self, may_end: NDArray[np.bool_], radius: float
     ) -> NDArray[np.float64]:
-        """Return beyond which distance from a goal paths end, by heading: (16,), cells.
+        """Return beyond which distance from a goal paths end, by heading: (H,), cells.
 
         A path may end within a radius of the goal, in some headings, and ends as soon
         as it may. If all primitives that lead to a heading begin in headings in which a
@@ -590,7 +590,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
 
         Parameters
         ----------
-        may_end : (16,) bool
+        may_end : (H,) bool
             In which headings a path may end.
         radius : float
             Cells from the goal.
@@ -625,7 +625,9 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
             if changed is None or len(changed):
                 continue
             # The number of the pose at the start; -1 if no pose is near.
-            first = paths.nearest_pose(path.poses, request.start, request.grid, ON_PATH)
+            first = paths.nearest_pose(
+                path.poses, request.start, request.grid, self._on_path
+            )
             # Nor does a path out of obstacles count: which obstacles a robot may leave
             # depends on its start.
             if first < path.escape:

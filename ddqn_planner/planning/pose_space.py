@@ -33,13 +33,11 @@ from ddqn_planner.planning.queues import (
     push_to_heap,
 )
 from ddqn_planner.planning.wavefront import OPEN, UNREACHED, WAITING, spread
-from ddqn_planner.robot.motions import HEADINGS
 
-# A state is a cell and one of 16 headings. Its number counts headings, then the cells
-# of a tile of 4 x 4, then tiles: so what a request visits lies on few pages of memory,
-# 4 bytes a distance.
-HEADING_BITS: Final = 4
-TILE_BITS: Final = HEADING_BITS + 2 * SHIFT
+# A state is a cell and a heading. Its number counts headings, then the cells of a tile
+# of 4 x 4, then tiles: so what a request visits lies on few pages of memory, 4 bytes a
+# distance.
+CELL_BITS: Final = 2 * SHIFT  # that number a cell in its tile
 OUTSIDE: Final = -1  # the number of a state outside the map
 NO_PRIMITIVE: Final = -1
 
@@ -79,28 +77,46 @@ class Search(NamedTuple):
 
 @inlined
 def number_of_state(x: Any, y: Any, heading: Any, world: Any) -> Any:
-    """Return the number of the state at cell (x, y) with a heading, 0 to 15.
+    """Return the number of the state at cell (x, y) with a heading.
 
     Its highest bits number the tile of 4 x 4 cells, row by row; then come 4 bits for
-    the cell in the tile, row by row, and 4 for the heading.
+    the cell in the tile, row by row, and those for the heading.
     """
+    heading_bits = world.body.heading_bits
     tile_columns = world.nearness.shape[1]
     tile = (y >> SHIFT) * tile_columns + (x >> SHIFT)
     cell_in_tile = (y & (TILE - 1)) << SHIFT | (x & (TILE - 1))
-    return tile << TILE_BITS | cell_in_tile << HEADING_BITS | heading
+    cell = tile << CELL_BITS | cell_in_tile
+    return cell << heading_bits | heading
 
 
 @inlined
 def state_of(number: int, world: Any) -> State:
     """Return x, y and heading of the state of a number, see `number_of_state`."""
     tile_columns = world.nearness.shape[1]
-    tile = number >> TILE_BITS
+    heading_bits = world.body.heading_bits
+    tile = tile_of(number, world)
+    cell = number >> heading_bits  # its lowest bits are x and y in the tile
     tile_row = tile // tile_columns
     tile_column = tile - tile_row * tile_columns
-    cell = number >> HEADING_BITS  # its lowest bits are x and y in the tile
     x = tile_column << SHIFT | (cell & (TILE - 1))
     y = tile_row << SHIFT | (cell >> SHIFT & (TILE - 1))
-    return x, y, number & (HEADINGS - 1)
+    return x, y, number - (cell << heading_bits)
+
+
+@inlined
+def first_in_tile(tile: Any, world: Any) -> Any:
+    """Return the number of the first state in a tile: less than those in later tiles.
+
+    For T tiles, `first_in_tile(T)` states have numbers.
+    """
+    return tile << CELL_BITS + world.body.heading_bits
+
+
+@inlined
+def tile_of(number: Any, world: Any) -> Any:
+    """Return the number of the tile in which the state of a number lies."""
+    return number >> CELL_BITS + world.body.heading_bits
 
 
 @inlined
@@ -199,8 +215,8 @@ def queue_open_states(search: Search, tiles: NDArray[np.int64]) -> float:
     aim = search.aim
     lower_bound = np.inf
     for tile in tiles:
-        # The numbers of the states in the tile.
-        for number in range(tile << TILE_BITS, (tile + 1) << TILE_BITS):
+        first = first_in_tile(tile, search.world)
+        for number in range(first, first_in_tile(tile + 1, search.world)):
             if OPEN <= search.mark[number] <= WAITING:
                 search.mark[number] = OPEN
                 x, y, _ = state_of(number, search.world)
@@ -261,7 +277,7 @@ def _expand_pose(number: int, distance: Any, mark: Any, heap: Any, search: Any) 
             mark[previous] = WAITING
             continue
         mark[previous] = OPEN
-        search.touched[previous >> TILE_BITS] = True
+        search.touched[tile_of(previous, world)] = True
         key = cost + aim.weight * remaining_cost(begin_x, begin_y, aim)
         push_to_heap(key, previous, heap)
 
@@ -490,8 +506,8 @@ def least_unsupported(search: Search, tiles: NDArray[np.int64]) -> Any:
     """
     least_cost = np.float32(np.inf)
     for tile in tiles:
-        # The numbers of the states in the tile.
-        for number in range(tile << TILE_BITS, (tile + 1) << TILE_BITS):
+        first = first_in_tile(tile, search.world)
+        for number in range(first, first_in_tile(tile + 1, search.world)):
             if search.mark[number] == UNREACHED:
                 continue
             cost = search.distance[number]
@@ -521,7 +537,8 @@ def take_back(search: Search, tiles: NDArray[np.int64], limit: Any) -> None:
     for cost in world.body.cost:
         greatest_cost = max(greatest_cost, limit + cost)
     for tile in tiles:
-        for number in range(tile << TILE_BITS, (tile + 1) << TILE_BITS):
+        first = first_in_tile(tile, world)
+        for number in range(first, first_in_tile(tile + 1, world)):
             if mark[number] == UNREACHED or distance[number] < limit:
                 continue
             mark[number] = UNREACHED
@@ -564,7 +581,7 @@ def may_pass(x: int, y: int, world: Any) -> bool:
     if not has_room(x, y, body.common_core_mask, world):
         return False
     # The masks of heading h have the numbers of those of heading 0, plus h.
-    for heading in range(HEADINGS):
+    for heading in range(body.angle.size):
         if has_room(x, y, body.standing_mask + heading, world):
             return True
         if not has_room(x, y, body.core_mask + heading, world):

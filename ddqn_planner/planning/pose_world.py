@@ -13,7 +13,7 @@ from ddqn_planner.grid.boxes import Box
 from ddqn_planner.grid.layers import Layers, forbids, has_costs, multiplier_at
 from ddqn_planner.grid.map_changes import changed_cells
 from ddqn_planner.grid.moves import ACTION_OF_STEP, STAND
-from ddqn_planner.robot.motions import HEADINGS, Motions, dense_poses
+from ddqn_planner.robot.motions import Motions, dense_poses
 
 SHIFT: Final = 2  # so many bits tell where in its tile a cell lies, along a side
 TILE: Final = 1 << SHIFT  # cells along a side of a tile
@@ -42,9 +42,9 @@ class Body(NamedTuple):
 
     # The primitives that end in heading h are by_end[first_ending[h]] and on, to before
     # first_ending[h + 1]; those that start in h are first_starting[h] and on.
-    first_ending: NDArray[np.int64]  # (17,)
+    first_ending: NDArray[np.int64]  # (H + 1,), for H headings
     by_end: NDArray[np.int64]  # (P,): primitives, by the heading in which they end
-    first_starting: NDArray[np.int64]  # (17,)
+    first_starting: NDArray[np.int64]  # (H + 1,)
     start: NDArray[np.int64]  # (P,): the heading in which each primitive starts
     end: NDArray[np.int64]  # (P,): the heading in which it ends
     offset: NDArray[np.int64]  # (P, 2): x and y from its first to its last cell
@@ -67,7 +67,8 @@ class Body(NamedTuple):
     # (N, 4): all poses but the first of each primitive, and their shares of its cost.
     pose: NDArray[np.float64]
     first_pose: NDArray[np.int64]  # (P + 1,): where the poses of each primitive begin
-    angle: NDArray[np.float64]  # (16,): the yaw of each heading, radians
+    angle: NDArray[np.float64]  # (H,): the yaw of each heading, radians
+    heading_bits: int  # that number a heading
     # (P, 2): the least and the greatest x and y of the cells that the origin passes,
     # from its first cell.
     lowest_passed: NDArray[np.int64]
@@ -119,8 +120,8 @@ class Rows(NamedTuple):
 class Masks(NamedTuple):
     """Cells around a body, S x S with the body's cell in the middle."""
 
-    standing: NDArray[np.bool_]  # (16, S, S): where the body stands, by heading
-    core: NDArray[np.bool_]  # (16, S, S): see `Body.core_mask`
+    standing: NDArray[np.bool_]  # (H, S, S): where the body stands, by heading
+    core: NDArray[np.bool_]  # (H, S, S): see `Body.core_mask`
     swept: NDArray[np.bool_]  # (S, S): by any primitive around any cell that it passes
 
 
@@ -164,12 +165,13 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
         for poses in motions.poses
     ]
     primitives = len(motions.start)
-    headings = np.arange(HEADINGS + 1)
+    headings = motions.headings
+    first_of = np.arange(headings + 1)
     by_end = np.argsort(motions.end, kind="stable")
     return Body(
-        first_ending=np.searchsorted(motions.end[by_end], headings),
+        first_ending=np.searchsorted(motions.end[by_end], first_of),
         by_end=by_end,
-        first_starting=np.searchsorted(motions.start, headings),
+        first_starting=np.searchsorted(motions.start, first_of),
         start=motions.start,
         end=motions.end,
         offset=motions.offset,
@@ -178,15 +180,16 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
         row_bits=np.concatenate([part.bits for part in rows]),
         first_row=np.cumsum([0, *row_counts]),
         standing_mask=primitives,
-        core_mask=primitives + HEADINGS,
-        common_core_mask=primitives + 2 * HEADINGS,
-        reach_mask=primitives + 2 * HEADINGS + 1,
+        core_mask=primitives + headings,
+        common_core_mask=primitives + 2 * headings,
+        reach_mask=primitives + 2 * headings + 1,
         passed_cells=np.concatenate(passed_rows),
         passed_shares=shares.astype(np.float32),
         first_passed=np.cumsum([0, *map(len, passed_rows)]),
         pose=np.concatenate(pose_rows),
         first_pose=np.cumsum([0, *map(len, pose_rows)]),
         angle=motions.angles,
+        heading_bits=(headings - 1).bit_length(),
         lowest_passed=lowest,
         highest_passed=highest,
         reach=reach,
@@ -223,8 +226,8 @@ def _masks_of(
     """
     shape = swept.shape[1:]
     # All cells are set at first. Each primitive takes away what it does not sweep.
-    standing = np.ones((HEADINGS, *shape), dtype=np.bool_)
-    core = np.ones((HEADINGS, *shape), dtype=np.bool_)
+    standing = np.ones((motions.headings, *shape), dtype=np.bool_)
+    core = np.ones((motions.headings, *shape), dtype=np.bool_)
     swept_by_any = np.zeros(shape, dtype=np.bool_)
     for primitive, mask in enumerate(swept):
         start = motions.start[primitive]

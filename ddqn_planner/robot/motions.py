@@ -15,25 +15,29 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ddqn_planner.files import as_path, read_file
-from ddqn_planner.grid.arguments import Choice, as_number, as_whole, numbers
+from ddqn_planner.grid.arguments import Choice, as_number, as_whole, numbers, shortened
 
 Float64 = NDArray[np.float64]
 Poses = NDArray[np.float64]  # (N, 3): x and y in cells, yaw in radians
 
 # As in Nav2's lattices (Pivtoraiko and Kelly 2005), a robot that drives straight ahead
-# passes through the centres of cells: the headings are not evenly spaced.
-QUARTER: Final = np.array([(1, 0), (2, 1), (1, 1), (1, 2)])
-TURNED_QUARTER: Final = QUARTER[:, ::-1] * (-1, 1)
-# (16, 2): the cells (dx, dy) from one centre to the next along each heading.
-DIRECTIONS: Final = np.concatenate([QUARTER, TURNED_QUARTER, -QUARTER, -TURNED_QUARTER])
-HEADINGS: Final = len(DIRECTIONS)
-
-# The headings of straight primitives, from the robot's own one.
-AHEAD: Final = 0
-SIDEWAYS: Final = (4, 12)
-DIAGONALLY: Final = (2, 14)
+# passes through the centres of cells: the headings are not evenly spaced. For each
+# number of headings, these are the cells (dx, dy) from one centre to the next along the
+# headings of the first octant. The 64 are at most 6.4 degrees apart.
+OCTANTS: Final = {
+    16: ((1, 0), (2, 1)),
+    32: ((1, 0), (4, 1), (2, 1), (4, 3)),
+    64: ((1, 0), (9, 1), (9, 2), (3, 1), (9, 4), (7, 4), (3, 2), (5, 4)),
+}
+HEADINGS: Final = 16  # unless another number is chosen
+HEADINGS_OF_LATTICES: Final = range(16, 65, 8)
+# Bends lead to the next heading on each side, and to the one that is farthest within
+# this turn, in radians. It is the largest between two of 16 headings: so many headings
+# allow turns as tight as few.
+MAX_BEND: Final = math.atan2(1, 2) + 1e-9
 
 STRIDE = 0.4  # metres of a long step straight ahead
+LONG_STEP: Final = 6.0  # cells: a short step that is longer needs no long one
 BEHIND = 2.0  # cost of a metre that is not driven ahead; Nav2's reverse_penalty
 TURN = 0.5  # metres driven ahead that cost as much as a turn by one radian
 # Between two poses of a primitive, at most.
@@ -70,12 +74,17 @@ class Motions:
     """P motion primitives: from a heading, over some cells, to a heading."""
 
     resolution: float  # metres per cell
-    angles: Float64  # (16,) the yaw of each heading, radians
+    angles: Float64  # (H,) the yaw of each heading, radians
     start: NDArray[np.int64]  # (P,) the first heading
     end: NDArray[np.int64]  # (P,) the last heading
     offset: NDArray[np.int64]  # (P, 2) cells, x and y
     cost: NDArray[np.float32]  # (P,) as that of so many cells driven ahead
     poses: tuple[Poses, ...]  # P times (N, 3), from the cell where the primitive begins
+
+    @property
+    def headings(self) -> int:
+        """The number H of headings."""
+        return len(self.angles)
 
 
 class Primitive(NamedTuple):
@@ -107,14 +116,30 @@ def turn_between(start_yaw: ArrayLike, end_yaw: ArrayLike) -> Float64:
 # Primitives that are made
 
 
+def directions_of(headings: int) -> NDArray[np.int64]:
+    """Return the cells (dx, dy) from one centre to the next along each heading: (H, 2).
+
+    `headings` is one of the numbers in `OCTANTS`.
+    """
+    octant = np.array(OCTANTS[headings])
+    # The next octant begins with the diagonal and mirrors all but the first heading.
+    next_octant = np.vstack([[(1, 1)], octant[:0:-1, ::-1]])
+    quarter = np.concatenate([octant, next_octant])
+    turned_quarter = quarter[:, ::-1] * (-1, 1)
+    return np.concatenate([quarter, turned_quarter, -quarter, -turned_quarter])
+
+
 def make_motions(
-    motion: Motion | str, turning_radius: float, resolution: float
+    motion: Motion | str,
+    turning_radius: float,
+    resolution: float,
+    headings: int = HEADINGS,
 ) -> Motions:
     """Make the primitives of a robot.
 
-    Every robot drives straight ahead and behind, and in bends to the next heading on
-    each side. All robots except cars also turn on the spot. An omnidirectional robot
-    also drives straight sideways and diagonally.
+    Every robot drives straight ahead and behind, and in bends to headings on each side.
+    All robots except cars also turn on the spot. An omnidirectional robot also drives
+    straight sideways and diagonally.
 
     Parameters
     ----------
@@ -124,6 +149,8 @@ def make_motions(
         Metres: at most the length of 100 cells, and for a car at least that of one.
     resolution : float
         Metres per cell.
+    headings : int
+        16, 32 or 64.
 
     Raises
     ------
@@ -131,22 +158,46 @@ def make_motions(
         If there is no such motion, or a number is out of its range.
     """
     motion = Motion(motion)
+    if headings not in OCTANTS:
+        choice = ", ".join(map(str, OCTANTS))
+        raise ValueError(f"headings is {shortened(headings)}; give one of {choice}")
     cell_size = _cell_size("the resolution", resolution)
     radius = _radius_in_cells(motion, turning_radius, cell_size)
-    angles = np.arctan2(DIRECTIONS[:, 1], DIRECTIONS[:, 0]) % (2 * math.pi)
-    relative_headings: tuple[int, ...] = (AHEAD,)
-    if motion is Motion.OMNIDIRECTIONAL:
-        relative_headings = (AHEAD, *SIDEWAYS, *DIAGONALLY)
+    directions = directions_of(headings)
+    angles = np.arctan2(directions[:, 1], directions[:, 0]) % (2 * math.pi)
     primitives: list[Primitive] = []
-    for heading in range(HEADINGS):
-        for relative_heading in relative_headings:
-            primitives += _straight(heading, relative_heading, angles, cell_size)
-        for end in ((heading - 1) % HEADINGS, (heading + 1) % HEADINGS):
+    for heading in range(headings):
+        yaw = float(angles[heading])
+        step = directions[heading]
+        for ahead in _straight(heading, step, yaw, cell_size):
+            primitives += [ahead, _driven_behind(ahead)]
+        if motion is Motion.OMNIDIRECTIONAL:
+            primitives += _aside(heading, directions, yaw, cell_size)
+        for end in _ends_of_bends(heading, angles):
             bend = _driven_ahead(heading, end, _bend(heading, end, angles, radius))
             primitives += [bend, _driven_behind(bend)]
-            if motion is not Motion.ACKERMANN:
+        if motion is not Motion.ACKERMANN:
+            for end in _neighbours(heading, headings):
                 primitives.append(_turn_on_the_spot(heading, end, angles, cell_size))
     return _motions(cell_size, angles, primitives)
+
+
+def _neighbours(heading: int, headings: int) -> tuple[int, int]:
+    """Return the next headings to the right and to the left of a heading."""
+    return (heading - 1) % headings, (heading + 1) % headings
+
+
+def _ends_of_bends(heading: int, angles: Float64) -> list[int]:
+    """Return the headings to which bends lead: the next and the farthest on each side.
+
+    `angles` (H,) has the yaw of each heading, radians.
+    """
+    turn = turn_between(angles[heading], angles)  # (H,)
+    may_bend = np.abs(turn) <= MAX_BEND
+    farthest_left = int(np.where(may_bend, turn, 0).argmax())
+    farthest_right = int(np.where(may_bend, turn, 0).argmin())
+    next_headings = _neighbours(heading, len(angles))
+    return sorted({farthest_right, *next_headings, farthest_left})
 
 
 def _cell_size(name: str, metres: Any) -> float:
@@ -181,45 +232,61 @@ def _radius_in_cells(motion: Motion, turning_radius: float, cell_size: float) ->
 
 
 def _straight(
-    heading: int, relative_heading: int, angles: Float64, cell_size: float
+    heading: int, step: NDArray[np.int64], yaw: float, cell_size: float
 ) -> list[Primitive]:
-    """Return a short and a long straight step in one direction, with a fixed heading.
-
-    Each step ahead comes with the same step behind. Of diagonal steps there is only the
-    short one.
+    """Return a short and a long straight drive with a fixed heading, or a short one.
 
     Parameters
     ----------
     heading : int
-        The robot's heading, 0 to 15.
-    relative_heading : int
-        The direction of the steps: by how many headings it lies to the left of ahead.
-    angles : (16,) float64
-        The yaw of each heading, radians.
+        The robot's heading, whose yaw is `yaw`, in radians.
+    step : (2,) int64
+        The short drive: cells from a centre to the next one in its direction.
+    yaw : float
+        Radians.
     cell_size : float
         Metres per cell.
     """
-    # (2,): cells from a centre to the next one in this direction.
-    step = DIRECTIONS[(heading + relative_heading) % HEADINGS]
-    counts = [1]  # how many times the step is taken
-    if relative_heading not in DIAGONALLY:
-        stride = round(STRIDE / cell_size / math.hypot(*step))
-        counts.append(max(stride, 2))
-    primitives = []
-    for count in counts:
-        poses = _line(np.zeros(2), step * count, float(angles[heading]))
-        primitive = _driven_ahead(heading, heading, poses)
-        if relative_heading == AHEAD:
-            primitives += [primitive, _driven_behind(primitive)]
-        else:
-            primitives.append(primitive._replace(cost=BEHIND * primitive.cost))
-    return primitives
+    length = math.hypot(*step)  # cells
+    counts = [1]
+    if length < LONG_STEP:
+        counts.append(max(round(STRIDE / cell_size / length), 2))
+    lines = [_line(np.zeros(2), step * count, yaw) for count in counts]
+    return [_driven_ahead(heading, heading, poses) for poses in lines]
+
+
+def _aside(
+    heading: int, directions: NDArray[np.int64], yaw: float, cell_size: float
+) -> list[Primitive]:
+    """Return straight drives sideways, and short ones diagonally ahead.
+
+    Parameters
+    ----------
+    heading : int
+        The robot's heading, whose yaw is `yaw`, in radians.
+    directions : (H, 2) int64
+        Cells from one centre to the next along each heading.
+    yaw : float
+        Radians.
+    cell_size : float
+        Metres per cell.
+    """
+    headings = len(directions)
+    quarter = headings // 4
+    drives: list[Primitive] = []
+    for direction in (heading + quarter, heading - quarter):
+        step = directions[direction % headings]
+        drives += _straight(heading, step, yaw, cell_size)
+    for direction in (heading + quarter // 2, heading - quarter // 2):
+        step = directions[direction % headings]
+        drives += _straight(heading, step, yaw, cell_size)[:1]
+    return [drive._replace(cost=BEHIND * drive.cost) for drive in drives]
 
 
 def _driven_ahead(start: int, end: int, poses: Poses) -> Primitive:
     """Return the primitive along poses (N, 3); its cost is its length in cells.
 
-    `start` and `end` are the headings, 0 to 15, of the first and the last pose.
+    `start` and `end` are the headings of the first and the last pose.
     """
     return Primitive(start, end, poses, cost=driven_length(poses))
 
@@ -240,7 +307,7 @@ def _turn_on_the_spot(
 ) -> Primitive:
     """Return the primitive that turns from one heading to another in the origin.
 
-    `start` and `end` are headings, 0 to 15; `angles` (16,) has the yaw of each heading
+    `start` and `end` are headings; `angles` (H,) has the yaw of each heading
     in radians; `cell_size` is in metres.
     """
     turn = float(turn_between(angles[start], angles[end]))
@@ -263,7 +330,7 @@ def _line(start: NDArray[Any], end: NDArray[Any], yaw: float) -> Poses:
 
 
 def _bend(start: int, end: int, angles: Float64, radius: float) -> Poses:
-    """Return the shortest bend to a neighbouring heading that ends in a cell's centre.
+    """Return the shortest bend to another heading that ends in a cell's centre.
 
     Two straight sides meet in a corner: from the origin ahead, and from the corner to
     the end in the last heading. The bend cuts the corner by an arc, which begins as far
@@ -272,8 +339,8 @@ def _bend(start: int, end: int, angles: Float64, radius: float) -> Poses:
     Parameters
     ----------
     start, end : int
-        The first and the last heading, 0 to 15.
-    angles : (16,) float64
+        The first and the last heading.
+    angles : (H,) float64
         The yaw of each heading, radians.
     radius : float
         The least radius of the arc, in cells; one below 1 cell counts as 1.
@@ -364,7 +431,7 @@ def _motions(
 ) -> Motions:
     """Return primitives as arrays, sorted by their first and then their last headings.
 
-    `cell_size` is in metres; `angles` (16,) has the yaw of each heading, radians.
+    `cell_size` is in metres; `angles` (H,) has the yaw of each heading, radians.
     """
     in_order = sorted(
         primitives, key=lambda primitive: (primitive.start, primitive.end)
@@ -453,8 +520,8 @@ def _motions_in(lattice: object, allow_reverse: bool) -> Motions:
     cell_size = _cell_size(
         "grid_resolution", _field(metadata, "grid_resolution", "lattice_metadata")
     )
-    _check_number_of_headings(metadata)
     angles = _angles(_field(metadata, "heading_angles", "lattice_metadata"))
+    _check_number_of_headings(metadata, len(angles))
     objects: object = _field(lattice, "primitives", "it")
     if not isinstance(objects, list) or not objects:
         raise ValueError(
@@ -467,8 +534,8 @@ def _motions_in(lattice: object, allow_reverse: bool) -> Motions:
     if allow_reverse:
         primitives += _reversed(primitives)
     motions = _motions(cell_size, angles, primitives)
-    _check_headings(motions.start, "starts")
-    _check_headings(motions.end, "ends")
+    _check_headings(motions.start, len(angles), "starts")
+    _check_headings(motions.end, len(angles), "ends")
     return motions
 
 
@@ -489,34 +556,38 @@ def _ends_of(primitive: Primitive) -> tuple[int, int, int, int]:
     return primitive.start, primitive.end, x, y
 
 
-def _check_number_of_headings(metadata: object) -> None:
-    """Raise a ValueError for another number of headings; a lattice may not say it."""
+def _check_number_of_headings(metadata: object, count: int) -> None:
+    """Raise a ValueError unless a lattice has the number of headings that it says.
+
+    A lattice may not say a number; `count` are those that it has.
+    """
     field = "num_of_headings"
     if isinstance(metadata, dict) and field in metadata:
-        as_number(field, metadata[field], HEADINGS, HEADINGS, f"{HEADINGS}")
+        as_number(field, metadata[field], count, count, f"{count}")
 
 
-def _check_headings(headings: NDArray[np.int64], verb: str) -> None:
-    """Raise a ValueError unless each heading, 0 to 15, is among those of primitives.
+def _check_headings(headings: NDArray[np.int64], count: int, verb: str) -> None:
+    """Raise a ValueError unless each of `count` headings is among those of primitives.
 
     `headings` (P,) are those with which P primitives start or end, as `verb` says:
     "starts" or "ends".
     """
-    missing = sorted(set(range(HEADINGS)) - set(headings.tolist()))
+    missing = sorted(set(range(count)) - set(headings.tolist()))
     if missing:
-        remedy = f"give primitives that start and end with each of the {HEADINGS}"
+        remedy = f"give primitives that start and end with each of the {count}"
         raise ValueError(f"no primitive {verb} with the headings {missing}; {remedy}")
 
 
 def _angles(values: Any) -> Float64:
-    """Return the yaws of a lattice's headings, (16,) radians; a ValueError for others.
+    """Return the yaws of a lattice's headings, (H,) radians; a ValueError for others.
 
     `values` are those in the lattice's JSON.
     """
     name = "heading_angles"
     angles = numbers(name, values)
-    if angles.shape != (HEADINGS,):
-        raise ValueError(f"it has {angles.size} headings; give {HEADINGS}")
+    if angles.ndim != 1 or len(angles) not in HEADINGS_OF_LATTICES:
+        choice = ", ".join(map(str, HEADINGS_OF_LATTICES))
+        raise ValueError(f"it has {angles.size} headings; give one of {choice}")
     limits = (-MAX_YAW, MAX_YAW)
     numbers(name, angles, between=limits, whole=False, remedy="finite radians")
     return angles.astype(np.float64)
@@ -535,11 +606,11 @@ def _primitive(
         The value in the list of primitives, which should be a dict.
     cell_size : float
         Metres per cell.
-    angles : (16,) float64
+    angles : (H,) float64
         The yaw of each heading, radians.
     """
-    start = _heading("start_angle_index", name, primitive)
-    end = _heading("end_angle_index", name, primitive)
+    start = _heading("start_angle_index", name, primitive, len(angles))
+    end = _heading("end_angle_index", name, primitive, len(angles))
     length = as_number(
         f"trajectory_length of {name}",
         _field(primitive, "trajectory_length", name),
@@ -567,10 +638,10 @@ def _primitive(
     return Primitive(start, end, dense_poses(poses, SPACING, SPACING / ANGLE), cost)
 
 
-def _heading(field: str, name: str, primitive: object) -> int:
-    """Return a field of a lattice's primitive that is a heading, 0 to 15."""
+def _heading(field: str, name: str, primitive: object, headings: int) -> int:
+    """Return a field of a lattice's primitive that is one of `headings` headings."""
     value = _field(primitive, field, name)
-    return as_whole(f"{field} of {name}", value, 0, HEADINGS - 1)
+    return as_whole(f"{field} of {name}", value, 0, headings - 1)
 
 
 def _from_heading_to_heading(poses: Poses, start_yaw: float, end_yaw: float) -> Poses:

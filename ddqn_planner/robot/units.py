@@ -7,11 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.robot.motions import HEADINGS, Motions, turn_between
+from ddqn_planner.robot.motions import Motions, turn_between
 
 Poses = NDArray[np.float64]  # (N, 3): x and y in cells, yaw in radians
 
-HEADINGS_PER_QUARTER = HEADINGS // 4
 # Cells or radians: two primitives differ by more; a lattice is written less exactly.
 SAME = 1e-6
 
@@ -28,9 +27,9 @@ def units_of(motions: Motions) -> Units:
     """Return the units of primitives: quarter turns of each other share a unit.
 
     The poses of a unit are those of its first primitive, turned back by quarter turns
-    until its first heading lies in the first quarter, 0 to 3.
+    until its first heading lies in the first quarter.
     """
-    turns = motions.start // HEADINGS_PER_QUARTER  # (P,): quarter turns, 0 to 3
+    turns = motions.start // (motions.headings // 4)  # (P,): quarter turns, 0 to 3
     unit_of_primitive: list[int] = []
     poses_of_units: list[Poses] = []
     for quarter_turns, poses in zip(turns.tolist(), motions.poses, strict=True):

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -83,13 +83,9 @@ class RobotTrainer:
     def __init__(
         self,
         footprint: Footprint | None,
-        motion: str | None,
-        turning_radius: float,
-        resolution: float,
-        lattice: str | Path | None,
+        motions: Motions,
         seed: int,
         padding: float = 0.0,
-        allow_reverse: bool = False,
     ) -> None:
         """Make maps, tables and first weights.
 
@@ -97,19 +93,11 @@ class RobotTrainer:
         ----------
         footprint, padding
             The body, see `read_footprint`.
-        motion, turning_radius, resolution
-            The kind of motion, the radius of its tightest turns in metres, and the
-            metres per cell, see `make_motions`.
-        lattice
-            A file of motions that replaces the three; then `motion` must be None.
-        seed
+        motions : Motions
+            Those of the robot, see `read_motions`.
+        seed : int
             Of all random draws.
-        allow_reverse
-            Whether the robot can drive the lattice's motions in reverse, too.
         """
-        motions = _read_motions(
-            motion, turning_radius, resolution, lattice, allow_reverse
-        )
         self.network = RobotNetwork.untrained(
             read_footprint(footprint, padding), motions
         )
@@ -125,6 +113,7 @@ class RobotTrainer:
         self._initial, self._exploration, self._sampling = generators
         side = self.network.swept_by_unit.shape[1]  # of a unit's view, cells
         self.width = side + FREE_BORDER  # of a square map, cells
+        self.headings = motions.headings
         self._draw_maps(map_generator)
         self._tabulate_moves(motions)
         self._list_starts()
@@ -153,7 +142,7 @@ class RobotTrainer:
         # The first of three cells is not used. Without it, a seed would draw others.
         drawn_M3 = [random.choice(cells, 3, replace=False) for _ in range(maps)]
         _, goal_cell_M, obstacle_M = np.transpose(drawn_M3)
-        self.goal_M = goal_cell_M * HEADINGS  # the pose with heading 0
+        self.goal_M = goal_cell_M * self.headings  # the pose with heading 0
         self.obstacle_y_M, self.obstacle_x_M = np.divmod(obstacle_M, self.width)
 
     def _tabulate_moves(self, motions: Motions) -> None:
@@ -164,23 +153,23 @@ class RobotTrainer:
         `next_KC` and `reward_KC`, by the action 0 to K - 1 and the pose.
         """
         primitives = [
-            np.flatnonzero(motions.start == heading) for heading in range(HEADINGS)
+            np.flatnonzero(motions.start == heading) for heading in range(self.headings)
         ]
         count = max(map(len, primitives))  # K
         # `resize` repeats the primitives of a heading that has fewer than K.
         self.primitive_KN = np.transpose(
             [np.resize(numbers, count) for numbers in primitives]
         )
-        # A pose is (y * width + x) * HEADINGS + heading.
-        pose_C = np.arange(self.width**2 * HEADINGS)
-        cell_C, heading_C = np.divmod(pose_C, HEADINGS)
+        # A pose is (y * width + x) * headings + heading.
+        pose_C = np.arange(self.width**2 * self.headings)
+        cell_C, heading_C = np.divmod(pose_C, self.headings)
         y_C, x_C = np.divmod(cell_C, self.width)
         primitive_KC = self.primitive_KN[:, heading_C]
         dx_KC, dy_KC = np.moveaxis(motions.offset[primitive_KC], 2, 0)  # cells
         next_x_KC = (x_C + dx_KC) % self.width  # the map repeats in all directions
         next_y_KC = (y_C + dy_KC) % self.width
         next_cell_KC = next_y_KC * self.width + next_x_KC
-        self.next_KC = next_cell_KC * HEADINGS + motions.end[primitive_KC]
+        self.next_KC = next_cell_KC * self.headings + motions.end[primitive_KC]
         self.reward_KC = -motions.cost[primitive_KC]
 
     def _list_starts(self) -> None:
@@ -189,7 +178,7 @@ class RobotTrainer:
         They are first the poses of map 0, then those of map 1, and so on. Each map has
         the same number of them.
         """
-        poses = self.width**2 * HEADINGS
+        poses = self.width**2 * self.headings
         is_start_MC = np.arange(poses) != self.goal_M[:, None]
         _, self._starts = np.nonzero(is_start_MC)
 
@@ -336,7 +325,7 @@ class RobotTrainer:
         Parameters
         ----------
         scenario, pose : (B,) int64
-            The number of each robot's map and of its pose, cell * HEADINGS + heading.
+            The number of each robot's map and of its pose, cell * N + heading.
 
         Returns
         -------
@@ -345,9 +334,9 @@ class RobotTrainer:
         (B,) int64
             The place in the robot's view where the map's obstacle lies: 0 to V - 1.
         """
-        cell, heading = np.divmod(pose, HEADINGS)
+        cell, heading = np.divmod(pose, self.headings)
         y, x = np.divmod(cell, self.width)
-        quarter = heading // (HEADINGS // 4)
+        quarter = heading // (self.headings // 4)
         # From the robot to the obstacle; the map repeats in all directions.
         rows = (self.obstacle_y_M[scenario] - y) % self.width
         columns = (self.obstacle_x_M[scenario] - x) % self.width
@@ -393,12 +382,24 @@ class RobotTrainer:
             self._q_SCK[number] = q_1CK[0]
 
 
-def train_robot(
+class MotionOptions(NamedTuple):
+    """What a robot's motions are made from: a kind of motion, or a lattice file."""
+
+    motion: str | None = None  # one of `Motion`; then there is no lattice
+    turning_radius: float = 0.0  # metres, of the tightest bends
+    resolution: float = 0.05  # metres per cell
+    headings: int = HEADINGS  # 16, 32 or 64
+    lattice: str | Path | None = None  # a file, in place of the four
+    allow_reverse: bool = False  # the lattice's motions also in reverse
+
+
+def train_robot(  # noqa: PLR0913
     footprint: Footprint,
     motion: str | None = None,
     *,
     turning_radius: float = 0.0,
     resolution: float = 0.05,
+    headings: int = HEADINGS,
     lattice: str | Path | None = None,
     padding: float = 0.0,
     seed: int = 0,
@@ -420,8 +421,11 @@ def train_robot(
         Of the tightest bends, in metres; ackermann needs it.
     resolution : float
         Metres per cell of the maps.
+    headings : int
+        How many: 16, 32 or 64. With more, the robot finds a way through narrower
+        passages that are askew to the map's cells, and plans with more memory.
     lattice : path, optional
-        A file of Nav2's lattice generator, in place of these three.
+        A file of Nav2's lattice generator, in place of these four.
     padding : float
         Metres by which the body counts as larger: room for a controller.
     seed : int
@@ -443,9 +447,10 @@ def train_robot(
     >>> planner.plan_poses(grid, start=(1, 1, 0), goal=(5, 3, 0)).status.name
     'SUCCEEDED'
     """
-    trainer = RobotTrainer(
-        footprint, motion, turning_radius, resolution, lattice, seed, padding
+    motions = read_motions(
+        MotionOptions(motion, turning_radius, resolution, headings, lattice)
     )
+    trainer = RobotTrainer(footprint, motions, seed, padding)
     *_, certificate = trainer.run(steps)
     if not certificate.proved:
         raise ValueError(
@@ -455,27 +460,21 @@ def train_robot(
     return Planner(trainer.network, trainer.metadata())
 
 
-def _read_motions(
-    motion: str | None,
-    turning_radius: float,
-    resolution: float,
-    lattice: str | Path | None,
-    allow_reverse: bool,
-) -> Motions:
-    """Return the primitives of a kind of motion, or of a lattice file.
-
-    Either `motion` or `lattice` is None. `turning_radius`, in metres, and `resolution`,
-    in metres per cell, are for a kind of motion; a lattice file has its own, and can be
-    driven in reverse with `allow_reverse`.
-    """
-    if allow_reverse and lattice is None:
+def read_motions(options: MotionOptions) -> Motions:
+    """Return the primitives of a kind of motion, or of a lattice file."""
+    if options.allow_reverse and options.lattice is None:
         problem = "allow_reverse is given without a lattice"
         raise ValueError(f"{problem}; leave it out: all other motions can reverse")
-    if motion is not None and lattice is None:
-        return make_motions(motion, turning_radius, resolution)
-    if lattice is not None and motion is None:
-        return read_lattice(lattice, allow_reverse)
-    is_neither = motion is None
+    if options.motion is not None and options.lattice is None:
+        return make_motions(
+            options.motion,
+            options.turning_radius,
+            options.resolution,
+            options.headings,
+        )
+    if options.lattice is not None and options.motion is None:
+        return read_lattice(options.lattice, options.allow_reverse)
+    is_neither = options.motion is None
     problem = (
         "neither motion nor lattice is" if is_neither else "motion and lattice are"
     )

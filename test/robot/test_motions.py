@@ -13,7 +13,13 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from ddqn_planner.robot.footprint import inside, read_footprint, swept_cells
-from ddqn_planner.robot.motions import Motion, make_motions, read_lattice, turn_between
+from ddqn_planner.robot.motions import (
+    OCTANTS,
+    Motion,
+    make_motions,
+    read_lattice,
+    turn_between,
+)
 
 ARROW = "[[0.4, 0], [-0.3, 0.3], [-0.1, 0], [-0.3, -0.3]]"
 FORMS = {
@@ -86,11 +92,21 @@ FORMS = {
 LONG = "[[0.7, 0.2], [-0.2, 0.2], [-0.2, -0.2], [0.7, -0.2]]"
 
 
-@given(motion=st.sampled_from(Motion), radius=st.floats(0.05, 1.5))
+@given(
+    motion=st.sampled_from(Motion),
+    radius=st.floats(0.05, 1.5),
+    headings=st.sampled_from([*OCTANTS]),
+)
 def test_primitives_lead_from_heading_to_heading_and_turn_no_sharper_than_allowed(
-    motion: Motion, radius: float
+    motion: Motion, radius: float, headings: int
 ) -> None:
-    motions = make_motions(motion, radius, 0.05)
+    motions = make_motions(motion, radius, 0.05, headings)
+    assert motions.headings == headings
+    quarter = motions.angles[: headings // 4]
+    assert (np.diff(motions.angles) > 0).all()
+    np.testing.assert_allclose(
+        motions.angles, np.add.outer(np.arange(4) * math.pi / 2, quarter).ravel()
+    )
     for start, end, offset, poses in zip(
         motions.start, motions.end, motions.offset, motions.poses, strict=True
     ):

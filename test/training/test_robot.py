@@ -10,15 +10,15 @@ import pytest
 
 from ddqn_planner.model import RobotNetwork, load_model, model_bytes
 from ddqn_planner.robot.footprint import swept_cells
-from ddqn_planner.training.robot import RobotTrainer, train_robot
-
-TINY: Any = (
-    "[[0.34, 0.09], [-0.09, 0.09], [-0.09, -0.09], [0.34, -0.09]]",
-    "ackermann",
-    0.6,
-    0.25,
-    None,
+from ddqn_planner.training.robot import (
+    MotionOptions,
+    RobotTrainer,
+    read_motions,
+    train_robot,
 )
+
+TINY = "[[0.34, 0.09], [-0.09, 0.09], [-0.09, -0.09], [0.34, -0.09]]"
+MOTION = MotionOptions("ackermann", turning_radius=0.6, resolution=0.25)
 FORK = (
     "[[0.56, 0.2], [0.56, 0.1], [0.4, 0.1], [0.4, -0.1], [0.56, -0.1], "
     "[0.56, -0.2], [0.3, -0.2], [0.3, 0.2], [0.56, 0.2]]"
@@ -28,20 +28,17 @@ FORK = (
 def test_the_command_trains_a_robot_that_is_proved(
     console: Any, tmp_path: Path
 ) -> None:
-    path, (footprint, motion, radius, resolution, _) = (
-        tmp_path / "tiny.safetensors",
-        TINY,
-    )
-    command = f"train-robot --motion {motion} --resolution {resolution}"
+    path = tmp_path / "tiny.safetensors"
+    command = "train-robot --motion ackermann --resolution 0.25"
     given = (
         "--turning-radius",
-        radius,
+        0.6,
         "--padding",
         0.02,
         "--out",
         path,
         "--footprint",
-        footprint,
+        TINY,
     )
     assert re.search(
         "steps|seed", console(command, *given, "--steps", 20_000, status=1).err
@@ -69,17 +66,15 @@ def test_a_concave_body_ahead_of_its_origin_is_learned() -> None:
 
 
 def test_a_robot_that_is_not_proved_is_no_planner() -> None:
-    footprint, motion, turning_radius, resolution, _ = TINY
-    options: Any = {"turning_radius": turning_radius, "resolution": resolution}
     reason = "after 10 steps the model is not proved: .*; give more steps, or"
     with pytest.raises(ValueError, match=reason):
-        train_robot(footprint, motion, **options, steps=10)
+        train_robot(TINY, "ackermann", turning_radius=0.6, resolution=0.25, steps=10)
 
 
 def test_the_same_seed_trains_the_same_model() -> None:
     contents = []
     for seed in (1, 1, 2):
-        trainer = RobotTrainer(*TINY, seed)
+        trainer = RobotTrainer(TINY, read_motions(MOTION), seed)
         for _ in trainer.run(30_000):
             pass
         contents.append(model_bytes(trainer.network, trainer.metadata()))
@@ -87,7 +82,7 @@ def test_the_same_seed_trains_the_same_model() -> None:
 
 
 def test_a_robot_bumps_where_its_body_touches_an_obstacle() -> None:
-    trainer = RobotTrainer(*TINY, 0)
+    trainer = RobotTrainer(TINY, read_motions(MOTION), 0)
     motions, width = trainer.network.motions, trainer.width
     swept = trainer.network.of_primitives(trainer.network.swept_by_unit)
     reach, collisions = swept.shape[1] // 2, 0
@@ -144,7 +139,7 @@ def test_what_is_no_robot_is_refused(
 
 
 def test_a_training_makes_as_many_transitions_as_it_may() -> None:
-    trainer = RobotTrainer(*TINY, 0)
+    trainer = RobotTrainer(TINY, read_motions(MOTION), 0)
     for steps in (1000, 1001):
         for _ in trainer.run(steps):
             pass

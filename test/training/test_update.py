@@ -21,6 +21,7 @@ from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap, MoveRule
 from ddqn_planner.grid.arguments import as_seed
 from ddqn_planner.model import AnyMapQNetwork
 from ddqn_planner.model.move_costs import patches
+from ddqn_planner.robot.motions import make_motions
 from ddqn_planner.training.compiled_learner import adam, draw_batch, training_of
 from ddqn_planner.training.double_dqn import NextQ, ReplayBuffer, Transitions
 from ddqn_planner.training.environment import (
@@ -337,4 +338,4 @@ def test_a_seed_that_is_none_is_named(seed: Any) -> None:
     with pytest.raises(ValueError, match="the seed is"):
         Trainer([paper_scenario()], HyperParameters(), seed)
     with pytest.raises(ValueError, match="the seed is"):
-        RobotTrainer("0.2", "differential", 0.5, 0.25, None, seed)
+        RobotTrainer("0.2", make_motions("differential", 0.5, 0.25), seed)
