@@ -38,6 +38,7 @@ MAX_BEND: Final = math.atan2(1, 2) + 1e-9
 
 STRIDE = 0.4  # metres of a long step straight ahead
 LONG_STEP: Final = 6.0  # cells: a short step that is longer needs no long one
+LONGEST_STEP: Final = 10.0  # cells, of any heading in `OCTANTS`
 BEHIND = 2.0  # cost of a metre that is not driven ahead; Nav2's reverse_penalty
 TURN = 0.5  # metres driven ahead that cost as much as a turn by one radian
 # Between two poses of a primitive, at most.
@@ -413,8 +414,9 @@ def _nearest_end(directions: Float64, min_length: float) -> _Corner:
     min_length : float
         The least length of each side, in cells.
     """
-    # All cells in a square around the origin, which contains the nearest end.
-    max_distance = math.ceil(4 * min_length) + 6
+    # All cells in a square around the origin, which contains the nearest end: sides
+    # that are whole numbers of steps end in the centre of a cell.
+    max_distance = math.ceil(2 * (min_length + LONGEST_STEP))
     coordinates = range(-max_distance, max_distance + 1)
     cells = np.array(list(product(coordinates, repeat=2)))  # (N, 2)
     # The lengths of the two sides that lead to each cell: directions @ lengths = cells.
