@@ -149,6 +149,7 @@ class Evidence:
             places=self._sums_of(visits, log),
             errors=errors,
             surprises=np.array([largest_surprise] if surprises else []),
+            turns=visits.turns,
         )
         self.fleet.add(drive)
         self.sum_up()
@@ -239,7 +240,8 @@ class Evidence:
         # The slowness of a place includes the waits that are expected there.
         expected_seconds = nominal_seconds * posterior.slowness[places]  # (K,)
         deviation = posterior.deviation_of(expected_seconds, places)
-        seconds = visits.total_seconds - visits.seconds[~is_on_map].sum()
+        driving_seconds = visits.total_seconds - visits.turning_seconds
+        seconds = driving_seconds - visits.seconds[~is_on_map].sum()
         log_of_ratio = math.log(seconds / float(expected_seconds.sum()))
         return np.array([log_of_ratio / deviation])
 

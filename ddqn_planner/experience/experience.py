@@ -23,6 +23,7 @@ from ddqn_planner.experience.fleet import Fleet, RobotEvidence, Version
 from ddqn_planner.experience.places import FARTHEST, Float32, Float64, Int64
 from ddqn_planner.experience.posterior import Posterior
 from ddqn_planner.experience.prior import FEATURES
+from ddqn_planner.experience.turns import seconds_per_radian, turning_of
 from ddqn_planner.experience.visits import (
     UNSEEN,
     Limits,
@@ -233,8 +234,9 @@ class Experience:
             speed=self.learned_speed,
             max_speed=self._max_speed(usual_speed),
             max_pause=self.max_pause,
+            turn_seconds=self.turn_seconds,
         )
-        visits = visits_of(poses, self.evidence.side, limits)
+        visits = self._visits_of(poses, limits)
         places = len(visits.seconds) + len(visits.waits.seconds)
         if not places:
             return Learned(0, 0.0, self._why_nothing(poses, count))
@@ -244,6 +246,16 @@ class Experience:
             return Learned(0, 0.0, reason, is_possible=False)
         self._learn(visits)
         return Learned(places, visits.total_seconds)
+
+    def _visits_of(self, poses: Poses, limits: Limits) -> Visits:
+        """Return the visits of a drive, without the time in which the robot turned.
+
+        How long turning takes is learned from the drive itself, too.
+        """
+        visits = visits_of(poses, self.evidence.side, limits)
+        turn_seconds = seconds_per_radian(self._fleet.turns + visits.turns)
+        limits = limits._replace(turn_seconds=turn_seconds)
+        return visits_of(poses, self.evidence.side, limits)
 
     def _why_nothing(self, poses: Poses, count: int) -> str:
         """Return in words why a drive taught nothing, and what to do.
@@ -376,6 +388,11 @@ class Experience:
         return self.nominal_speed / math.exp(self.evidence.open_log)
 
     @property
+    def turn_seconds(self) -> float:
+        """Seconds that turning by one radian takes; 0 if they hardly count."""
+        return seconds_per_radian(self._fleet.turns)
+
+    @property
     def prior(self) -> Float64:
         """By how much each feature of other maps raised the log slowness: (7,).
 
@@ -432,11 +449,12 @@ class Experience:
         share = as_number("exploration", exploration, 0, 10, "0 to 10")
         posterior = self.evidence.posterior_over(grid)
         seconds = grid.resolution / self.nominal_speed * math.exp(posterior.fastest_log)
-        expected = grid.with_times(posterior.painted, seconds)
+        turn_cost = self.turn_seconds / seconds  # in cells per radian
+        expected = grid.with_times(posterior.painted, seconds, turn_cost)
         if not share:
             return expected
         exploration_layers = Exploration(share, grid, posterior.uncertainty)
-        return expected.with_layers(exploration=exploration_layers)
+        return expected.with_layers(exploration=exploration_layers, turn_cost=turn_cost)
 
     def slowness(self, grid: GridMap) -> Float32:
         """Return (H, W) float32: seconds, with waits, over those at nominal speed."""
@@ -476,7 +494,9 @@ class Experience:
         # Of the logarithm of the path's time.
         deviation = posterior.deviation_of(seconds_of_moves, places)
         errors = np.array(self.evidence.error_range())  # (3,): low, mean, high
-        seconds = float(seconds_of_moves.sum())
+        metres = corners.astype(np.float64) * grid.resolution
+        turning_seconds = self.turn_seconds * turning_of(metres)
+        seconds = float(seconds_of_moves.sum()) + turning_seconds
         low, mean, high = (seconds * np.exp(errors * deviation)).tolist()
         return ExpectedTime(mean, low, high)
 

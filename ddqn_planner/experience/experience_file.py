@@ -37,7 +37,7 @@ RANGES = {
     **dict.fromkeys(("driven", "faded"), (0, 0, MOST)),
     **dict.fromkeys(SUMS, (1, 0, MOST)),
     # Logarithms, and what follows from them, may be negative.
-    **dict.fromkeys(("sum_of_log", "errors", "surprises"), (1, -MOST, MOST)),
+    **dict.fromkeys(("sum_of_log", "errors", "surprises", "turns"), (1, -MOST, MOST)),
     "version": (1, 0, math.inf),
     "prior": (1, -100, 100),  # no feature of a map raises the log slowness by more
     "position": (2, -FARTHEST, FARTHEST),
@@ -45,7 +45,7 @@ RANGES = {
     "slowness": (1, 0.5 / MAX_SLOWNESS, 2 * MAX_SLOWNESS),
 }
 # The arrays with a row for each robot, in the order of `RobotEvidence`.
-VALUES = "identities", "robots", "versions", "driven", "faded", "priors"
+VALUES = "identities", "robots", "versions", "driven", "faded", "priors", "turns"
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -130,12 +130,14 @@ def _members(arrays: Arrays, side: float) -> list[RobotEvidence]:
     totals = [sums.shape[1], len(errors), len(surprises)]
     if (counts < 0).any() or ends[-1].tolist() != totals:
         raise ValueError("its counts cannot be true")
+    # The files of 0.6.0 have no turns.
+    arrays = {"turns": np.zeros((len(counts), 2)), **arrays}
     values = [arrays[name].tolist() for name in VALUES]
     members = []
     for robot, start, end in zip(
         zip(*values, strict=True), ends - counts, ends, strict=True
     ):
-        identity, name, version, driven, faded, prior = robot
+        identity, name, version, driven, faded, prior, turns = robot
         of_places, of_errors, of_surprises = map(slice, start, end)
         parts = {name: column[of_places] for name, column in columns.items()}
         members.append(
@@ -146,6 +148,7 @@ def _members(arrays: Arrays, side: float) -> list[RobotEvidence]:
                 driven,
                 faded,
                 np.array(prior),
+                np.array(turns),
                 Places(**parts, side=side),
                 errors[of_errors],
                 surprises[of_surprises],
@@ -171,6 +174,8 @@ def _check(robot: RobotEvidence) -> None:
             raise ValueError(f"its {name} cannot be true")
     if len(robot.prior) != FEATURES or not places.are_in_order():
         raise ValueError("its prior or the order of its places cannot be true")
+    if len(robot.turns) != 2 or robot.turns[0] < 0:
+        raise ValueError("its turns cannot be true")
 
 
 def _old_evidence(

@@ -39,6 +39,7 @@ class RobotEvidence(NamedTuple):
     faded: float
     # (FEATURES,): by how much features of other maps raised the log slowness
     prior: Float64
+    turns: Float64  # (2,): of all drives, see `sums_of_turns`
     places: Places
     errors: Float64  # (D,): of the last D drives, see `ErrorRange`
     surprises: Float64  # (D,)
@@ -59,6 +60,7 @@ class RobotEvidence(NamedTuple):
             places=Places.none(side),
             errors=np.zeros(0),
             surprises=np.zeros(0),
+            turns=np.zeros(2),
         )
 
     @property
@@ -92,6 +94,7 @@ class RobotEvidence(NamedTuple):
             places=Places.summed(places).with_few_passages(),
             errors=errors[-LAST_DRIVES:],
             surprises=surprises[-LAST_DRIVES:],
+            turns=self.turns * older.share + drive.turns,
         )
 
 
@@ -126,6 +129,12 @@ class Fleet:
         return Places.summed(
             [robot.places.faded(robot.share) for robot in self.members]
         )
+
+    @property
+    def turns(self) -> Float64:
+        """The sums over what all robots showed of turns, (2,)."""
+        turns = [robot.turns * robot.share for robot in self.members]
+        return np.asarray(np.sum(turns, axis=0))
 
     @property
     def prior(self) -> Float64:

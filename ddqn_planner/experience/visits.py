@@ -11,6 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ddqn_planner.experience.places import Float64, Int64
+from ddqn_planner.experience.turns import (
+    Steps,
+    seconds_of_turns,
+    sums_of_turns,
+    turning_at,
+)
 
 # Poses are averaged over the time in which the robot drives this many metres, or up to
 # the second if the poses are noisy.
@@ -73,12 +79,14 @@ class Visits(NamedTuple):
     # robot docks, or waits for its next task, which says nothing of who passes by.
     waits: SecondsAt
     seconds_at_ends: float  # that the robot waited near the ends of the drive
+    turning_seconds: float  # that the robot needed to turn, on the whole drive
+    turns: Float64  # (2,): what the drive showed of them, see `sums_of_turns`
 
     @property
     def total_seconds(self) -> float:
         """The seconds of the drive, with its waits."""
         seconds = self.seconds.sum() + self.waits.seconds.sum()
-        return float(seconds) + self.seconds_at_ends
+        return float(seconds) + self.seconds_at_ends + self.turning_seconds
 
     @classmethod
     def of_wait(cls, x: float, y: float, seconds: float) -> Visits:
@@ -86,7 +94,16 @@ class Visits(NamedTuple):
         waits = SecondsAt(np.array([[x, y]]), np.array([seconds]))
         nothing = np.zeros(0)
         is_on_way = np.zeros(0, np.bool_)
-        return cls(np.zeros((0, 2)), nothing, nothing, is_on_way, waits, 0.0)
+        return cls(
+            position=np.zeros((0, 2)),
+            seconds=nothing,
+            metres=nothing,
+            is_on_way=is_on_way,
+            waits=waits,
+            seconds_at_ends=0.0,
+            turning_seconds=0.0,
+            turns=np.zeros(2),
+        )
 
 
 class Limits(NamedTuple):
@@ -96,6 +113,7 @@ class Limits(NamedTuple):
     speed: float  # metres per second that the robot usually drives in the open
     max_speed: float  # metres per second; faster moves are left out
     max_pause: float  # seconds; a longer pause is no wait
+    turn_seconds: float = 0.0  # that the robot needs to turn by one radian
 
 
 def visits_of(poses: Poses, side: float, limits: Limits) -> Visits:
@@ -109,11 +127,14 @@ def visits_of(poses: Poses, side: float, limits: Limits) -> Visits:
         The side of a place, which is a square; metres.
     limits : Limits
         The seconds over which poses are averaged (`window`), the usual and the greatest
-        speed in metres per second, and the longest wait in seconds (`max_pause`).
+        speed in metres per second, the longest wait in seconds (`max_pause`), and the
+        seconds per radian that turning takes (`turn_seconds`).
     """
     step_length = max(side, WINDOW) / 2  # metres
     steps_of_parts = []
     waits_of_parts = []
+    turning_seconds = 0.0
+    turns = np.zeros(2)
     for part in _believed_parts(poses, limits):
         means = averaged(part, limits.window)  # M mean poses
         # A spot is a mean pose that lies STAND_DISTANCE from the spot before it. The
@@ -122,10 +143,15 @@ def visits_of(poses: Poses, side: float, limits: Limits) -> Visits:
         spots = np.array(indices_apart(means.position, STAND_DISTANCE), np.int64)[1:]
         if not len(spots):  # the robot stood all the time
             continue
-        # (S - 1,) for S spots: the seconds from each spot to the next one, standing at
+        elapsed = np.diff(means.time[spots])  # (S - 1,) for S spots
+        turning_steps = _turning_steps(means.position[spots], elapsed)
+        turned = seconds_of_turns(turning_steps, limits.turn_seconds, limits.speed)
+        turns += sums_of_turns(turning_steps, limits.turn_seconds)
+        turning_seconds += float(turned.sum())
+        # (S - 1,): the seconds from each spot to the next one, turning and standing at
         # the spot and then driving.
-        stood = _seconds_stood(means.time, spots, limits.speed)
-        driven = np.diff(means.time[spots]) - stood
+        stood = _seconds_stood(means.time, spots, turned, limits.speed)
+        driven = elapsed - turned - stood
         steps_of_parts.append(_steps_along(means.position[spots], driven, step_length))
         next_position = means.position[spots[1:]]
         is_wait = (stood > 0) & (stood <= limits.max_pause)
@@ -136,11 +162,30 @@ def visits_of(poses: Poses, side: float, limits: Limits) -> Visits:
     possible_steps = SecondsAt(steps.position[is_possible], steps.seconds[is_possible])
     waits = SecondsAt.joined(waits_of_parts)
     ends = poses.position[[0, -1]]
-    return _visits_of_steps(possible_steps, step_length, side, waits, ends)
+    visits = _visits_of_steps(possible_steps, step_length, side, waits, ends)
+    return visits._replace(turning_seconds=turning_seconds, turns=turns)
 
 
-def _seconds_stood(time: Float64, spots: Int64, speed: float) -> Float64:
+def _turning_steps(spots: Float64, elapsed: Float64) -> Steps:
+    """Return the steps from each of S spots to the next one: (S - 1,).
+
+    `spots` is (S, 2), in metres, and `elapsed` (S - 1,) has the seconds of each step.
+    """
+    turning = turning_at(spots)
+    step: Float64 = np.diff(spots, axis=0)  # metres
+    return Steps(
+        seconds=elapsed,
+        metres=np.hypot(step[:, 0], step[:, 1]),
+        turning=(turning[1:] + turning[:-1]) / 2,
+    )
+
+
+def _seconds_stood(
+    time: Float64, spots: Int64, turned: Float64, speed: float
+) -> Float64:
     """Return how long a robot stood at each of S spots but the last: (S - 1,) seconds.
+
+    The seconds in which it turned there do not count.
 
     Parameters
     ----------
@@ -148,12 +193,14 @@ def _seconds_stood(time: Float64, spots: Int64, speed: float) -> Float64:
         The seconds of each mean pose of a drive.
     spots : (S,) int64
         The index of the first mean pose at each spot.
+    turned : (S - 1,) float64
+        The seconds in which the robot turned at each spot.
     speed : float
         The robot's usual speed, metres per second.
     """
     arrival = time[spots[:-1]]
     last_time_there = time[spots[1:] - 1]
-    stood = last_time_there - arrival
+    stood = np.maximum(last_time_there - arrival - turned, 0)
     # A robot that drives leaves a spot before it could have driven so far.
     stood[stood < STAND / speed] = 0
     return stood
@@ -199,6 +246,8 @@ def _visits_of_steps(
         is_on_way=_is_away(position, ends),
         waits=SecondsAt(waits.position[is_wait_on_way], waits.seconds[is_wait_on_way]),
         seconds_at_ends=float(waits.seconds[~is_wait_on_way].sum()),
+        turning_seconds=0.0,
+        turns=np.zeros(2),
     )
 
 

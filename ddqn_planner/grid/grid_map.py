@@ -406,15 +406,20 @@ class GridMap:
         return self._history.patches_since(older._history)
 
     def with_times(
-        self, slowness: NDArray[np.float32], seconds_per_cell: float
+        self,
+        slowness: NDArray[np.float32],
+        seconds_per_cell: float,
+        turn_cost: float = 0.0,
     ) -> GridMap:
         """Return the map with expected times, which its own factors multiply.
 
         The slowness (H, W) and the seconds per cell are as for `GridMap`, but not
-        checked.
+        checked. `turn_cost` is that of turning, in cells per radian.
         """
         return self.with_layers(
-            slowness=self._multiplied(slowness), seconds_per_cell=seconds_per_cell
+            slowness=self._multiplied(slowness),
+            seconds_per_cell=seconds_per_cell,
+            turn_cost=turn_cost,
         )
 
     def with_times_of(self, other: GridMap) -> GridMap:
