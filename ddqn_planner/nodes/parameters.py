@@ -81,7 +81,7 @@ class PlannerSettings:
         False, "A robot's goal may be reached forwards or backwards"
     )
     path_bound: float = parameter(
-        1.2, "A robot's first path: how many times the least cost", (1, math.inf)
+        1.2, "A robot's path soon costs at most so many times the least", (1, math.inf)
     )
     replan_period: float = parameter(
         1.0, "Seconds between plans on a free path; 0: each map", (0, 3600)

@@ -447,25 +447,42 @@ class PlannerNode(ManagedNode):
         `plan.bound` times as much.
         """
         self._newest_outcome = outcome
-        plan = outcome.plan
-        switch_ratio = (1 + self._settings.switch_threshold) * SAME_COST
-        if isinstance(plan, PosePlan) and plan.bound > switch_ratio:
+        if self._may_cost_less(outcome, bound=1.0):
             executor: Any = self.executor
             executor.create_task(self._improve_path, outcome)
 
-    async def _improve_path(self, outcome: Outcome) -> None:
-        """Search the cheapest path; publish it, if it leads to the active goal.
+    def _may_cost_less(self, outcome: Outcome, bound: float) -> bool:
+        """Return whether a path may be worth a switch from that of an outcome.
 
-        The search ends when there is a newer outcome.
+        That is so if it may cost more than `bound` times the least cost, by what is
+        proved.
+        """
+        plan = outcome.plan
+        switch_ratio = (1 + self._settings.switch_threshold) * SAME_COST
+        return isinstance(plan, PosePlan) and plan.bound > max(bound, switch_ratio)
+
+    async def _improve_path(self, outcome: Outcome) -> None:
+        """Search better paths; publish them, if they lead to the active goal.
+
+        The first one keeps the parameter ``path_bound``, and the second is the
+        cheapest. The search ends when there is a newer outcome.
         """
 
         def given_up() -> Outcome | None:
             return None if outcome is self._newest_outcome else UNCHANGED
 
-        improving = self.requests.improve(outcome)
-        better = await self.requests.answer([], improving, given_up)
-        if outcome is self._active_goal.last and better.request is not None:
-            self._publish(better, self._active_goal)
+        for bound in (self._settings.path_bound, 1.0):
+            if not self._may_cost_less(outcome, bound):
+                continue
+            is_followed = outcome is self._active_goal.last
+            improving = self.requests.improve(outcome, bound, is_followed)
+            better = await self.requests.answer([], improving, given_up)
+            if better.request is None or given_up() is not None:
+                return
+            if is_followed and outcome is self._active_goal.last:
+                self._publish(better, self._active_goal)
+            outcome = better
+            self._newest_outcome = better
 
     async def _on_is_path_valid(self, request: Any, response: Any) -> Any:
         """Answer Nav2's IsPathValid: whether the robot can drive the rest of a path."""

@@ -347,21 +347,43 @@ class Requests:
         self.retries.note(poses, costmap, outcome)
         return outcome
 
-    async def improve(self, outcome: Outcome) -> Outcome:
-        """Return an outcome for a robot with a body, with the cheapest path instead.
+    async def improve(
+        self, outcome: Outcome, bound: float, is_followed: bool
+    ) -> Outcome:
+        """Return the outcome of a robot with a body, with a better path if any.
 
-        `outcome` has a path that may cost more than the cheapest one.
+        Parameters
+        ----------
+        outcome : Outcome
+            With a path that may cost more than the cheapest one.
+        bound : float
+            How many times the least cost a path may cost. The outcome's path is kept if
+            it costs no more.
+        is_followed : bool
+            Whether the robot follows the path: then another path begins where the robot
+            is when it is found.
         """
         planner = outcome.planner
         goal = outcome.goal
+        header = outcome.map_header
         assert isinstance(outcome.request, PoseRequest)
         assert isinstance(outcome.plan, PosePlan)
         assert planner is not None
         assert goal is not None
-        # A bound of 1: no path costs less. The outcome's path is kept if it costs no
-        # more.
-        request = replace(outcome.request, bound=1.0, under_way=outcome.plan.poses)
+        assert header is not None
+        request = replace(
+            outcome.request,
+            bound=bound,
+            is_bound_proved=True,
+            under_way=outcome.plan.poses,
+        )
         plan = await self._plan(planner, request)
+        was_kept = plan.extra_cost is not None
+        if is_followed and not was_kept:
+            inputs = PlanInputs(header, request.grid, planner)
+            start = await self._start_in_map(inputs)
+            request = replace(request, start=pose_of(start.message))
+            plan = await self._plan(planner, request)
         # Reasons of paths name neither the start, here the goal, nor the robot_radius.
         reason = reason_of(request, plan, goal, goal, 0.0)
         return replace(outcome, request=request, plan=plan, reason=reason)
@@ -557,6 +579,7 @@ def request_to(
             goals=tuple(pose_of(goal.message) for goal in goals),
             tolerance=(tolerance, yaw_tolerance),
             bound=settings.path_bound,
+            is_bound_proved=False,  # the node improves the first path
             switch_threshold=settings.switch_threshold,
             start_clearing_radius=clearing_radius_of_body(settings),
             either_direction=settings.either_direction,

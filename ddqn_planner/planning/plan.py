@@ -115,6 +115,7 @@ class PoseRequest(PathRequest[Pose]):
 
     tolerance: tuple[float, float] = (0.0, 0.0)  # metres, radians; for one goal
     bound: float = 1.2
+    is_bound_proved: bool = True  # or the first path is enough
     start_clearing_radius: float = 0.0  # metres
     either_direction: bool = False  # a goal may be reached forwards or backwards
     finished: bool = True  # with exact ends, see `pose_finish`

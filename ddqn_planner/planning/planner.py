@@ -303,6 +303,7 @@ class Planner:
         bound: float = 1.2,
         start_clearing_radius: float = 0.0,
         either_direction: bool = False,
+        prove: bool = True,
     ) -> PosePlan:
         """Plan a path for a robot with a body and a heading, by a model of that robot.
 
@@ -335,6 +336,11 @@ class Planner:
             cells count; with `math.inf`, none of those under the body.
         either_direction : bool
             Whether the robot may also arrive with the opposite of the goal's heading.
+        prove : bool
+            Whether the bound is proved before the path is returned. Without, it is the
+            first path that is found, and `PosePlan.bound` is what is proved of it by
+            then: so a robot drives off early, and the same request with a proof goes on
+            from there.
 
         Returns
         -------
@@ -363,6 +369,7 @@ class Planner:
                 "0 metres or more",
             ),
             either_direction=as_flag("either_direction", either_direction),
+            is_bound_proved=as_flag("prove", prove),
         )
         if self.pose_planner is None:
             raise ValueError(

@@ -59,6 +59,8 @@ ALL_STATES = 2**62  # no map has so many
 ANY_PATH = 1e6
 # The first round's weight is the bound to the power of this: mostly one round will do.
 GREEDY_EXPONENT = 1.5
+# Likewise where a first path is enough: it costs some 0.5 % more.
+EAGER_EXPONENT = 2.5
 
 
 def _untouched(count: int, dtype: DTypeLike) -> NDArray[Any]:
@@ -138,7 +140,9 @@ class PoseField(Field[Search]):
         states: int = pose_space.first_in_tile(self.world.nearness.size, self.world)
         return 5 * states
 
-    def reach(self, start: State, bound: float, limit: int) -> float | None:
+    def reach(
+        self, start: State, bound: float, limit: int, is_bound_proved: bool = True
+    ) -> float | None:
         """Grow until the cost from a start is known within a bound, or to be none.
 
         Parameters
@@ -149,18 +153,21 @@ class PoseField(Field[Search]):
             By what factor the cost may exceed the least cost, 1 or more.
         limit : int
             How many states may be visited in this call.
+        is_bound_proved : bool
+            Without, a first path is enough, whatever is proved of it.
 
         Returns
         -------
         float, optional
-            The bound that is proved, infinite if there is no path; None if more states
-            must be visited.
+            The bound that is proved, at most `ANY_PATH`, or infinite if there is no
+            path; None if more states must be visited.
         """
         finite_bound = min(bound, ANY_PATH)
         with self._lock:
-            self._aim_at(start, finite_bound)
+            exponent = GREEDY_EXPONENT if is_bound_proved else EAGER_EXPONENT
+            self._aim_at(start, weight=finite_bound**exponent)
             visits_left = limit
-            while not self._is_enough(finite_bound):
+            while not self._is_enough(finite_bound, is_bound_proved):
                 if visits_left <= 0:
                     return None
                 if self._should_count_reachable():
@@ -173,13 +180,13 @@ class PoseField(Field[Search]):
                 else:
                     most_visits = min(visits_left, self._visits_between_looks())
                     visits_left -= self._visit(finite_bound, most_visits)
-            return self._proved_bound()
+            has_path = _cost_from_start(self.known) < math.inf
+            return min(self._proved_bound(), ANY_PATH) if has_path else math.inf
 
-    def _aim_at(self, start: State, bound: float) -> None:
+    def _aim_at(self, start: State, weight: float) -> None:
         """Begin the first round of A* toward a start, unless the field aims at it.
 
-        The start is (x, y, heading), and the bound the factor by which the cost from
-        the start may exceed the least cost.
+        The start is (x, y, heading), and the weight that of the round's lower bound.
         """
         aim = self.known.aim
         number = int(pose_space.number_of_state(*start, self.world))
@@ -188,9 +195,7 @@ class PoseField(Field[Search]):
         self.visits = 0
         self._leads_on = False
         self._begin_round(
-            self._aim_toward(start)._replace(
-                start_number=number, weight=bound**GREEDY_EXPONENT
-            )
+            self._aim_toward(start)._replace(start_number=number, weight=weight)
         )
 
     def _aim_toward(self, start: State) -> Aim:
@@ -230,9 +235,16 @@ class PoseField(Field[Search]):
         self._known = search
         self._lower_bound = pose_space.queue_open_states(search, tiles)
 
-    def _is_enough(self, bound: float) -> bool:
-        """Return whether a bound is proved, or that no path leads from the start."""
-        return self._proved_bound() <= bound * SAME or self._lower_bound == math.inf
+    def _is_enough(self, bound: float, is_bound_proved: bool) -> bool:
+        """Return whether a bound is proved, or that no path leads from the start.
+
+        Unless the bound has to be proved, the path of the first round is enough.
+        """
+        if self._proved_bound() <= bound * SAME or self._lower_bound == math.inf:
+            return True
+        has_path = _cost_from_start(self.known) < math.inf
+        is_first_round_over = self.known.aim.weight == 1
+        return has_path and is_first_round_over and not is_bound_proved
 
     def _should_count_reachable(self) -> bool:
         """Return whether to ask now, once per start, to how many states it leads."""
@@ -399,15 +411,17 @@ class PoseField(Field[Search]):
             multipliers = np.minimum(of_pairs[:, ::2], of_pairs[:, 1::2])
         return multipliers
 
-    def rollout(self, start: State, bound: float) -> PosePath:
+    def rollout(
+        self, start: State, bound: float, is_bound_proved: bool = True
+    ) -> PosePath:
         """Return the path from a start (x, y, heading) to a goal, and keep it.
 
-        The path costs at most `bound` times the least. There is a path: `reach` has
-        returned a finite bound.
+        There is a path: `reach` has returned a finite bound. See there for all
+        parameters.
         """
         body = self.world.body
         with self._lock:
-            proved_bound = self.reach(start, bound, ALL_STATES)
+            proved_bound = self.reach(start, bound, ALL_STATES, is_bound_proved)
             assert proved_bound is not None
             search = self.known
             start_number = search.aim.start_number

@@ -179,14 +179,15 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         ignored = start.ignored.tobytes()
         key = request.goals, request.reach, states.tobytes(), ignored
         field = self.fields.get(key, grid, lambda: PoseField(states, grid, start.world))
-        bound = field.reach(start.state, request.bound, VISITS)
+        is_proved = request.is_bound_proved
+        bound = field.reach(start.state, request.bound, VISITS, is_proved)
         while bound is None:
             yield  # a pause: a slow step follows
-            bound = field.reach(start.state, request.bound, VISITS)
+            bound = field.reach(start.state, request.bound, VISITS, is_proved)
         clock.end_field()
         if bound == math.inf:
             return PosePlan(PlanStatus.NO_PATH, field_ms=clock.field_ms)
-        path = field.rollout(start.state, request.bound)
+        path = field.rollout(start.state, request.bound, is_proved)
         if request.finished:
             path = self._finished(path, request, start.world)
             path = path._replace(is_finished=True)
@@ -609,8 +610,8 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         """Return the rest of a path that was planned before, if the start lies on it.
 
         The path led to the same goals with the same tolerance, on a map with the same
-        cells. Its rest is proved to cost at most the request's bound times the least
-        cost. Return None if there is no such path.
+        cells. If the request's bound has to be proved, its rest is proved to cost at
+        most that times the least cost. Return None if there is no such path.
         """
         for field in self.fields.kept:
             path = field.path  # the last one that was made from the field
@@ -638,7 +639,8 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
                 path = self._finish.joined(rest, request.start, request.grid, world)
                 first = 0
             plan = path.plan(first, request.grid)
-            if plan.bound <= request.bound * paths.SAME:
+            is_within_bound = plan.bound <= request.bound * paths.SAME
+            if is_within_bound or not request.is_bound_proved:
                 return plan
         return None
 

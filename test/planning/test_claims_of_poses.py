@@ -48,10 +48,22 @@ def pose_of(planner: Planner, grid: GridMap, state: State) -> Pose:
 
 
 def plan_of_primitives(
-    planner: Planner, grid: GridMap, start: Any, goal: Pose, bound: float
+    planner: Planner,
+    grid: GridMap,
+    start: Any,
+    goal: Pose,
+    bound: float,
+    is_bound_proved: bool = True,
 ) -> PosePlan:
     """A path that Dijkstra finds, too: not finished."""
-    request = PoseRequest(grid, start, (goal,), bound=bound, finished=False)
+    request = PoseRequest(
+        grid,
+        start,
+        (goal,),
+        bound=bound,
+        is_bound_proved=is_bound_proved,
+        finished=False,
+    )
     plan = last_step(planner.steps(request))
     assert isinstance(plan, PosePlan)
     return plan
@@ -198,6 +210,28 @@ def test_the_rest_of_a_cheapest_path_costs_the_least(
     costs_of_states = [least[y, x, heading] for _, (x, y, heading) in states]
     expected = np.interp(range(len(costs)), places, costs_of_states)
     assert costs == pytest.approx(expected, rel=2e-3, abs=0.02)
+
+
+def test_a_first_path_comes_early_and_is_proved_by_the_next_request(
+    planner: Planner,
+) -> None:
+    body = fresh(planner)
+    grid = obstacles(1)
+    start, goal = (pose_of(body, grid, state) for state in (START_STATE, GOAL_STATE))
+    first = body.plan_poses(grid, start, goal, bound=1.05, prove=False)
+    assert first.bound > 1.05
+    visits_of_first = last_field(body).visits
+    proved = body.plan_poses(grid, start, goal, bound=1.05)
+    assert proved.bound <= 1.05
+    assert last_field(body).visits > visits_of_first  # it has gone on, not begun anew
+    at_once = fresh(planner)
+    at_once.plan_poses(grid, start, goal, bound=1.05)
+    assert visits_of_first < last_field(at_once).visits
+
+
+def last_field(planner: Planner) -> PoseField:
+    assert planner.pose_planner is not None
+    return planner.pose_planner.fields.kept[-1]
 
 
 def test_a_path_in_reverse_is_kept_at_what_reversing_costs(planner: Planner) -> None:
@@ -350,10 +384,15 @@ def test_plans_with_costs_keep_the_bound_that_they_prove(
     random = np.random.default_rng(seed)
     for y, x, heading in random.choice(reachable, 8).tolist():
         start = pose_of(body, grid, (x, y, heading))
+        least_cost = least[y, x, heading] * (grid.seconds_per_cell or 1)
+        first = plan_of_primitives(
+            fresh(body), grid, start, goal, bound=1.2, is_bound_proved=False
+        )
+        assert first.cost is not None
+        assert first.cost <= first.bound * least_cost * (1 + ROUNDED)
         for bound in (math.inf, 1.3, 1.05, 1.0):
             plan = plan_of_primitives(body, grid, start, goal, bound=bound)
             assert plan.status is PlanStatus.SUCCEEDED
             assert plan.cost is not None
             assert plan.bound <= bound * (1 + ROUNDED)
-            cells_of_least = least[y, x, heading] * (grid.seconds_per_cell or 1)
-            assert plan.cost <= plan.bound * cells_of_least * (1 + ROUNDED)
+            assert plan.cost <= plan.bound * least_cost * (1 + ROUNDED)
