@@ -1,7 +1,6 @@
 """A robot's drives: divided from its poses, and recorded in a folder that learns."""
 
 import math
-import os
 import re
 from collections.abc import Callable, Iterator
 from enum import Enum
@@ -46,8 +45,7 @@ SAMPLE = rb"%b:%b:%b" % ((NUMBER,) * 3)
 # samples: else a row could be divided in too many ways to try.
 ROW = re.compile(
     rb"(?:\xef\xbb\xbf)?(\d{1,18}),([a-z_]{1,20}),(%b),(%b),(%b),"
-    rb"(%b(?: %b){,%d})[ \t]*\r?\n"
-    % (NUMBER, NUMBER, NUMBER, SAMPLE, SAMPLE, MOST_SAMPLES - 1)
+    rb"(%b(?: %b){,%d})\s*" % (NUMBER, NUMBER, NUMBER, SAMPLE, SAMPLE, MOST_SAMPLES - 1)
 )
 
 # A sample is recorded this many metres, or seconds, after the last one.
@@ -155,7 +153,7 @@ def read_drives(
     read.
     """
     for number, line in enumerate(read_rows(as_path(path)), 1):
-        if HEADER.strip() in line:
+        if line.strip(b"\xef\xbb\xbf \t\r\n") == HEADER.strip():
             continue
         try:
             yield _drive_in(line)
@@ -332,7 +330,8 @@ class DriveFolder(WorkFolder):
         self.experience_path = self.folder / EXPERIENCE
         self.experience = Experience(nominal_speed, robot_width, robot=robot)
         with self.opening():
-            self.drives = _cut_incomplete_row(self.record_path)
+            is_recorded = self.record_path.exists()
+            rows = read_file(self.record_path, MAX_RECORD_BYTES) if is_recorded else b""
             is_new = not self.experience_path.exists()
             if not is_new:
                 self._load(self.experience_path)
@@ -341,8 +340,12 @@ class DriveFolder(WorkFolder):
                 self.experience = self.experience.for_robot(robot)
             self._record = Appender(self.record_path)
             self.callback(self._record.close)
-            if self.record_path.stat().st_size == 0:
+            if not rows:
                 self._record.append(HEADER)
+            elif not rows.endswith(b"\n"):  # a crash has cut the last one
+                self._record.append(b"\r\n")
+            numbers = re.findall(rb"^\d{1,18}", rows, re.MULTILINE)
+            self.drives = max(map(int, numbers), default=0)
             if is_new:  # learn anew from the drives that the folder holds
                 for drive in read_drives(self.record_path):
                     drive.teach(self.experience)
@@ -395,16 +398,3 @@ class DriveFolder(WorkFolder):
         with self.saving():
             self._record.flush()
             self.experience.save(self.experience_path)
-
-
-def _cut_incomplete_row(path: Path) -> int:
-    """Cut the incomplete last row that a crash left in an ``episodes.csv``.
-
-    Returns the number of the last drive in the file: 0 without a drive or a file.
-    """
-    content = read_file(path, MAX_RECORD_BYTES) if path.exists() else b""
-    complete = content[: content.rfind(b"\n") + 1]
-    if complete != content:
-        os.truncate(path, len(complete))
-    numbers = re.findall(rb"^\d{1,18}", complete, re.MULTILINE)
-    return max(map(int, numbers), default=0)
