@@ -468,6 +468,17 @@ def test_a_file_with_directions_of_slowness_loads_without_them(tmp_path: Path) -
     np.testing.assert_array_equal(again.slowness(HALL), experience.slowness(HALL))
 
 
+def test_a_file_of_several_robots_of_version_0_6_loads() -> None:
+    # Of two robots, which drove along y = 2 m and 5 m.
+    experience = Experience.load(Path(__file__).with_name("two_robots.npz"))
+    seconds = sorted(robot.driven for robot in experience.evidence.fleet.members)
+    assert seconds == pytest.approx([39, 59], abs=1)
+    slowness = experience.slowness(HALL)
+    assert at(HALL, slowness, 7, 2) == pytest.approx(3, rel=0.1)
+    assert at(HALL, slowness, 7, 5) == pytest.approx(2, rel=0.1)
+    assert Experience.from_bytes(experience.to_bytes()).state == experience.state
+
+
 LINE = np.column_stack([np.linspace(0, 10, 41), np.zeros(41)])
 TIMES = np.linspace(0, 20, 41)
 
