@@ -378,7 +378,7 @@ def bytes_of(kind: str, message: UInt8MultiArray) -> bytes:
         remedy = "save there again"
     else:
         remedy = "let trainer and planner have one version"
-    raise ValueError(f"the trainer sent {wrong}; {remedy}")
+    raise ValueError(f"the message has {wrong}; {remedy}")
 
 
 def has_changes(message: UInt8MultiArray) -> bool:

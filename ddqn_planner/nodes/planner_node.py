@@ -51,6 +51,7 @@ from ddqn_planner.nodes.poses import Poses, check_tf_is_installed
 from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.nodes.requests import Requests, path_poses
 from ddqn_planner.nodes.spinning import spin_until_shutdown
+from ddqn_planner.nodes.trained_bodies import TrainedBodies
 from ddqn_planner.nodes.worker import Worker
 from ddqn_planner.planning import PlanMethod
 from ddqn_planner.planning.plan import PosePlan
@@ -154,6 +155,13 @@ class PlannerNode(ManagedNode):
         if self._settings.follow_trainer:
             self.create_subscription(
                 UInt8MultiArray, "trainer/model", self._on_model, LATCHED
+            )
+            TrainedBodies(
+                self,
+                self._diagnostics,
+                self._worker,
+                self.model_source,
+                on_change=self._plan_anew,
             )
         # Reentrant: while a request waits for its field, others are answered.
         reentrant = ReentrantCallbackGroup()

@@ -13,6 +13,7 @@ from ddqn_planner.experience import Experience
 from ddqn_planner.experience.experience import SPEEDS, WIDTHS
 from ddqn_planner.files import as_path
 from ddqn_planner.grid import MapFile, read_map_file
+from ddqn_planner.nodes.body_training import BodyTraining
 from ddqn_planner.nodes.clocks import STEADY
 from ddqn_planner.nodes.conversions import MapRules, grid_from_message
 from ddqn_planner.nodes.declared import NAMESPACES, Declared
@@ -73,6 +74,9 @@ PARAMETERS: Final = {
     "experience": Declared(
         "", "Driving: older experience with which a new folder begins"
     ),
+    "body_padding": Declared(
+        0.02, "Footprints: metres of room around a body, for a controller", (0.0, 1.0)
+    ),
     **HYPER_PARAMETERS,
 }
 """The next ``~/start`` uses those that changed."""
@@ -101,6 +105,7 @@ class TrainerNode(LearningNode):
         self.create_trigger("~/save", self.learner.save, callback_group=group)
         for name, handler in services.items():
             self.create_trigger(f"~/{name}", handler, callback_group=group)
+        self._bodies = BodyTraining(self)
         self.create_timer(1.0, self._on_look, clock=STEADY)
         self._is_complete = True
 
@@ -160,7 +165,10 @@ class TrainerNode(LearningNode):
         activity = "driving" if self.is_driving else "training"
         message = "; ".join(problems) or self.state
         self.diagnostics.publish_status(
-            activity, level, message, {"state": self.state, **lines}
+            activity,
+            level,
+            message,
+            {"state": self.state, **lines, **self._bodies.describe()},
         )
 
     def _on_stop(self) -> Answer:
@@ -216,6 +224,7 @@ class TrainerNode(LearningNode):
         # Newer releases destroy a node that cannot start, and some destroy it twice.
         if self._is_complete:
             self._is_complete = False
+            self._bodies.close()
             self.learner.close()
         super().destroy_node()
 

@@ -66,7 +66,8 @@ def rooms() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def running(run_robot: Any, model: FilePath, rooms: np.ndarray) -> Iterator[Robot]:
-    with run_robot("/body", {"model": str(model)}, rooms) as robot:
+    parameters = {"model": str(model), "follow_trainer": True}
+    with run_robot("/body", parameters, rooms) as robot:
         robot.model = model
         robot.grid = GridMap(rooms > 0, CELL, ORIGIN)
         yield robot
@@ -92,25 +93,31 @@ def array_of(path: Path) -> np.ndarray:
     return np.array([(at.x, at.y, yaw_of(turned)) for at, turned in places])
 
 
-def check(
-    path: Path,
-    grid: GridMap,
-    goal: Cell,
-    yaw: float,
-    size: tuple[float, float, float] = BODY,
-) -> np.ndarray:
+def check(path: Path, grid: GridMap, goal: Cell, yaw: float) -> np.ndarray:
     """Check that no part of the body touches an obstacle, and where the path begins and
     ends.
     """
-    poses, (front, back, side) = array_of(path), size
+    poses = array_of(path)
     assert ends_at(path, grid, goal, yaw)
     assert np.hypot(*np.diff(poses[:, :2], axis=0).T).max() <= CELL / 2 + 1e-6
+    assert has_room(path, grid, BODY)
+    return poses
+
+
+def has_room(path: Path, grid: GridMap, size: tuple[float, float, float]) -> bool:
+    """Return whether there is a path, on which no part of a body touches an
+    obstacle.
+    """
+    front, back, side = size
     over, up = np.meshgrid(np.arange(-back, front, 0.02), np.arange(-side, side, 0.02))
     body = (over + 1j * up).ravel()
-    for x, y, towards in poses.tolist():
-        for point in x + 1j * y + body * np.exp(1j * towards):
-            assert grid.is_free(grid.world_to_cell(point.real, point.imag))
-    return poses
+    points = [
+        x + 1j * y + body * np.exp(1j * yaw) for x, y, yaw in array_of(path).tolist()
+    ]
+    return len(points) > 0 and all(
+        grid.is_free(grid.world_to_cell(point.real, point.imag))
+        for point in np.concatenate(points)
+    )
 
 
 def ends_at(path: Path, grid: GridMap, goal: Cell, yaw: float) -> bool:
@@ -217,46 +224,62 @@ def test_a_path_leads_round_a_box_that_stands_on_it(robot: Robot) -> None:
     path_to(robot, BESIDE, 0.5, grid_from_message(message))
 
 
+def carry(robot: Robot, ahead: float, side: float, behind: float = 0.2) -> str:
+    """Publish a footprint in the robot's frame; return how it is written."""
+    corners = [(ahead, side), (-behind, side), (-behind, -side), (ahead, -side)]
+    robot.plans.clear()
+    points = [Point32(x=x, y=y) for x, y in corners]
+    footprint = PolygonStamped(polygon=Polygon(points=points))
+    footprint.header.frame_id = "base_link"
+    robot.client.publish("published_footprint", footprint)
+    return re.escape(str([list(corner) for corner in corners]))
+
+
 def test_the_model_that_covers_the_footprint_is_used_during_a_drive(
     robot: Robot, tmp_path: FilePath
 ) -> None:
-    def carry(ahead: float, side: float, behind: float = 0.2) -> str:
-        """Publish a footprint in the robot's frame; return how it is written."""
-        corners = [(ahead, side), (-behind, side), (-behind, -side), (ahead, -side)]
-        robot.plans.clear()
-        points = [Point32(x=x, y=y) for x, y in corners]
-        footprint = PolygonStamped(polygon=Polygon(points=points))
-        footprint.header.frame_id = "base_link"
-        robot.client.publish("published_footprint", footprint)
-        return re.escape(str([list(corner) for corner in corners]))
-
     loaded, extended, torn = 0.3, tmp_path / "loaded", tmp_path / "torn.safetensors"
     extended = extended.with_suffix(".safetensors")
     robot_model(extended, "differential", CELL, (0.5, 0.2, loaded))
     torn.write_bytes(extended.read_bytes()[:-9])
     assert "torn.safetensors: cannot be read" in robot.refuse(models=[str(torn)])
     assert "any_map.safetensors knows no body" in robot.refuse(models=["any_map"])
-    robot.set(path_bound=1.0)  # no path gets better later
     drive_to(robot, BEYOND, 0.0)
-    carry(5.0, 5.0)  # of no consequence without other models
     robot.set(models=[str(extended)])
     path_to(robot, BEYOND, 0.0)
-    carry(0.45, loaded)
-    path = robot.plans.wait(lambda path: len(path.poses) > 0)
-    check(path, robot.grid, BEYOND, 0.0, (0.5, 0.2, loaded))
+    carry(robot, 0.45, loaded)
+    size = (0.5, 0.2, loaded)
+    robot.plans.wait(lambda path: has_room(path, robot.grid, size))
     robot.wait_for_reason("", {"model file": str(extended)})
+    path = robot.get_plan(at(robot, START, 0.5), at(robot, BEYOND, 0.0))
+    assert has_room(path, robot.grid, size)
     # A footprint that no model covers has no path, and the log says what to do.
-    words = carry(0.5, loaded, behind=0.3)
+    words = carry(robot, 0.5, loaded, behind=0.3)
     robot.plans.wait(lambda path: not path.poses)
     reason = f"no model covers .*{words}.* 0.1 m beyond .*{extended.name}; train one"
     robot.wait_for_reason(reason, {"status": "NO_MODEL"})
     assert not robot.get_plan(at(robot, START, 0.5), at(robot, BEYOND, 0.0)).poses
     # The smallest model that covers a footprint is used, and is told if it is larger.
-    words = carry(0.1, 0.1, behind=0.1)
+    words = carry(robot, 0.1, 0.1, behind=0.1)
     path_to(robot, BEYOND, 0.0)
     robot.wait_for_reason("", {"model file": str(robot.model)})
     robot.node.wait_for_log(f"no model has .*{words}; planning with a larger body")
     robot.set(models=[""])
+
+
+def test_the_trainer_makes_a_model_of_a_new_footprint_on_request(
+    robot: Robot, run_node: Any
+) -> None:
+    drive_to(robot, BEYOND, 0.0)
+    carry(robot, 0.28, 0.2, behind=0.25)
+    robot.plans.wait(lambda path: not path.poses)
+    with run_node("trainer_node", {}, namespace="/body") as trainer:
+        trainer.wait_for_log("the footprint is trained, proved")
+        robot.plans.wait(lambda path: has_room(path, robot.grid, (0.3, 0.27, 0.22)))
+    robot.wait_for_reason("", {"model file": "trainer/body"})
+    carry(robot, 0.3, 0.2)
+    path_to(robot, BEYOND, 0.0)
+    robot.wait_for_reason("", {"model file": str(robot.model)})
 
 
 def test_bodies_along_the_path_are_shown_to_who_asks(robot: Robot) -> None:
