@@ -30,7 +30,6 @@ from tables import table
 from ddqn_planner import GridMap, Planner, load_map
 from ddqn_planner.commands.options import file_of
 from ddqn_planner.grid import MOVES, Cell, MoveRule
-from ddqn_planner.grid.inflation import inflate
 from ddqn_planner.model import ModelMetadata, RobotNetwork
 from ddqn_planner.planning.path_finder import last_step
 from ddqn_planner.planning.plan import PosePlan, PoseRequest
@@ -60,7 +59,6 @@ LONGEST_REQUEST: Final = 60.0
 BOX_AHEAD: Final = 2.0  # metres on the path to the box that is put on it
 ORACLE_METRES: Final = 0.02  # between two poses that the oracle tries
 ORACLE_RADIANS: Final = math.radians(2)
-SHAPE_RADIUS: Final = 0.75  # metres of free space around starts and goals
 BEND_METRES: Final = 0.25  # on which a curvature is measured
 STRAIGHT: Final = 0.05  # per metre: a smaller curvature is none
 SHRUNK: Final = 1e-6  # metres, so that a body that only touches does not collide
@@ -237,20 +235,52 @@ def least_costs(
     primitive; its middle is the cell of the origin. A goal is (x, y, heading). The
     costs are in cells: (H, W, headings), infinite without a path.
     """
+    layers = 2 if motions.cusp else 1  # driven ahead, and in reverse
     edges = [
-        edges_of_primitive(grid, motions, swept, primitive)
+        in_layer(edges_of_primitive(grid, motions, swept, primitive), layer, layers)
         for primitive in range(len(motions.poses))
+        for layer in layers_of(motions.poses[primitive], layers)
     ]
-    pose, next_pose, cost = np.concatenate(edges).T
-    size = grid.occupancy.size * motions.headings
+    if motions.cusp:
+        state = np.arange(grid.occupancy.size * motions.headings * layers)
+        cost = np.full(len(state), motions.cusp)
+        edges.append(np.column_stack([state, state ^ 1, cost]))
+    state, next_state, cost = np.concatenate(edges).T
+    size = grid.occupancy.size * motions.headings * layers
     # Against the drive, as the search begins at the goals.
-    ends = next_pose.astype(int), pose.astype(int)
+    ends = next_state.astype(int), state.astype(int)
     graph = coo_matrix((cost, ends), (size, size)).tocsr()
     numbers = [
-        (y * grid.width + x) * motions.headings + heading for x, y, heading in goals
+        ((y * grid.width + x) * motions.headings + heading) * layers + layer
+        for x, y, heading in goals
+        for layer in range(layers)
     ]
     costs: NDArray[np.float64] = dijkstra(graph, indices=numbers, min_only=True)
-    return costs.reshape(grid.height, grid.width, motions.headings)
+    shape = grid.height, grid.width, motions.headings, layers
+    least: NDArray[np.float64] = costs.reshape(shape).min(axis=-1)
+    return least
+
+
+def layers_of(poses: NDArray[np.float64], layers: int) -> range:
+    """Return in which layers a primitive is driven: ahead 0, in reverse 1, or both.
+
+    Without cusps there is one layer.
+    """
+    dx, dy, turn = np.diff(poses, axis=0).T
+    yaw = poses[:-1, 2] + turn / 2
+    ahead = (dx * np.cos(yaw) + dy * np.sin(yaw)).sum()
+    is_neither = abs(ahead) <= 0.9 * np.hypot(dx, dy).sum()
+    if layers == 1 or is_neither:
+        return range(layers)
+    return range(1) if ahead > 0 else range(1, 2)
+
+
+def in_layer(
+    edges: NDArray[np.float64], layer: int, layers: int
+) -> NDArray[np.float64]:
+    """Return edges (N, 3) between poses as edges between the states of a layer."""
+    pose, next_pose, cost = edges.T
+    return np.column_stack([pose * layers + layer, next_pose * layers + layer, cost])
 
 
 def edges_of_primitive(
@@ -456,47 +486,6 @@ def shape_of(poses: NDArray[np.float64], start: Pose, goal: Pose) -> Shape:
     )
 
 
-def shapes(options: argparse.Namespace) -> Iterator[list[Any]]:
-    """Yield two rows for each kind of map: paths of primitives, and finished ones."""
-    planner = Planner.load(options.model)
-    assert isinstance(planner.network, RobotNetwork)
-    assert planner.pose_planner is not None
-    random = np.random.default_rng(options.seed)
-    maps = {"empty": GridMap(np.zeros((280, 280), np.bool_), CELL)}
-    maps |= worlds(options.maps, random)
-    maps |= {f"{name}, costs": inflate(grid, 0.0, 1.0) for name, grid in maps.items()}
-    footprint = str(planner.network.footprint.tolist())
-    for name, grid in maps.items():
-        obstacles = GridMap(grid.uninflated, CELL)
-        oracle = Oracle(occupied_cells(obstacles), footprint)
-        drawn = requests(obstacles, SHAPE_RADIUS, random)
-        pairs = (pair for pair in drawn if math.dist(pair[0][:2], pair[1][:2]) > 4)
-        results: dict[bool, list[tuple[float, ...]]] = {False: [], True: []}
-        for start, goal in islice(pairs, options.requests):
-            costs = []
-            for is_finished, rows in results.items():
-                request = PoseRequest(grid, start, (goal,), finished=is_finished)
-                began = time.process_time()
-                plan = last_step(planner.pose_planner.steps(request))
-                ms = 1e3 * (time.process_time() - began)
-                if not plan.poses.size:
-                    break
-                costs.append(plan.cost or 0.0)
-                shape = shape_of(plan.poses, start, goal)
-                is_exact = shape.off < 1e-6 and shape.turned < 1e-6
-                hits = oracle.collisions(plan.poses)
-                rows.append((*shape, is_exact, costs[-1] / costs[0], ms, hits))
-        if not results[True]:
-            continue
-        for is_finished, rows in results.items():
-            *figures, ms, _ = np.mean(rows, axis=0)
-            median_ms = np.median(np.array(rows)[:, -2])
-            hits = int(sum(row[-1] > 0 for row in rows))
-            kind = "finished" if is_finished else "of primitives"
-            words = [f"{figure:.2f}" for figure in (*figures, median_ms)]
-            yield [name, kind, len(rows), *words, hits]
-
-
 class Speed(NamedTuple):
     """What one request took: milliseconds of CPU time, if no unit is named."""
 
@@ -604,11 +593,6 @@ def blocks(share: float, seed: int) -> GridMap:
 
 
 FIGURES: Final = {
-    "shapes": (
-        "map | paths | requests | degrees per 10 m | flips | cusps | ends off, cm "
-        "| degrees | exact | cost | ms | with a collision",
-        shapes,
-    ),
     "collisions": (
         "body | motion | requests | plans | with a collision | poses",
         collisions,

@@ -215,7 +215,7 @@ def test_plan_drives_a_body_as_the_library_and_without_a_collision(
             poses = np.array(rows, dtype=float)
             np.testing.assert_allclose(poses, plan.poses, atol=1e-6)
             assert Oracle(occupied_cells(grid), body).collisions(poses) == 0
-        seen.add(plan.poses.tobytes())
+        seen.add((plan.poses.tobytes(), plan.cost))
     assert len(seen) == len(BODY_ASKED)  # each option counts
 
 

@@ -13,7 +13,8 @@ from ddqn_planner.grid.arguments import as_whole
 from ddqn_planner.model import save_model
 from ddqn_planner.model.model_file import check_model_path
 from ddqn_planner.robot.body_certificate import BodyCertificate
-from ddqn_planner.robot.motions import HEADINGS
+from ddqn_planner.robot.driving_costs import CUSP_METRES, DrivingCosts
+from ddqn_planner.robot.motions import BEHIND, HEADINGS
 from ddqn_planner.training.robot import (
     MOST_STEPS,
     ROBOT,
@@ -51,6 +52,20 @@ OPTIONS = (
         "a file of Nav2's lattice generator, instead of these four",
     ),
     Option("allow-reverse", bool, False, "the lattice's motions also in reverse"),
+    Option(
+        "bend-cost",
+        float,
+        None,
+        "of a metre in a bend, in metres driven straight ahead: by default 1.05, or "
+        "what the lattice says",
+    ),
+    Option("reverse-cost", float, BEHIND, "of a metre in reverse or sideways"),
+    Option(
+        "cusp-cost",
+        float,
+        CUSP_METRES,
+        "of a change between ahead and reverse, in metres",
+    ),
     Option("out", Path, "my_robot.safetensors", "the model's file"),
     Option("seed", int, 0, "seed of the training"),
     Option("steps", int, ROBOT.steps, "transitions after which to give up"),
@@ -78,6 +93,7 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
             options.headings,
             options.lattice,
             options.allow_reverse,
+            DrivingCosts(options.bend_cost, options.reverse_cost, options.cusp_cost),
         )
     )
     trainer = RobotTrainer(options.footprint, motions, options.seed, options.padding)

@@ -178,6 +178,7 @@ def model_of(data: bytes) -> tuple[QNetwork, ModelMetadata]:
             f"its metadata is wrong ({error}); train the model again"
         ) from None
     network_class = NETWORKS[description.network]
+    tensors = {**network_class.former_tensors, **tensors}
     _check_tensors(tensors, network_class, description.sizes)
     return network_class(description.sizes, tensors), description
 

@@ -63,6 +63,8 @@ class QNetwork:
     max_size: ClassVar[int] = 4096
     # Sizes that files of older versions do not name, as theirs are always these.
     former_sizes: ClassVar[Mapping[str, int]] = {}
+    # Tensors that files of older versions lack, and what these stand for.
+    former_tensors: ClassVar[Mapping[str, NDArray[np.generic]]] = {}
     doubles: ClassVar[frozenset[str]] = frozenset()  # tensors that are float64
 
     def __init__(self, sizes: Mapping[str, int], tensors: Mapping[str, Array]) -> None:

@@ -16,6 +16,7 @@ from ddqn_planner.robot.footprint import read_footprint, swept_cells
 from ddqn_planner.robot.motions import (
     HEADINGS,
     HEADINGS_OF_LATTICES,
+    MIN_COST,
     Motions,
     is_too_cheap,
     turn_between,
@@ -39,8 +40,11 @@ class RobotNetwork(QNetwork):
     name = "robot"
     size_names = ("units", "side", "primitives", "poses", "corners", "headings")
     former_sizes: ClassVar = {"headings": HEADINGS}
+    former_tensors: ClassVar = {"cusp": np.zeros(1)}  # they cost nothing
     max_size = 2**16
-    doubles = frozenset({"primitive", "pose", "angle", "footprint", "resolution"})
+    doubles = frozenset(
+        {"primitive", "pose", "angle", "footprint", "resolution", "cusp"}
+    )
 
     @classmethod
     def shapes(cls, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
@@ -55,6 +59,7 @@ class RobotNetwork(QNetwork):
             "footprint": (sizes["corners"], 2),
             "angle": (sizes["headings"],),
             "resolution": (1,),
+            "cusp": (1,),
         }
 
     @classmethod
@@ -95,6 +100,7 @@ class RobotNetwork(QNetwork):
             "footprint": footprint,
             "angle": motions.angles,
             "resolution": np.array([motions.resolution]),
+            "cusp": np.array([motions.cusp]),
         }
         sizes = {
             "units": units,
@@ -226,6 +232,7 @@ def _motions_of(tensors: Mapping[str, NDArray[Any]]) -> Motions:
         or pose_count.sum() != len(pose_N3)
         or not ((column.cost > 0) & (column.cost < np.inf)).all()
         or not tensors["resolution"] > 0
+        or not _is_cost_of_cusps(float(tensors["cusp"][0]))
     )
     if is_damaged:
         raise ValueError("its primitives are damaged; train the robot again")
@@ -242,7 +249,13 @@ def _motions_of(tensors: Mapping[str, NDArray[Any]]) -> Motions:
         offset=offset,
         cost=column.cost.astype(np.float32),
         poses=tuple(np.split(pose_N3, end_row[:-1])),
+        cusp=float(tensors["cusp"][0]),
     )
+
+
+def _is_cost_of_cusps(cusp: float) -> bool:
+    """Return whether a cusp may cost so many cells: none, or enough to be seen."""
+    return cusp == 0 or MIN_COST <= cusp < np.inf
 
 
 def _are_headings(numbers: NDArray[np.int64], headings: int) -> bool:

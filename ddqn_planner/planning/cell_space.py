@@ -306,7 +306,7 @@ def grow(known: Known, costs: MoveCosts, start: int, limit: int) -> tuple[Known,
             known.distance,
             known.mark,
             queue,
-            Target(start, TIES, 0.0, max(visits_left, 1)),
+            Target(start, 1, TIES, 0.0, max(visits_left, 1)),
             space,
         )
         opened = states_in_buckets(queue)

@@ -21,13 +21,14 @@ from ddqn_planner.planning.pose_curves import (
     write_curve,
     write_pieces,
 )
-from ddqn_planner.planning.pose_paths import ON_THE_SPOT, Float64
+from ddqn_planner.planning.pose_paths import Float64
 from ddqn_planner.planning.queues import (
     Heap,
     make_heap,
     pop_from_heap,
     push_to_heap,
 )
+from ddqn_planner.robot.directions import cusps_before, directions_of_travel
 
 # So many steps apart are the poses of a curve that are checked first, before its cost
 # is computed, and then.
@@ -40,7 +41,7 @@ NODE_SPACING: Final = 8.0
 JUMP: Final = 1.35
 # The weight of a chain is its cost and so many cells for each radian of a turn, for
 # each curve and each stretch of the path, and for each change between ahead and
-# reverse: so that a path turns less, and less often.
+# reverse, if this does not cost more: so that a path turns less, and less often.
 TURN_WEIGHT: Final = 8.0
 CURVE_WEIGHT: Final = 1.0
 CUSP_WEIGHT: Final = 12.0
@@ -56,7 +57,8 @@ class Track(NamedTuple):
     """A path of N poses along which a chain may lead."""
 
     poses: Float64  # (N, 3), in cells
-    costs: Float64  # (N,): up to each pose; infinite where the body has no room
+    # (N,): up to each pose, without cusps; infinite where the body has no room
+    costs: Float64
 
 
 class Chain(NamedTuple):
@@ -91,7 +93,7 @@ class Nodes(NamedTuple):
     next_weight: Float64  # (N,): of the stretch to it
     next_direction: Int64  # (N,): in which the robot drives there
     first: Int64  # (G + 1,): where the nodes of each group begin
-    cost_before: Float64  # (G,): of the planned path
+    cost_before: Float64  # (G,): of the planned path, with cusps
     may_reverse: NDArray[np.bool_]  # (G,): whether the path has a step in reverse there
     # What is found for a robot that arrives in each direction: the least weight of a
     # chain to the goal, its next node, and the word to it.
@@ -127,7 +129,7 @@ def choose(nodes: Any, jumps: Int64, limits: Any, candidates: Any, course: Any) 
             if next_node != NO_NODE:
                 direction = nodes.next_direction[node]
                 weight = nodes.next_weight[node] + nodes.value[next_node, direction]
-                _take(nodes, node, next_node, KEPT, direction, weight)
+                _take(nodes, node, next_node, KEPT, direction, weight, course)
             for jump in jumps:
                 next_group = group + jump
                 if next_group < groups:
@@ -139,15 +141,22 @@ def choose(nodes: Any, jumps: Int64, limits: Any, candidates: Any, course: Any) 
 
 @in_place
 def _take(
-    nodes: Any, node: int, next_node: int, word: int, direction: int, weight: float
+    nodes: Any,
+    node: int,
+    next_node: int,
+    word: int,
+    direction: int,
+    weight: float,
+    course: Any,
 ) -> None:
     """Take a curve or a stretch from a node if it weighs less than what was taken.
 
     `direction` is that in which the robot drives it, and `weight` that of the chain by
     way of it, up to the goal.
     """
+    cusp_weight = max(CUSP_WEIGHT, course.rates.cusp)
     for arrival in range(2):
-        weight_with_cusp = weight + (CUSP_WEIGHT if arrival != direction else 0.0)
+        weight_with_cusp = weight + (cusp_weight if arrival != direction else 0.0)
         if weight_with_cusp < nodes.value[node, arrival]:
             nodes.value[node, arrival] = weight_with_cusp
             nodes.chosen_node[node, arrival] = next_node
@@ -174,7 +183,7 @@ def _take_free(nodes: Any, node: int, candidates: Any, course: Any) -> None:
         for stride in STRIDES:
             is_free = is_free and is_curve_free(begin, word, stride, course)
         if is_free:
-            _take(nodes, node, next_node, word, direction, weight)
+            _take(nodes, node, next_node, word, direction, weight, course)
 
 
 @in_place
@@ -244,17 +253,21 @@ def _weight_of_chain(
 # From Python
 
 
-def best_chain(tracks: list[Track], limits: Limits, course: Course) -> Chain:
+def best_chain(
+    tracks: list[Track], planned_costs: Float64, limits: Limits, course: Course
+) -> Chain:
     """Return the chain of the least weight; with exact ends, where there is one.
 
     Parameters
     ----------
     tracks : list of Track
         The planned path, or this and its two moved copies, all of N poses.
+    planned_costs : (N,)
+        Of the planned path up to each pose, with cusps.
     limits : Limits
     course : Course
     """
-    nodes = _nodes_of(tracks)
+    nodes = _nodes_of(tracks, planned_costs)
     # An end in the centre of a cell weighs more than any path, if there is another.
     price = float(nodes.next_weight.sum()) + 2 * limits.end_cost
     _write_values_of_goals(nodes, price)
@@ -271,13 +284,17 @@ def best_chain(tracks: list[Track], limits: Limits, course: Course) -> Chain:
         queue=make_heap(most_curves),
     )
     choose(nodes, jumps, limits, candidates, course)
-    return _follow(_best_start(nodes, price), nodes, tracks, course)
+    first = _best_start(nodes, price)
+    return _follow(first, nodes, tracks, planned_costs, course)
 
 
-def _nodes_of(tracks: list[Track]) -> Nodes:
-    """Return the nodes of T tracks, of which the first one is the planned path."""
+def _nodes_of(tracks: list[Track], planned_costs: Float64) -> Nodes:
+    """Return the nodes of T tracks, of which the first one is the planned path.
+
+    `planned_costs` (N,) are those of the planned path up to each pose, with cusps.
+    """
     planned = tracks[PLANNED]
-    is_behind = _steps_behind(planned.poses)  # (N - 1,)
+    is_behind = directions_of_travel(planned.poses) < 0  # (N - 1,)
     indices = _node_poses(planned.poses, is_behind)  # (G,)
     costs = np.array([track.costs[indices] for track in tracks])  # (T, G)
     has_node = np.isfinite(costs)
@@ -304,7 +321,7 @@ def _nodes_of(tracks: list[Track]) -> Nodes:
         next_weight=weight[path, group],
         next_direction=np.where(is_after, REVERSE, FORWARD)[group],
         first=np.append(0, np.cumsum(has_node.sum(axis=0))),
-        cost_before=costs[PLANNED],
+        cost_before=planned_costs[indices],
         may_reverse=is_before | is_after,
         value=np.full(shape, np.inf),
         chosen_node=np.full(shape, NO_NODE),
@@ -323,14 +340,6 @@ def _node_poses(poses: Float64, is_behind: NDArray[np.bool_]) -> Int64:
     even = np.searchsorted(lengths, np.arange(0, lengths[-1], NODE_SPACING))
     cusps = np.flatnonzero(is_behind[1:] != is_behind[:-1]) + 1
     return np.unique(np.concatenate([[0, last], even.clip(0, last), cusps]))
-
-
-def _steps_behind(poses: Float64) -> NDArray[np.bool_]:
-    """Return which steps of a path (N, 3) are driven in reverse: (N - 1,)."""
-    dx, dy, turn = np.diff(poses, axis=0).T
-    yaw = poses[:-1, 2] + turn / 2
-    is_behind: NDArray[np.bool_] = dx * np.cos(yaw) + dy * np.sin(yaw) < -ON_THE_SPOT
-    return is_behind
 
 
 def lengths_of(poses: Float64) -> Float64:
@@ -369,15 +378,23 @@ class _Part(NamedTuple):
     costs: Float64  # (N,): from the first pose to each
 
 
-def _follow(first: int, nodes: Nodes, tracks: list[Track], course: Course) -> Chain:
-    """Return the chain that leads on from a node."""
+def _follow(
+    first: int,
+    nodes: Nodes,
+    tracks: list[Track],
+    planned_costs: Float64,
+    course: Course,
+) -> Chain:
+    """Return the chain that leads on from a node.
+
+    `planned_costs` (N,) are those of the planned path up to each pose, with cusps.
+    """
     node = first
     direction = int(np.argmin(nodes.value[first]))
     cost = 0.0
     poses = [nodes.pose[first][None]]
     costs = [np.zeros(1)]
-    planned_costs = [np.zeros(1)]
-    planned = tracks[PLANNED].costs
+    replaced_costs = [np.zeros(1)]
     while nodes.chosen_node[node, direction] != NO_NODE:
         next_node = int(nodes.chosen_node[node, direction])
         word = int(nodes.chosen_word[node, direction])
@@ -391,13 +408,17 @@ def _follow(first: int, nodes: Nodes, tracks: list[Track], course: Course) -> Ch
             direction = REVERSE if is_in_reverse(word) else FORWARD
         poses.append(part.poses)
         costs.append(cost + part.costs)
-        planned_costs.append(_evenly(planned[begin], planned[end], len(part.poses)))
+        replaced_costs.append(
+            _evenly(planned_costs[begin], planned_costs[end], len(part.poses))
+        )
         cost += float(part.costs[-1])
         node = next_node
+    all_poses = np.concatenate(poses)
+    cusps = cusps_before(directions_of_travel(all_poses))
     return Chain(
-        np.concatenate(poses),
-        np.concatenate(costs),
-        np.concatenate(planned_costs),
+        all_poses,
+        np.concatenate(costs) + course.rates.cusp * cusps,
+        np.concatenate(replaced_costs),
         first_track=int(nodes.path[first]),
         last_track=int(nodes.path[node]),
     )

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ddqn_planner.compiled import in_place
 from ddqn_planner.grid.layers import forbids, has_costs, multiplier_at
 from ddqn_planner.grid.moves import ACTION_OF_STEP
-from ddqn_planner.planning.pose_paths import AHEAD, ON_THE_SPOT, Float64
+from ddqn_planner.planning.pose_paths import Float64
 from ddqn_planner.planning.pose_world import (
     BORDER,
     LAST_BIT,
@@ -24,6 +24,8 @@ from ddqn_planner.planning.pose_world import (
     is_far,
     is_inside,
 )
+from ddqn_planner.robot.directions import AHEAD, ON_THE_SPOT
+from ddqn_planner.robot.driving_costs import Rates
 from ddqn_planner.robot.motions import ANGLE, SPACING
 
 Int64 = NDArray[np.int64]
@@ -43,17 +45,6 @@ SPIN_AHEAD: Final = 8
 SPIN_BEHIND: Final = 9
 FINE: Final = 0.02  # cells between points of a curve that tell the cells that it passes
 COARSE: Final = 0.5  # likewise, where no cell forbids a move
-
-
-class Rates(NamedTuple):
-    """What a cell of length and a radian cost; infinite where a robot cannot drive."""
-
-    ahead: float
-    bend_ahead: float
-    behind: float
-    bend_behind: float
-    aside: float
-    spin: float  # a radian on the spot
 
 
 class Course(NamedTuple):

@@ -306,6 +306,7 @@ class PoseField(Field[Search]):
         is_weighted = aim.weight > 1
         target = Target(
             state=aim.start_number,
+            states=search.world.body.directions,
             share=1.0 if is_weighted else 1 / bound,
             cost_enough=bound * self._lower_bound,
             most_visits=most_visits,
@@ -424,7 +425,7 @@ class PoseField(Field[Search]):
             proved_bound = self.reach(start, bound, ALL_STATES, is_bound_proved)
             assert proved_bound is not None
             search = self.known
-            start_number = search.aim.start_number
+            start_number = _cheapest_start(search)
             cost = search.distance[start_number]
             most_primitives = int(cost / body.cost.min()) + 1
             most_poses = int(np.diff(body.first_pose).max())  # of a primitive
@@ -441,7 +442,8 @@ class PoseField(Field[Search]):
             poses=np.column_stack([grid.centres(in_cells), yaw_in_frame]),
             cells=cells_of(in_cells),
             costs=costs.copy(),
-            # If the rest could cost less, so could the whole path.
+            # If the rest could cost less, so could the whole path: a robot that drives
+            # there, and so pays for a cusp if it leaves in the other direction.
             least_costs=float(costs[-1]) / proved_bound - costs,
             escape=escape,
         )
@@ -547,7 +549,22 @@ def may_escape(start: State, world: World) -> bool:
 
 def _cost_from_start(search: Search) -> float:
     """Return the least cost found from the aim's start; infinite without a path."""
-    number = search.aim.start_number
+    number = _cheapest_start(search)
     if number < 0 or search.mark[number] == wavefront.UNREACHED:
         return math.inf
     return float(search.distance[number])
+
+
+def _cheapest_start(search: Search) -> int:
+    """Return the number of the aim's state at the start that costs least so far.
+
+    The robot stands there: a path may begin in any direction of travel. The number is
+    negative if the aim is at no start.
+    """
+    first = search.aim.start_number
+    if first < 0:
+        return first
+    states = slice(first, first + search.world.body.directions)
+    is_reached = search.mark[states] != wavefront.UNREACHED
+    costs = np.where(is_reached, search.distance[states], np.inf)
+    return first + int(costs.argmin())

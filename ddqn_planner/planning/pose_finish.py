@@ -7,7 +7,7 @@ The best chain of free curves and of stretches of the path is that of `pose_chai
 """
 
 import math
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,14 +36,11 @@ from ddqn_planner.planning.pose_curves import (
     YAWS,
     Course,
     Int64,
-    Rates,
     count_free,
     write_costs,
     write_masks,
 )
 from ddqn_planner.planning.pose_paths import (
-    AHEAD,
-    ON_THE_SPOT,
     BodyPoints,
     Float64,
     PosePath,
@@ -52,6 +49,8 @@ from ddqn_planner.planning.pose_paths import (
     touches,
 )
 from ddqn_planner.planning.pose_world import BORDER, World
+from ddqn_planner.robot.directions import cusps_before, directions_of_travel
+from ddqn_planner.robot.driving_costs import Rates, least_radius_of, rates_of
 from ddqn_planner.robot.motions import Motions, turn_between
 
 # What a curve may cost, as a share of what it replaces, if the whole path costs no more
@@ -134,7 +133,7 @@ class Finish:
             return path
         course = self.course(world)
         tracks = self._tracks(path, start, goal, grid, course)
-        chain = self._chain(tracks, course)
+        chain = self._chain(tracks, path.costs - path.costs[0], course)
         if chain is None:
             return path
         finished = _path_of(chain, path, grid)
@@ -172,7 +171,9 @@ class Finish:
         poses[:, 2] = np.unwrap(poses[:, 2])
         ends = in_cells(np.array([start, goal], np.float64), grid)  # (2, 3)
         ends[:, 2] = poses[[0, -1], 2] + turn_between(poses[[0, -1], 2], ends[:, 2])
-        planned = Track(poses, path.costs - path.costs[0])
+        cusps = cusps_before(directions_of_travel(poses))
+        costs = path.costs - path.costs[0] - self._rates.cusp * cusps
+        planned = Track(poses, costs)
         from_start = self._moved(planned, 0, ends[0], grid, course)
         to_goal = self._moved(planned, len(poses) - 1, ends[1], grid, course)
         return [planned, from_start, to_goal]
@@ -200,73 +201,25 @@ class Finish:
         write_costs(poses[first:], len(poses) - first, course, costs[first:])
         return Track(poses, costs)
 
-    def _chain(self, tracks: list[Track], course: Course) -> Chain | None:
-        """Return the best chain that costs no more than the path; None without one."""
+    def _chain(
+        self, tracks: list[Track], costs: Float64, course: Course
+    ) -> Chain | None:
+        """Return the best chain that costs no more than the path; None without one.
+
+        `costs` (N,) are those of the path up to each pose, with cusps.
+        """
         planned = tracks[PLANNED]
-        cost = float(planned.costs[-1])
+        cost = float(costs[-1])
         end_cost = END_COST * cost / max(float(lengths_of(planned.poses)[-1]), 1.0)
         for slack in SLACKS:
-            chain = best_chain(tracks, Limits(slack, end_cost), course)
+            chain = best_chain(tracks, costs, Limits(slack, end_cost), course)
             exact_ends = int(chain.first_track == FROM_START) + int(
                 chain.last_track == TO_GOAL
             )
             if chain.cost <= cost * (1 + SAME_END) + exact_ends * end_cost:
                 return chain
-        chain = best_chain(tracks[:1], Limits(1.0, end_cost), course)
+        chain = best_chain(tracks[:1], costs, Limits(1.0, end_cost), course)
         return chain if chain.cost <= cost * (1 + SAME_END) else None
-
-
-class PrimitiveRate(NamedTuple):
-    """What one primitive costs, and how sharply it bends."""
-
-    kind: str  # the field of `Rates` that it belongs to
-    rate: float  # per cell of length, or per radian on the spot
-    radius: float  # of its sharpest bend in cells; infinite without one
-
-
-def _rate_of_primitive(poses: Float64, cost: float) -> PrimitiveRate:
-    """Return the rate of a primitive with these poses (N, 3) and this cost."""
-    dx, dy, turn = np.diff(poses, axis=0).T  # (N - 1,) each
-    lengths = np.hypot(dx, dy)
-    length = float(lengths.sum())
-    if length < ON_THE_SPOT:
-        return PrimitiveRate("spin", cost / float(np.abs(turn).sum()), math.inf)
-    rate = cost / length
-    yaw = poses[:-1, 2] + turn / 2
-    ahead = float((dx * np.cos(yaw) + dy * np.sin(yaw)).sum())
-    if abs(ahead) <= AHEAD * length:
-        return PrimitiveRate("aside", rate, math.inf)
-    direction = "ahead" if ahead > 0 else "behind"
-    is_bend = np.abs(turn) > ON_THE_SPOT
-    if not is_bend.any():
-        return PrimitiveRate(direction, rate, math.inf)
-    radii = lengths[is_bend] / np.abs(turn[is_bend])
-    return PrimitiveRate(f"bend_{direction}", rate, float(radii.min()))
-
-
-def _rates_of_primitives(motions: Motions) -> list[PrimitiveRate]:
-    """Return the rate of each of a robot's primitives."""
-    costs = motions.cost.tolist()
-    return list(map(_rate_of_primitive, motions.poses, costs))
-
-
-def least_radius_of(motions: Motions) -> float:
-    """Return the radius of a robot's sharpest bend, in cells; infinite without one.
-
-    It is a little greater, so that no curve bends more sharply than a primitive.
-    """
-    radii = [primitive.radius for primitive in _rates_of_primitives(motions)]
-    return min(radii, default=math.inf) * (1 + 1e-3)
-
-
-def rates_of(motions: Motions) -> Rates:
-    """Return what a robot's motions cost: of a kind, the dearest primitive counts."""
-    rates = dict.fromkeys(Rates._fields, 0.0)
-    for primitive in _rates_of_primitives(motions):
-        rates[primitive.kind] = max(rates[primitive.kind], primitive.rate)
-    # A kind without a primitive cannot be driven.
-    drivable_rates = {kind: rate or math.inf for kind, rate in rates.items()}
-    return Rates(**drivable_rates)
 
 
 def words_of(rates: Rates) -> Int64:

@@ -12,6 +12,12 @@ from ddqn_planner.grid.layers import multipliers_of
 from ddqn_planner.grid.moves import ACTION_OF_STEP
 from ddqn_planner.planning.plan import PlanStatus, PosePlan
 from ddqn_planner.planning.pose_world import body_costs
+from ddqn_planner.robot.directions import (
+    ON_THE_SPOT,
+    cusps_before,
+    directions_of_travel,
+)
+from ddqn_planner.robot.driving_costs import Rates
 from ddqn_planner.robot.footprint import inside, outline
 from ddqn_planner.robot.motions import BEHIND, TURN, turn_between
 
@@ -23,13 +29,10 @@ OUTLINE_SPACING: Final = 0.25  # cells between two points of a body's outline
 # And inside: so each cell there, turned as it may be, has a point.
 FILL_SPACING: Final = 0.7
 SAME: Final = 1 + 1e-6  # what is rounded in sums of float32 is less
-# The cosine above which a robot drives ahead, not behind or sideways.
-AHEAD: Final = 0.9
 ESCAPE_IN_WORDS: Final = (
     "the start is occupied: cells that the robot's body covers there do not count until"
     " it has left them"
 )
-ON_THE_SPOT: Final = 1e-6  # cells: a shorter step is a turn
 
 
 class PosePath(NamedTuple):
@@ -211,29 +214,33 @@ def cells_of(path: Float64) -> NDArray[np.int32]:
     return np.floor(path[:, :2] + 0.5).astype(np.int32)
 
 
-def cost_of_poses(poses: Float64, grid: GridMap) -> float:
+def cost_of_poses(poses: Float64, grid: GridMap, rates: Rates) -> float:
     """Return the cost of a path along poses (N, 3), in cells.
 
     The poses are in metres and radians, in the map's frame. A step from a pose to the
-    next one costs its length, `BEHIND` times that if it is not driven ahead, or without
-    a length its turn on the spot. All this is times the multiplier of the step's cell.
-    The sum is nearly the cost of the primitives of which the path is made.
+    next one costs its length or its turn on the spot by the robot's rates, times the
+    multiplier of the step's cell. What the robot cannot drive costs as much as another
+    robot's. The sum is nearly the cost of the primitives of which the path is made.
     """
     path = in_cells(poses, grid)
+    path[:, 2] = np.unwrap(path[:, 2])
+    spin_of_others = TURN / grid.resolution
+    of_others = Rates(1.0, 1.0, BEHIND, BEHIND, BEHIND, spin_of_others)
+    rate = Rates(*np.where(np.isfinite(rates), rates, of_others).tolist())
     steps: Float64 = np.diff(path[:, :2], axis=0)
     dx = steps[:, 0]
     dy = steps[:, 1]
     # All arrays from here on are (N - 1,), a number for each step.
     length = np.hypot(dx, dy)
-    yaw = path[:-1, 2]
-    turn = turn_between(yaw, path[1:, 2])
-    mean_yaw = yaw + turn / 2
-    length_ahead = dx * np.cos(mean_yaw) + dy * np.sin(mean_yaw)
-    is_ahead = length_ahead > AHEAD * length
-    drive_cost = np.where(is_ahead, length, BEHIND * length)
-    turn_cost = np.abs(turn) * TURN / grid.resolution
+    turn = np.abs(np.diff(path[:, 2]))
+    direction = directions_of_travel(path)
+    is_bend = turn > ON_THE_SPOT
+    rate_ahead = np.where(is_bend, rate.bend_ahead, rate.ahead)
+    rate_behind = np.where(is_bend, rate.bend_behind, rate.behind)
+    rate_along = np.where(direction > 0, rate_ahead, rate_behind)
+    drive_cost = length * np.where(direction == 0, rate.aside, rate_along)
     is_on_the_spot = length < ON_THE_SPOT
-    cost = np.where(is_on_the_spot, turn_cost, drive_cost)
+    cost = np.where(is_on_the_spot, turn * rate.spin, drive_cost)
     # The layers of the map count at the cell in which a step begins.
     cells = cells_of(path[:-1])  # (N - 1, 2)
     x = cells[:, 0]
@@ -243,7 +250,8 @@ def cost_of_poses(poses: Float64, grid: GridMap) -> float:
         cost *= multipliers_of(cell_costs[y, x])
     if grid.slowness is not None:
         cost *= grid.slowness[y, x]
-    return float(cost.sum())
+    cusps = int(cusps_before(direction)[-1])
+    return float(cost.sum()) + rate.cusp * cusps
 
 
 @in_place

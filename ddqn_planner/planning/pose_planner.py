@@ -37,6 +37,7 @@ from ddqn_planner.planning.pose_world import (
     world_of,
     world_with_escape,
 )
+from ddqn_planner.robot.driving_costs import rates_of
 from ddqn_planner.robot.motions import turn_between
 
 if TYPE_CHECKING:
@@ -74,6 +75,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         self.points = paths.points_of(self.footprint, self.motions.resolution)
         # A start so near to a pose of a path, in cells and radians, lies on that path.
         self._on_path = 0.5, math.pi / self.motions.headings
+        self._rates = rates_of(self.motions)
         self._finish = Finish(self.motions, self.footprint, self.points)
         # A request compares the same two maps for its path, its world and its field.
         self._differences = lru_cache(maxsize=1)(differences)
@@ -94,10 +96,14 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         if exploration is None or plan.cost is None or len(plan.poses) < 2:
             return plan
         seconds = [
-            paths.cost_of_poses(plan.poses, grid) * (grid.seconds_per_cell or 1.0)
+            self._cost_along(plan.poses, grid) * (grid.seconds_per_cell or 1.0)
             for grid in (request.grid, exploration.untimed)
         ]
         return replace(plan, cost=plan.cost * seconds[0] / seconds[1])
+
+    def _cost_along(self, poses: NDArray[np.float64], grid: GridMap) -> float:
+        """Return the cost of a path along poses (N, 3) in the map frame, in cells."""
+        return paths.cost_of_poses(poses, grid, self._rates)
 
     def _find_on_map(
         self, request: PoseRequest, clock: Clock
@@ -406,11 +412,11 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         if is_other_end:
             return plan
         # Costs are in cells here, and in seconds in a plan on a map of expected times.
-        rest_cost = paths.cost_of_poses(rest, grid)
+        rest_cost = self._cost_along(rest, grid)
         least_cost = 0.0  # of any path: without a new path nothing is proved
         ratio = 1.0  # of the cost of the rest to that of the new path
         if has_new_path:
-            new_cost = paths.cost_of_poses(plan.poses, grid)
+            new_cost = self._cost_along(plan.poses, grid)
             if not request.keeps(rest_cost, new_cost):
                 return plan
             if new_cost:
@@ -481,7 +487,8 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         turn = np.abs(turn_between(self.motions.angles, yaw - grid.origin[2]))  # (H,)
         nearest_headings: list[int] = np.argsort(turn, kind="stable")[:2].tolist()
         column, row = grid.world_to_cell(x, y)
-        return [(column, row, heading) for heading in nearest_headings]
+        directions = self.body.directions
+        return [(column, row, heading * directions) for heading in nearest_headings]
 
     def _state_at(self, grid: GridMap, pose: Pose, world: World) -> State | None:
         """Return the state (x, y, heading) of a pose on a map; None without room.
@@ -522,10 +529,16 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
     ) -> NDArray[np.int64]:
         """Return the states (N, 3) of those poses in which the body has room.
 
-        The poses are (x, y, yaw) in metres and radians; see `_state_at`.
+        The poses are (x, y, yaw) in metres and radians; see `_state_at`. Each has a
+        state for each direction of travel.
         """
-        states = [self._state_at(grid, pose, world) for pose in poses]
-        with_room = [state for state in states if state is not None]
+        with_room: list[State] = []
+        for pose in poses:
+            state = self._state_at(grid, pose, world)
+            if state is not None:
+                x, y, heading = state
+                directed = range(heading, heading + self.body.directions)
+                with_room += [(x, y, number) for number in directed]
         return np.array(with_room, dtype=np.int64).reshape(-1, 3)
 
     def _states_around_goal(
@@ -552,7 +565,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         goal_column, goal_row = grid.world_to_cell(x, y)
         radius = metres * ROUNDING / grid.resolution  # cells
         # In which headings a path may end: within the tolerance, or the nearest one.
-        turn = np.abs(turn_between(self.motions.angles, yaw - grid.origin[2]))  # (H,)
+        turn = np.abs(turn_between(self.body.angle, yaw - grid.origin[2]))  # (H,)
         if request.either_direction:
             turn = np.minimum(turn, math.pi - turn)
         may_end = turn <= max(radians, turn.min()) * ROUNDING  # (H,)
@@ -596,13 +609,13 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         radius : float
             Cells from the goal.
         """
-        motions = self.motions
+        body = self.body
         # -1: at any distance, also 0. With the radius itself: nowhere.
         least_distance = np.where(may_end, -1.0, radius)
         for heading in np.flatnonzero(may_end):
-            leads_there = motions.end == heading  # (P,): by primitive
-            if may_end[motions.start[leads_there]].all():
-                longest = np.hypot(*motions.offset[leads_there].T).max()
+            leads_there = body.end == heading  # (P,): by primitive
+            if may_end[body.start[leads_there]].all():
+                longest = np.hypot(*body.offset[leads_there].T).max()
                 least_distance[heading] = radius - longest
         return least_distance
 

@@ -13,6 +13,7 @@ from ddqn_planner.grid.boxes import Box
 from ddqn_planner.grid.layers import Layers, forbids, has_costs, multiplier_at
 from ddqn_planner.grid.map_changes import changed_cells
 from ddqn_planner.grid.moves import ACTION_OF_STEP, STAND
+from ddqn_planner.robot.directions import CUSP, DirectedMotions, with_directions
 from ddqn_planner.robot.motions import Motions, dense_poses
 
 SHIFT: Final = 2  # so many bits tell where in its tile a cell lies, along a side
@@ -79,6 +80,7 @@ class Body(NamedTuple):
     # The least cost of a primitive per cell of its origin's path, 1 at most: a lattice
     # file may count less than the length.
     cost_per_cell: float
+    directions: int  # of travel, for each heading of the robot, see `DirectedMotions`
     has_origin_inside: bool  # whether all cells that the origin passes must be free
 
 
@@ -126,16 +128,22 @@ class Masks(NamedTuple):
 
 
 def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
-    """Return P primitives as kernels need them: all in flat arrays, see `Body`.
+    """Return a robot's primitives as kernels need them: in flat arrays, see `Body`.
+
+    Where a change between ahead and reverse costs something, headings and primitives
+    are those of `DirectedMotions`.
 
     Parameters
     ----------
     motions : Motions
-        The primitives, sorted by the headings in which they start.
+        P primitives, sorted by the headings in which they start.
     swept : (P, S, S)
         The cells that the body sweeps on each primitive, by y and x, with the cell in
         which the primitive begins in the middle.
     """
+    directed = with_directions(motions)
+    swept = _swept_on(directed, motions, swept)
+    motions = directed.motions
     # For each primitive, the cells that the origin passes.
     passes = [_passed_cells(poses) for poses in motions.poses]
     lowest = np.array([cells.min(axis=0) for cells, _, _ in passes])  # (P, 2)
@@ -194,8 +202,31 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
         highest_passed=highest,
         reach=reach,
         cost_per_cell=_cost_per_cell(motions),
+        directions=directed.directions,
         has_origin_inside=bool(masks.core[:, middle, middle].all()),
     )
+
+
+def _swept_on(
+    directed: DirectedMotions, motions: Motions, swept: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return the cells (Q, S, S) that a body sweeps on directed primitives.
+
+    On a cusp, these are the cells in which the body stands: those that all primitives
+    sweep which begin in the heading. `swept` (P, S, S) are those of the robot's
+    `motions`.
+    """
+    standing = np.array(
+        [
+            swept[motions.start == heading].all(axis=0)
+            for heading in range(motions.headings)
+        ]
+    )  # (H, S, S)
+    swept_on = swept[directed.primitive]
+    is_cusp = directed.primitive == CUSP
+    heading = directed.motions.start[is_cusp] // directed.directions
+    swept_on[is_cusp] = standing[heading]
+    return swept_on
 
 
 def _cost_per_cell(motions: Motions) -> float:
@@ -284,6 +315,8 @@ def _passed_cells(poses: NDArray[np.float64]) -> PassedCells:
     cells = cell_of_step[first_steps]  # (C, 2)
     length_in_cell = np.add.reduceat(lengths, first_steps)  # (C,)
     shares = length_in_cell / lengths.sum()
+    if len(poses) == 1:  # a cusp, which costs the same in all cells
+        shares = np.zeros(1)
     # The move from each cell to the next one; the origin stays in the last cell.
     dx, dy = np.diff(cells, axis=0).T  # (C - 1,) each
     actions = np.append(ACTION_OF_STEP[dy + 1, dx + 1], STAND)  # (C,)

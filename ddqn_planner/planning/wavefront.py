@@ -2,6 +2,9 @@
 
 from typing import Any, Final, NamedTuple
 
+import numpy as np
+
+from ddqn_planner.compiled import inlined
 from ddqn_planner.planning.queues import NEXT_KEY, NONE_WAITS
 
 # Marks. The cost of an open state may fall; that of a closed one is the least that its
@@ -19,6 +22,8 @@ class Target(NamedTuple):
     """The state whose cost is asked for, and when a wavefront toward it may stop."""
 
     state: int
+    # How many states, from this one on, count as one: the least of their costs does.
+    states: int
     # The cost of the state is known well enough once all states in the queue have a
     # greater key than this share of it (1 for exact costs),
     share: float
@@ -70,6 +75,16 @@ def expand(state: int, distance: Any, mark: Any, queue: Any, space: Any) -> None
     raise NotImplementedError
 
 
+@inlined
+def _least_cost(target: Target, distance: Any, mark: Any) -> float:
+    """Return the least cost found from the states of a target; infinite without one."""
+    cost = np.inf
+    for state in range(target.state, target.state + target.states):
+        if mark[state] != UNREACHED:
+            cost = min(cost, distance[state])
+    return cost
+
+
 def spread(
     distance: Any, mark: Any, queue: Any, target: Target, space: Any
 ) -> Progress:
@@ -105,10 +120,10 @@ def spread(
         # The wavefront stops only between two keys: of the states of one key, all are
         # closed or none. So a rollout may choose among all paths of the same cost.
         if step == NEXT_KEY:
-            if mark[target.state] != UNREACHED:
-                cost = distance[target.state]
-                if cost <= target.cost_enough or is_past(queue, cost * target.share):
-                    break
+            cost = _least_cost(target, distance, mark)
+            is_known = cost <= target.cost_enough or is_past(queue, cost * target.share)
+            if cost < np.inf and is_known:
+                break
             if visits >= target.most_visits:
                 return Progress(visits, OUT_OF_VISITS)
         if is_full(queue, space):

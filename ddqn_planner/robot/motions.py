@@ -81,6 +81,8 @@ class Motions:
     offset: NDArray[np.int64]  # (P, 2) cells, x and y
     cost: NDArray[np.float32]  # (P,) as that of so many cells driven ahead
     poses: tuple[Poses, ...]  # P times (N, 3), from the cell where the primitive begins
+    # What a change between ahead and reverse costs, as so many cells driven ahead.
+    cusp: float = 0.0
 
     @property
     def headings(self) -> int:

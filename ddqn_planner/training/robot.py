@@ -13,8 +13,10 @@ from ddqn_planner.grid.arguments import as_seed, as_whole
 from ddqn_planner.model import ModelMetadata, RobotNetwork
 from ddqn_planner.planning import Planner
 from ddqn_planner.robot.body_certificate import BodyCertificate
+from ddqn_planner.robot.driving_costs import CUSP_METRES, DrivingCosts, with_costs
 from ddqn_planner.robot.footprint import read_footprint
 from ddqn_planner.robot.motions import (
+    BEHIND,
     HEADINGS,
     Motion,
     Motions,
@@ -391,6 +393,7 @@ class MotionOptions(NamedTuple):
     headings: int = HEADINGS  # 16, 32 or 64
     lattice: str | Path | None = None  # a file, in place of the four
     allow_reverse: bool = False  # the lattice's motions also in reverse
+    costs: DrivingCosts = DrivingCosts()
 
 
 def train_robot(  # noqa: PLR0913
@@ -402,6 +405,9 @@ def train_robot(  # noqa: PLR0913
     headings: int = HEADINGS,
     lattice: str | Path | None = None,
     padding: float = 0.0,
+    bend_cost: float | None = None,
+    reverse_cost: float = BEHIND,
+    cusp_cost: float = CUSP_METRES,
     seed: int = 0,
     steps: int = ROBOT.steps,
 ) -> Planner:
@@ -428,6 +434,14 @@ def train_robot(  # noqa: PLR0913
         A file of Nav2's lattice generator, in place of these four.
     padding : float
         Metres by which the body counts as larger: room for a controller.
+    bend_cost : float, optional
+        Of a metre in a bend, in metres driven straight ahead: 1 or more, by default
+        1.05. A lattice's bends cost what its file says, unless a number is given.
+    reverse_cost : float
+        Of a metre in reverse or sideways, likewise.
+    cusp_cost : float
+        Of a change between ahead and reverse, in metres: as far as the robot drives in
+        the time that the change takes. With 0, a request takes less time.
     seed : int
         Of all random draws: 0 to 2^63 - 1.
     steps : int
@@ -447,9 +461,11 @@ def train_robot(  # noqa: PLR0913
     >>> planner.plan_poses(grid, start=(1, 1, 0), goal=(5, 3, 0)).status.name
     'SUCCEEDED'
     """
-    motions = read_motions(
-        MotionOptions(motion, turning_radius, resolution, headings, lattice)
+    costs = DrivingCosts(bend_cost, reverse_cost, cusp_cost)
+    options = MotionOptions(
+        motion, turning_radius, resolution, headings, lattice, costs=costs
     )
+    motions = read_motions(options)
     trainer = RobotTrainer(footprint, motions, seed, padding)
     *_, certificate = trainer.run(steps)
     if not certificate.proved:
@@ -466,14 +482,16 @@ def read_motions(options: MotionOptions) -> Motions:
         problem = "allow_reverse is given without a lattice"
         raise ValueError(f"{problem}; leave it out: all other motions can reverse")
     if options.motion is not None and options.lattice is None:
-        return make_motions(
+        motions = make_motions(
             options.motion,
             options.turning_radius,
             options.resolution,
             options.headings,
         )
+        return with_costs(motions, options.costs, is_lattice=False)
     if options.lattice is not None and options.motion is None:
-        return read_lattice(options.lattice, options.allow_reverse)
+        motions = read_lattice(options.lattice, options.allow_reverse)
+        return with_costs(motions, options.costs, is_lattice=True)
     is_neither = options.motion is None
     problem = (
         "neither motion nor lattice is" if is_neither else "motion and lattice are"

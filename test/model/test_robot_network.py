@@ -2,6 +2,7 @@
 holds.
 """
 
+import json
 from copy import deepcopy
 from dataclasses import replace
 from functools import cache
@@ -11,6 +12,7 @@ from typing import cast
 
 import numpy as np
 import pytest
+import safetensors.numpy
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -278,3 +280,19 @@ def test_a_model_whose_motions_cost_too_little_is_not_proved() -> None:
     assert f"{drives} of {certificate.primitives} cost less" in str(certificate)
     with pytest.raises(ModelFileError, match=r"cost less than the way.*train-robot"):
         loaded.swept()
+
+
+def test_a_file_from_before_cusps_is_read_as_one_whose_cusps_cost_nothing() -> None:
+    network = exact()
+    assert network.motions.cusp == 0
+    data = model_bytes(network, metadata_of(network))
+    tensors = safetensors.numpy.load(data)
+    length = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + length])["__metadata__"]
+    assert tensors.pop("cusp") == 0
+    old, _ = model_of(safetensors.numpy.save(tensors, header))
+    assert isinstance(old, RobotNetwork)
+    assert old.motions.cusp == 0
+    assert np.array_equal(old.motions.cost, network.motions.cost)
+    with pytest.raises(ValueError, match="damaged"):
+        RobotNetwork(network.sizes, {**network.tensors, "cusp": np.array([-1.0])})

@@ -14,6 +14,7 @@ from ddqn_planner.planning import PlanStatus
 from ddqn_planner.planning.path_finder import last_step
 from ddqn_planner.planning.pose_paths import cost_of_poses
 from ddqn_planner.planning.pose_planner import PoseRequest
+from ddqn_planner.robot.driving_costs import rates_of
 
 CELL = 0.1
 START, GOAL = (
@@ -98,7 +99,11 @@ def test_a_body_leaves_the_shortest_path_by_the_share_too(
         )
         chosen = best if is_left else shortest
         assert np.array_equal(explored.poses, chosen.poses)
-        costs = [cost_of_poses(path.poses, expected) for path in (explored, best)]
+        assert planner.pose_planner is not None
+        rates = rates_of(planner.pose_planner.motions)
+        costs = [
+            cost_of_poses(path.poses, expected, rates) for path in (explored, best)
+        ]
         assert explored.cost == pytest.approx(best.cost * costs[0] / costs[1], rel=0.1)
         assert best.cost <= explored.cost <= (1 + share) * best.cost
 

@@ -14,8 +14,9 @@ from ddqn_planner import GridMap
 from ddqn_planner.planning.path_finder import last_step
 from ddqn_planner.planning.plan import Pose, PosePlan, PoseRequest
 from ddqn_planner.planning.pose_curves import write_pieces
-from ddqn_planner.planning.pose_finish import END_COST, least_radius_of, rates_of
+from ddqn_planner.planning.pose_finish import END_COST
 from ddqn_planner.planning.pose_planner import PosePlanner
+from ddqn_planner.robot.driving_costs import least_radius_of, rates_of
 from ddqn_planner.robot.motions import turn_between
 
 MOTIONS = ("ackermann", "differential", "omnidirectional")

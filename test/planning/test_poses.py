@@ -34,6 +34,7 @@ from ddqn_planner.planning.pose_world import (
     rows_of,
     world_of,
 )
+from ddqn_planner.robot.driving_costs import DrivingCosts, rates_of, with_costs
 from ddqn_planner.robot.footprint import read_footprint, swept_cells
 from ddqn_planner.robot.motions import Motions, make_motions, turn_between
 
@@ -58,8 +59,10 @@ BODIES = {
 
 @cache
 def robot(motion: str, body: str = "") -> tuple[Motions, NDArray[np.bool_]]:
-    """Return motions and swept cells of a small robot."""
+    """Return motions and swept cells of a small robot; a car's cusps cost something."""
     motions = make_motions(motion, 0.2, CELL)
+    if motion == "ackermann":
+        motions = with_costs(motions, DrivingCosts(cusp=0.3), is_lattice=False)
     return motions, swept_cells(read_footprint(body or BODIES[motion]), motions)
 
 
@@ -87,7 +90,7 @@ def state_at(planner: PosePlanner, grid: GridMap, state: State) -> State | None:
     angles = planner.motions.angles
     turn = np.abs(turn_between(angles, angles[heading]))
     for nearest in np.argsort(turn, kind="stable")[:2].tolist():
-        states = np.array([(x, y, nearest)])
+        states = np.array([(x, y, nearest * planner.body.directions)])
         if move_free_to_front(states, world_of(grid, planner.body)):
             return x, y, nearest
     return None
@@ -215,7 +218,8 @@ def test_a_core_is_what_all_motions_sweep_around_each_cell_of_the_origin(
         cells.append(
             {(x + i, y) for (y, x), bits in rows for i in range(64) if bits >> i & 1}
         )
-    for heading in range(16):
+    headings = body.angle.size
+    for heading in range(headings):
         swept_around = [
             {(x - over, y - up) for x, y in cells[primitive]}
             for primitive in range(
@@ -225,7 +229,9 @@ def test_a_core_is_what_all_motions_sweep_around_each_cell_of_the_origin(
                 slice(*body.first_passed[primitive : primitive + 2])
             ]
         ]
-        assert cells[body.start.size + 16 + heading] == set.intersection(*swept_around)
+        assert cells[body.start.size + headings + heading] == set.intersection(
+            *swept_around
+        )
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -634,7 +640,10 @@ def test_a_path_is_kept_while_it_costs_hardly_more_and_leads_to_a_goal() -> None
     assert (new.extra_cost, new.bound) == (None, 1.0)
     assert kept.extra_cost == pytest.approx(kept.cost / new.cost - 1)
     assert kept.bound == pytest.approx(kept.cost / new.cost)
-    assert kept.cost == pytest.approx(cost_of_poses(first.poses, above), rel=0.02)
+    rates = rates_of(body.motions)
+    assert kept.cost == pytest.approx(
+        cost_of_poses(first.poses, above, rates), rel=0.02
+    )
     assert (
         plan(body, above, start, other, switch_threshold=0.2, **how).extra_cost is None
     )

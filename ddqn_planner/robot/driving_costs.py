@@ -1,0 +1,132 @@
+"""What it costs a robot to drive: in bends, in reverse, and where it changes direction.
+
+All costs are those of so many cells driven straight ahead.
+"""
+
+import math
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from ddqn_planner.grid.arguments import as_number
+from ddqn_planner.robot.directions import AHEAD, ON_THE_SPOT
+from ddqn_planner.robot.motions import BEHIND, MIN_COST, Motions, Poses
+
+BEND: Final = 1.05  # cost of a metre in a bend: without it, paths of least cost slalom
+CUSP_METRES: Final = 1.0  # 2 s at 0.5 m/s
+MAX_FACTOR: Final = 100.0
+MAX_CUSP: Final = 1000.0  # metres
+
+
+class DrivingCosts(NamedTuple):
+    """What a robot's drives cost, beside a drive straight ahead."""
+
+    # Of a metre in a bend, in metres; None: `BEND`, or with a lattice what its file
+    # says.
+    bend: float | None = None
+    reverse: float = BEHIND  # of a metre in reverse or sideways, in metres
+    cusp: float = CUSP_METRES  # of a change between ahead and reverse, in metres
+
+
+class Rates(NamedTuple):
+    """What a cell of length, a radian and a cusp cost a robot.
+
+    A rate is infinite where the robot cannot drive so.
+    """
+
+    ahead: float
+    bend_ahead: float
+    behind: float
+    bend_behind: float
+    aside: float
+    spin: float  # a radian on the spot
+    cusp: float = 0.0
+
+
+class PrimitiveRate(NamedTuple):
+    """What one primitive costs, and how sharply it bends."""
+
+    kind: str  # the field of `Rates` that it belongs to
+    rate: float  # per cell of length, or per radian on the spot
+    radius: float  # of its sharpest bend in cells; infinite without one
+
+
+def with_costs(motions: Motions, costs: DrivingCosts, is_lattice: bool) -> Motions:
+    """Return motions whose primitives and cusps cost what `costs` say.
+
+    A ValueError if a cost is out of its range: bounds of paths rely on costs.
+    """
+    bend = costs.bend
+    if bend is None:
+        bend = 1.0 if is_lattice else BEND
+    factor_range = f"1 to {MAX_FACTOR:g}: times that of a drive straight ahead"
+    bend = as_number("the cost of bends", bend, 1, MAX_FACTOR, factor_range)
+    reverse = as_number(
+        "the cost of reverse", costs.reverse, 1, MAX_FACTOR, factor_range
+    )
+    cusp_range = f"metres driven ahead, 0 to {MAX_CUSP:g}"
+    cusp = as_number("the cost of a cusp", costs.cusp, 0, MAX_CUSP, cusp_range)
+    kinds = [primitive.kind for primitive in _rates_of_primitives(motions)]
+    factors = {
+        "ahead": 1.0,
+        "bend_ahead": bend,
+        "behind": reverse / BEHIND,
+        "bend_behind": bend * reverse / BEHIND,
+        "aside": reverse / BEHIND,
+        "spin": 1.0,
+    }
+    factor = np.array([factors[kind] for kind in kinds])  # (P,)
+    cusp_in_cells = cusp / motions.resolution
+    return replace(
+        motions,
+        cost=(motions.cost * factor).astype(np.float32),
+        # A path of primitives that cost nothing would not end.
+        cusp=cusp_in_cells if cusp_in_cells >= MIN_COST else 0.0,
+    )
+
+
+def rates_of(motions: Motions) -> Rates:
+    """Return what a robot's motions cost: of a kind, the dearest primitive counts."""
+    rates = dict.fromkeys(Rates._fields, 0.0)
+    for primitive in _rates_of_primitives(motions):
+        rates[primitive.kind] = max(rates[primitive.kind], primitive.rate)
+    # A kind without a primitive cannot be driven.
+    drivable_rates = {kind: rate or math.inf for kind, rate in rates.items()}
+    drivable_rates["cusp"] = motions.cusp
+    return Rates(**drivable_rates)
+
+
+def least_radius_of(motions: Motions) -> float:
+    """Return the radius of a robot's sharpest bend, in cells; infinite without one.
+
+    It is a little greater, so that no curve bends more sharply than a primitive.
+    """
+    radii = [primitive.radius for primitive in _rates_of_primitives(motions)]
+    return min(radii, default=math.inf) * (1 + 1e-3)
+
+
+def _rates_of_primitives(motions: Motions) -> list[PrimitiveRate]:
+    """Return the rate of each of a robot's primitives."""
+    costs: list[float] = motions.cost.tolist()
+    return list(map(_rate_of_primitive, motions.poses, costs))
+
+
+def _rate_of_primitive(poses: Poses, cost: float) -> PrimitiveRate:
+    """Return the rate of a primitive with these poses (N, 3) and this cost."""
+    dx, dy, turn = np.diff(poses, axis=0).T  # (N - 1,) each
+    lengths = np.hypot(dx, dy)
+    length = float(lengths.sum())
+    if length < ON_THE_SPOT:
+        return PrimitiveRate("spin", cost / float(np.abs(turn).sum()), math.inf)
+    rate = cost / length
+    yaw = poses[:-1, 2] + turn / 2
+    ahead = float((dx * np.cos(yaw) + dy * np.sin(yaw)).sum())
+    if abs(ahead) <= AHEAD * length:
+        return PrimitiveRate("aside", rate, math.inf)
+    direction = "ahead" if ahead > 0 else "behind"
+    is_bend = np.abs(turn) > ON_THE_SPOT
+    if not is_bend.any():
+        return PrimitiveRate(direction, rate, math.inf)
+    radii = lengths[is_bend] / np.abs(turn[is_bend])
+    return PrimitiveRate(f"bend_{direction}", rate, float(radii.min()))
