@@ -17,7 +17,7 @@ from ddqn_planner.experience.experience import (
 )
 from ddqn_planner.experience.places import Float64
 from ddqn_planner.experience.visits import (
-    STAND_DISTANCE,
+    SPOT,
     Poses,
     averaged,
     indices_apart,
@@ -118,7 +118,9 @@ class Drive(NamedTuple):
             # `record` compares with the times on the last map of `apply`.
             experience.apply(grid)
         learned = experience.record(self.seconds, self.positions)
-        if self.outcome is DriveEnd.ABORTED and learned.is_possible:
+        # A drive that is long enough to teach and does not cannot be true.
+        is_believed = bool(learned) or self.extent < SHORTEST
+        if self.outcome is DriveEnd.ABORTED and is_believed:
             experience.record_failure(self.positions[-1])
             learned = learned._replace(places=learned.places + 1, reason="")
         return learned
@@ -191,7 +193,7 @@ def _drive_in(line: bytes) -> Drive:
 class DriveRecorder:
     """Divides a robot's poses into drives, and calls `on_drive` with each drive.
 
-    A drive begins when the robot has moved by more than STAND_DISTANCE.
+    A drive begins when the robot has moved by more than SPOT metres.
     """
 
     def __init__(self, on_drive: Callable[[Drive], None]) -> None:
@@ -204,7 +206,7 @@ class DriveRecorder:
         """Forget the current drive, and where the robot is."""
         self._samples: list[Sample] = []  # of the drive; empty before it begins
         self._last: Sample | None = None  # the last pose
-        # The first pose from which the robot has moved no farther than STAND_DISTANCE.
+        # The first pose from which the robot has moved no farther than SPOT.
         self._stand: Sample | None = None
 
     @property
@@ -227,7 +229,7 @@ class DriveRecorder:
         if self._last is not None and seconds < self._last.seconds - JUMP:
             self.end()
             self.forget()
-        if self._stand is None or _distance(self._stand, sample) > STAND_DISTANCE:
+        if self._stand is None or _distance(self._stand, sample) > SPOT:
             self._stand = sample
             if self._last is not None and not self._samples:
                 self._samples = [self._last]  # a drive begins there

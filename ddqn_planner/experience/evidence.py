@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -22,15 +21,12 @@ from ddqn_planner.grid.arguments import MAX_SLOWNESS
 from ddqn_planner.grid.grid_map import check_grid
 
 # A drive has found a change if the mean log slowness of so many known places in a row
-# is off by more than so many standard deviations.
-PLACES_OF_PART = 8
+# is off by more than so many standard deviations,
+PLACES_IN_A_ROW = 8
 SURPRISE = 3.5
-# The standard deviation of that mean, as each path through a place is another.
-PART_NOISE = 0.12
-# From bound to bound of drives' errors. Where errors are larger, so is a surprise.
-USUAL_RANGE = 4.0
-# A surprise is also more than so many times this quantile of the largest surprises of
-# earlier drives.
+# of which each path through a place, which is another, makes so much;
+PATH_NOISE = 0.12
+# and by more than so many times this quantile of the largest surprises of drives.
 UNUSUAL = 2.5
 SURPRISE_QUANTILE = 0.95
 # By which all evidence fades after a change: other places may have changed. Hardly
@@ -72,8 +68,7 @@ class Evidence:
     places : Places
         The sums of what all robots saw.
     errors, surprises : (D,) float64
-        Of the last drives of each robot: the error, see `ErrorRange`, and the largest
-        surprise, see `_surprises_of`.
+        Of the last drives of each robot, see `ErrorRange` and `_surprise`.
     open_log : float
         The log slowness in the open.
     posterior : Posterior or None
@@ -124,7 +119,7 @@ class Evidence:
         return math.fsum(robot.driven for robot in self.fleet.members)
 
     def add(self, visits: Visits) -> RobotEvidence:
-        """Learn from a drive: its V visits of places and its W waits.
+        """Learn from a drive, which visited V places.
 
         If the drive differs from what was seen before, older evidence hardly counts any
         more. All evidence fades by the time that the drive took. Slowness is the time
@@ -135,33 +130,17 @@ class Evidence:
         RobotEvidence
             What the drive showed, as it was added to the fleet.
         """
-        slowness = visits.seconds / visits.metres * self.nominal_speed  # (V,)
+        # A wait without a drive has no metres, and so no weight.
+        slowness = visits.seconds * self.nominal_speed / np.maximum(visits.metres, 1e-9)
         log = np.log(np.clip(slowness, 1 / MAX_SLOWNESS, MAX_SLOWNESS))  # (V,)
-        errors = self._errors_of_expected_time(visits)
-        surprises = self._surprises_of(visits.position, log)  # one for each part
-        largest_surprise = max(surprises, default=0.0)
         half_lives = min(visits.total_seconds / self.half_life, MOST_HALF_LIVES)
-        if largest_surprise > self._usual_surprise(errors):
+        surprise = self._surprise(visits.position, log)
+        surprises = [*self.surprises, *[1.0] * ASSUMED_DRIVES]
+        usual_surprise = UNUSUAL * float(np.quantile(surprises, SURPRISE_QUANTILE))
+        if surprise > max(SURPRISE, usual_surprise):
             half_lives += HALF_LIVES_OF_CHANGE
-        drive = self.fleet.own.renewed()._replace(
-            driven=visits.total_seconds,
-            faded=half_lives,
-            places=self._sums_of(visits, log),
-            errors=errors,
-            surprises=np.array([largest_surprise] if surprises else []),
-            turns=visits.turns,
-        )
-        self.fleet.add(drive)
-        self.sum_up()
-        return drive
-
-    def _sums_of(self, visits: Visits, log: Float64) -> Places:
-        """Return the sums over the places of a drive.
-
-        `log` (V,) is the log slowness of each of its V visits.
-        """
         weight = visits.metres / self.side  # (V,)
-        driven = Places.at(
+        places = Places.at(
             visits.position,
             self.side,
             weight=weight,
@@ -169,55 +148,43 @@ class Evidence:
             sum_of_log=weight * log,
             sum_of_squares=weight * log**2,
             passages=weight * visits.is_on_way,
+            waited=visits.waited * visits.is_on_way,
         )
-        waits = visits.waits
-        waited = Places.at(waits.position, self.side, waited=waits.seconds)
-        return Places.summed([driven, waited])
+        drive = self.fleet.own.renewed()._replace(
+            driven=visits.total_seconds,
+            faded=half_lives,
+            places=places,
+            errors=self._errors_of_expected_time(visits),
+            surprises=np.array([surprise]),
+            turns=visits.turns,
+        )
+        self.fleet.add(drive)
+        self.sum_up()
+        return drive
 
-    def _surprises_of(self, position: Float64, log: Float64) -> list[float]:
-        """Return by how much each part of a drive differs from what was seen before.
+    def _surprise(self, position: Float64, log: Float64) -> float:
+        """Return by how much a drive differs from what was seen before.
 
-        A part has about PLACES_OF_PART visits of known places, one after another. Its
-        surprise is the mean difference of the log slowness, in standard deviations.
-
-        Parameters
-        ----------
-        position, log : (V, 2) float64, (V,) float64
-            x and y of each visit of the drive, metres, and its log slowness: the
-            logarithm of its time over that at nominal speed.
+        It is the greatest mean difference of the log slowness of PLACES_IN_A_ROW known
+        places in a row, in standard deviations; 0 if fewer places are known.
+        `position` (V, 2) and `log` (V,) are x and y of each visit in metres, and its
+        log slowness.
         """
-        rows = self.places.rows_of(squares_at(position, self.side))  # (V,)
+        places = self.places
+        rows = places.rows_of(squares_at(position, self.side))  # (V,)
         # NO_ROW is the index of the last value.
-        weight = np.append(self.places.weight, 0.0)[rows]  # (V,)
-        visits = np.flatnonzero(weight >= KNOWN_WEIGHT)  # (K,): those of known places
-        known_rows = rows[visits]
-        known_weight = weight[visits]
-        # (K,): beyond the mean log slowness that was seen before at each of the places.
-        difference = log[visits] - self.places.mean_log()[known_rows]
-        # (K,): the variance of that difference.
-        variance = self.places.noise()[known_rows] * (1 + 1 / known_weight)
-        part_count = max(1, len(visits) // PLACES_OF_PART)
-        surprises = []
-        for part in np.array_split(np.arange(len(visits)), part_count):
-            if len(part) < PLACES_OF_PART / 2:
-                continue
-            variance_of_mean = variance[part].mean() / len(part)
-            deviation = math.sqrt(variance_of_mean + PART_NOISE**2)
-            mean_difference = abs(float(difference[part].mean()))
-            surprises.append(mean_difference / deviation)
-        return surprises
-
-    def _usual_surprise(self, errors: Float64) -> float:
-        """Return the largest surprise that is no change, in standard deviations.
-
-        `errors` are those of the present drive.
-        """
-        # Where the times of drives differ more than usual, so may those of places.
-        error_range = error_range_of([*self.errors, *errors])
-        excess = max((error_range.high - error_range.low) / USUAL_RANGE, 1)
-        surprises = [*self.surprises, *[1.0] * ASSUMED_DRIVES]
-        large_surprise = float(np.quantile(surprises, SURPRISE_QUANTILE))
-        return max(SURPRISE * excess, UNUSUAL * large_surprise)
+        is_known = np.append(places.weight, 0)[rows] >= KNOWN_WEIGHT
+        known_rows = rows[is_known]  # (K,)
+        if len(known_rows) < PLACES_IN_A_ROW:
+            return 0.0
+        difference = log[is_known] - places.mean_log()[known_rows]
+        variance = places.noise()[known_rows] * (1 + 1 / places.weight[known_rows])
+        mean = np.full(PLACES_IN_A_ROW, 1 / PLACES_IN_A_ROW)
+        mean_difference = np.abs(np.convolve(difference, mean, mode="valid"))
+        variance_of_mean = np.convolve(variance, mean, mode="valid") / PLACES_IN_A_ROW
+        return float(
+            (mean_difference / np.sqrt(variance_of_mean + PATH_NOISE**2)).max()
+        )
 
     def _errors_of_expected_time(self, visits: Visits) -> Float64:
         """Return by how much a drive's time differs from the expected time: (1,).
@@ -240,14 +207,18 @@ class Evidence:
         # The slowness of a place includes the waits that are expected there.
         expected_seconds = nominal_seconds * posterior.slowness[places]  # (K,)
         deviation = posterior.deviation_of(expected_seconds, places)
-        driving_seconds = visits.total_seconds - visits.turning_seconds
+        driving_seconds = visits.total_seconds - visits.turned.sum()
         seconds = driving_seconds - visits.seconds[~is_on_map].sum()
         log_of_ratio = math.log(seconds / float(expected_seconds.sum()))
         return np.array([log_of_ratio / deviation])
 
     def error_range(self) -> ErrorRange:
         """Return the range of errors of the last drives and ASSUMED_DRIVES more."""
-        return error_range_of(self.errors.tolist())
+        # Errors that lie evenly over a little more than 90 % of a normal distribution.
+        assumed = NORMAL * np.linspace(-1.05, 1.05, ASSUMED_DRIVES)
+        errors = np.concatenate([self.errors, assumed])
+        low, high = np.quantile(errors, (TAIL, 1 - TAIL)).tolist()
+        return ErrorRange(low, float(errors.mean()), high)
 
     def posterior_over(self, grid: GridMap) -> Posterior:
         """Return the posterior over a map, solved with all that was seen until now.
@@ -267,15 +238,6 @@ class Evidence:
         self.posterior = posterior
         self._is_solved = True
         return posterior
-
-
-def error_range_of(errors: Sequence[float]) -> ErrorRange:
-    """Return the range of errors of drives and of ASSUMED_DRIVES more."""
-    # Errors that lie evenly over a little more than 90 % of a normal distribution.
-    assumed = NORMAL * np.linspace(-1.05, 1.05, ASSUMED_DRIVES)
-    all_errors = np.concatenate([errors, assumed])
-    low, high = np.quantile(all_errors, (TAIL, 1 - TAIL)).tolist()
-    return ErrorRange(low, float(all_errors.mean()), high)
 
 
 def _has_cells_of(grid: GridMap, other: GridMap) -> bool:

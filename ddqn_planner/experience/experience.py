@@ -29,9 +29,7 @@ from ddqn_planner.experience.visits import (
     Limits,
     Poses,
     Visits,
-    speeds_of,
     visits_of,
-    window_of,
 )
 from ddqn_planner.files import as_path, differences, locked, read_file, write_atomically
 from ddqn_planner.grid import GridMap
@@ -60,10 +58,8 @@ MOST_OF_PRIOR = 1e3  # of a coefficient: no map is so slow
 LONGEST_NAME = 100  # characters
 RECENT_CHANGES = 64  # that `changes_since` remembers
 LATEST = 1e12  # seconds of a clock: a pose of a later time is not believed
-# Times the nominal speed: a robot that usually drives faster is not believed.
-MAX_MEDIAN_FACTOR = 4.0
-# Times the usual speed: a faster move is not believed.
-MAX_SPEED_FACTOR = 3
+# Times the nominal speed: a faster move is not believed.
+MAX_SPEED_FACTOR = 4.0
 # By default, the share by which the shortest path may take longer than the best one.
 EXPLORATION = 0.2
 
@@ -86,8 +82,6 @@ class Learned(NamedTuple):
     places: int  # that were passed, or waited at
     seconds: float  # that were spent there
     reason: str = ""  # why nothing was learned, and what to do
-    # False if no robot with the nominal speed can have driven so.
-    is_possible: bool = True
 
     def __bool__(self) -> bool:
         return self.places > 0
@@ -110,9 +104,8 @@ class Experience:
     ----------
     nominal_speed : float
         Metres per second in the open, 0.001 to 1,000: a first guess, see
-        `learned_speed`. A drive whose median speed is more than 4 times the nominal
-        speed teaches nothing, nor does a drive that is never faster than a hundredth of
-        the nominal speed.
+        `learned_speed`. Moves that are faster than 4 times the nominal speed are left
+        out, and so are those slower than a hundredth of the nominal speed.
     robot_width : float
         Metres, 0.01 to 100: the size of a place is half of it.
     half_life : float
@@ -221,29 +214,17 @@ class Experience:
         time = numbers("seconds", seconds, (count,)).astype(np.float64)
         position = numbers("positions", positions, (count, 2)).astype(np.float64)
         poses = _possible(time, position)
-        if len(poses.time) < 2:
-            return Learned(0, 0.0, self._why_nothing(poses, count))
-        window = window_of(poses, self.learned_speed)  # seconds to average poses over
-        speeds = speeds_of(poses, window)  # metres per second
-        usual_speed = float(np.median(speeds)) if len(speeds) else 0.0
-        if usual_speed > self.nominal_speed * MAX_MEDIAN_FACTOR:
-            reason = self._wrong_speed(usual_speed, "at", "greater")
-            return Learned(0, 0.0, reason, is_possible=False)
         limits = Limits(
-            window=window,
             speed=self.learned_speed,
-            max_speed=self._max_speed(usual_speed),
+            min_speed=self.nominal_speed / MAX_SLOWNESS,
+            max_speed=self.nominal_speed * MAX_SPEED_FACTOR,
             max_pause=self.max_pause,
             turn_seconds=self.turn_seconds,
         )
         visits = self._visits_of(poses, limits)
-        places = len(visits.seconds) + len(visits.waits.seconds)
+        places = len(visits.seconds)
         if not places:
-            return Learned(0, 0.0, self._why_nothing(poses, count))
-        fastest = float(speeds.max(initial=0))
-        if fastest < self.nominal_speed / MAX_SLOWNESS:
-            reason = self._wrong_speed(fastest, "at most at", "less")
-            return Learned(0, 0.0, reason, is_possible=False)
+            return Learned(0, 0.0, _why_nothing(poses, count, limits))
         self._learn(visits)
         return Learned(places, visits.total_seconds)
 
@@ -256,53 +237,6 @@ class Experience:
         turn_seconds = seconds_per_radian(self._fleet.turns + visits.turns)
         limits = limits._replace(turn_seconds=turn_seconds)
         return visits_of(poses, self.evidence.side, limits)
-
-    def _why_nothing(self, poses: Poses, count: int) -> str:
-        """Return in words why a drive taught nothing, and what to do.
-
-        `poses` are those of its `count` poses that can be true.
-        """
-        if len(poses.time) < 2:
-            return (
-                f"{len(poses.time)} of {count} poses are possible and differ in their "
-                "time; give two or more, in finite seconds, and metres up to "
-                f"{FARTHEST:g}"
-            )
-        elapsed = np.diff(poses.time)
-        step: Float64 = np.diff(poses.position, axis=0)  # metres
-        backwards = np.count_nonzero(elapsed < 0)
-        if backwards:
-            return f"{backwards} times are earlier than those before; sort them"
-        if (elapsed > self.max_pause).any():
-            return (
-                f"the times are up to {elapsed.max():.10g} s apart; give seconds, not "
-                f"milliseconds, at most max_pause, {self.max_pause:.10g} s, apart"
-            )
-        metres = np.hypot(step[:, 0], step[:, 1])
-        fastest = float((metres / elapsed).max())
-        max_speed = self._max_speed()
-        if fastest > max_speed:
-            return self._wrong_speed(fastest, "at", "greater")
-        longest = float(metres.max())
-        if longest > max_speed * UNSEEN:
-            return (
-                f"the poses are up to {longest:.3g} m apart; give poses at most "
-                f"{max_speed * UNSEEN:.3g} m apart"
-            )
-        from_start = poses.position - poses.position[0]
-        extent = float(np.hypot(from_start[:, 0], from_start[:, 1]).max())
-        return f"the robot comes no farther than {extent:.2g} m; give a longer drive"
-
-    def _wrong_speed(self, speed: float, words: str, nominal: str) -> str:
-        """Return in words why a drive at `speed`, metres per second, taught nothing.
-
-        `words` stand before the speed: "at", or "at most at". `nominal` says how the
-        nominal speed should be: "greater" or "less".
-        """
-        return (
-            f"the robot moves {words} {speed:.3g} m/s; give metres and seconds, or a "
-            f"nominal_speed {nominal} than {self.nominal_speed:g} m/s"
-        )
 
     def record_failure(self, position: Sequence[float]) -> None:
         """Learn that the robot failed at a place, as if it had waited there.
@@ -318,9 +252,7 @@ class Experience:
             whole=False,
             remedy=f"metres, at most {FARTHEST:g}",
         )
-        x, y = point.tolist()
-        visits = Visits.of_wait(x, y, self.max_pause)
-        self._learn(visits)
+        self._learn(Visits.of_wait(point.astype(np.float64), self.max_pause))
 
     def _learn(self, visits: Visits) -> None:
         """Add visits to the evidence, and remember the drive.
@@ -373,15 +305,6 @@ class Experience:
                 f"the other experience has {changed}; give those of one kind of robot"
             )
 
-    def _max_speed(self, usual_speed: float = 0.0) -> float:
-        """Return the speed up to which a robot is believed, metres per second.
-
-        `usual_speed` is that of the drive, metres per second. However fast earlier
-        drives were, the result is at most 12 times the nominal speed.
-        """
-        usual = max(self.nominal_speed, self.learned_speed, usual_speed)
-        return MAX_SPEED_FACTOR * min(usual, MAX_MEDIAN_FACTOR * self.nominal_speed)
-
     @property
     def learned_speed(self) -> float:
         """Metres per second in the open, as drives show; at first the nominal speed."""
@@ -394,10 +317,10 @@ class Experience:
 
     @property
     def prior(self) -> Float64:
-        """By how much each feature of other maps raised the log slowness: (7,).
+        """By how much each feature of other maps raised the log slowness: (3,).
 
         It counts as far as it predicts the places that were driven since. Zeros say
-        nothing; a ValueError if it is set to anything but seven finite numbers.
+        nothing; a ValueError if it is set to anything but three finite numbers.
         """
         return self._fleet.prior
 
@@ -416,7 +339,7 @@ class Experience:
         self._recent.clear()
 
     def prior_of(self, grid: GridMap) -> Float64:
-        """Return the prior that the places driven on a map give other maps: (7,)."""
+        """Return the prior that the places driven on a map give other maps: (3,)."""
         return self.evidence.posterior_over(grid).coefficients
 
     def take_posterior_from(self, older: Experience) -> None:
@@ -707,3 +630,27 @@ def _possible(time: Float64, position: Float64) -> Poses:
     position = position[is_possible]
     is_new = np.diff(time, prepend=np.nan) != 0
     return Poses(time[is_new], position[is_new])
+
+
+def _why_nothing(poses: Poses, count: int, limits: Limits) -> str:
+    """Return in words what a drive that taught nothing looks like, and what to do.
+
+    `poses` are those of its `count` poses that can be true.
+    """
+    elapsed = np.diff(poses.time)
+    steps: Float64 = np.diff(poses.position, axis=0)
+    metres = np.hypot(steps[:, 0], steps[:, 1])
+    from_start = poses.position - poses.position[:1]
+    extent = np.hypot(from_start[:, 0], from_start[:, 1]).max(initial=0)
+    speed = (metres / np.abs(elapsed)).max(initial=0)
+    return (
+        f"{len(poses.time)} of {count} poses are possible and differ in their time, "
+        f"{np.count_nonzero(elapsed < 0)} times are earlier than those before, the "
+        f"poses are up to {elapsed.max(initial=0):.10g} s and "
+        f"{metres.max(initial=0):.3g} m apart, the robot comes {extent:.2g} m far and "
+        f"moves at up to {speed:.3g} m/s; give metres and seconds, not milliseconds, "
+        f"sorted by time, at most max_pause, {limits.max_pause:.10g} s, and "
+        f"{limits.max_speed * UNSEEN:.3g} m apart, that come some metres far at "
+        f"{limits.min_speed:.3g} to {limits.max_speed:.3g} m/s; set nominal_speed for "
+        "a robot that is slower or faster"
+    )

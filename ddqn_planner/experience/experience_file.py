@@ -44,6 +44,7 @@ RANGES = {
     # Rounding may change a sum a little.
     "slowness": (1, 0.5 / MAX_SLOWNESS, 2 * MAX_SLOWNESS),
 }
+OLD_FEATURES = 7  # of priors until version 0.6, which say nothing of today's features
 # The arrays with a row for each robot, in the order of `RobotEvidence`.
 VALUES = "identities", "robots", "versions", "driven", "faded", "priors", "turns"
 
@@ -79,7 +80,6 @@ def content_to_bytes(content: Content) -> bytes:
         "surprises": np.concatenate(surprises),
         # Columns that hardly change from row to row are compressed to a few bytes.
         "squares": np.diff(square, axis=0, prepend=np.int32(0)).T,  # (2, N) int32
-        "offsets": np.concatenate([part.offset for part in places]).T,  # (2, N) uint8
         "sums": np.concatenate(sums, axis=1).astype(np.float32),  # (len(SUMS), N)
     }
     if content.state is not None:
@@ -120,7 +120,6 @@ def _members(arrays: Arrays, side: float) -> list[RobotEvidence]:
     columns = {
         **dict(zip(SUMS, sums, strict=True)),  # (N,) each
         "square": np.cumsum(arrays["squares"], axis=1, dtype=np.int32).T,  # (N, 2)
-        "offset": arrays["offsets"].astype(np.uint8, casting="same_kind").T,
     }
     errors = arrays["errors"]
     surprises = arrays["surprises"]
@@ -138,6 +137,8 @@ def _members(arrays: Arrays, side: float) -> list[RobotEvidence]:
         zip(*values, strict=True), ends - counts, ends, strict=True
     ):
         identity, name, version, driven, faded, prior, turns = robot
+        if len(prior) == OLD_FEATURES:
+            prior = [0.0] * FEATURES
         of_places, of_errors, of_surprises = map(slice, start, end)
         parts = {name: column[of_places] for name, column in columns.items()}
         members.append(

@@ -91,7 +91,7 @@ class RobotEvidence(NamedTuple):
             version=drive.version,
             driven=self.driven + drive.driven,
             faded=0.0,
-            places=Places.summed(places).with_few_passages(),
+            places=Places.summed(places),
             errors=errors[-LAST_DRIVES:],
             surprises=surprises[-LAST_DRIVES:],
             turns=self.turns * older.share + drive.turns,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,6 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
-UInt8 = NDArray[np.uint8]
 
 # The variance of the log slowness of one visit, assumed from so many visits of all
 # places; and the visits of a place from which the variance of all is assumed there.
@@ -39,8 +38,6 @@ SUMS = (
 )
 # Metres from the origin of the map. A place farther away is not believed.
 FARTHEST = 1e7
-MOST_PASSAGES = 50.0  # a wait is the mean over about so many passages
-OFFSETS = 256  # steps of a position within its square
 NO_ROW = -1  # in arrays of rows: a square that was not seen
 NO_KEY = np.iinfo(np.int64).min  # of no square
 
@@ -54,8 +51,6 @@ class Places:
 
     side: float  # of a place, metres
     square: Int32  # (N, 2): x and y of each place, in sides of a place
-    # (N, 2): where in its square a robot first passed, in steps of 1 / OFFSETS of it
-    offset: UInt8
     # (N,): the sum of the weights of all visits; a visit of a side's length weighs 1
     weight: Float64
     # (N,) each: sums over all visits, times their weights
@@ -125,34 +120,23 @@ class Places:
         **sums : (M,) float64
             Those of SUMS by their names; sums that are not given are 0.
         """
-        square = squares_at(position, side)
-        in_square = position / side - square  # (M, 2): 0 to 1
-        offset = np.clip(in_square * OFFSETS, 0, OFFSETS - 1).astype(np.uint8)
         zeros = np.zeros(len(position))
         columns = {name: sums.get(name, zeros) for name in SUMS}
-        return _united(cls(**columns, side=side, square=square, offset=offset))
+        return _united(cls(**columns, side=side, square=squares_at(position, side)))
 
     @classmethod
     def summed(cls, parts: Sequence[Places]) -> Places:
-        """Return the sums over one or more parts, as over what several drives showed.
-
-        All parts have the same side. The position of a place is that of its first part.
-        """
-        filled = [part for part in parts if len(part)]
-        if len(filled) <= 1:
-            return filled[0] if filled else parts[0]
+        """Return the sums over one or more parts with the same side, as of drives."""
         columns = {
-            name: np.concatenate([getattr(part, name) for part in filled])
-            for name in ("square", "offset", *SUMS)
+            name: np.concatenate([getattr(part, name) for part in parts])
+            for name in ("square", *SUMS)
         }
         return _united(cls(**columns, side=parts[0].side))
 
     @property
     def position(self) -> Float64:
-        """Where a robot first passed each place: x and y, (N, 2) metres."""
-        in_square = (self.offset + 0.5) / OFFSETS
-        position: Float64 = (self.square + in_square) * self.side
-        return position
+        """The middle of each place: x and y, (N, 2) metres."""
+        return self.side * (self.square.astype(np.float64) + 0.5)
 
     def are_in_order(self) -> bool:
         """Return whether the places stand in the order of their squares, each once."""
@@ -174,16 +158,7 @@ class Places:
         if share == 0:
             return Places.none(self.side)
         sums = {name: _rounded(values * share) for name, values in self.sums().items()}
-        return Places(**sums, side=self.side, square=self.square, offset=self.offset)
-
-    def with_few_passages(self) -> Places:
-        """Return the places with at most MOST_PASSAGES, so that the last count most.
-
-        The mean wait stays: the seconds waited shrink as the passages do.
-        """
-        excess = np.maximum(self.passages / MOST_PASSAGES, 1)  # (N,): 1: not too many
-        passages = _rounded(self.passages / excess)
-        return replace(self, passages=passages, waited=_rounded(self.waited / excess))
+        return Places(**sums, side=self.side, square=self.square)
 
 
 def open_level(log: Float64, otherwise: float) -> float:
@@ -214,12 +189,7 @@ def _united(places: Places) -> Places:
         name: _rounded(np.bincount(row, values, count).astype(np.float64))
         for name, values in places.sums().items()
     }
-    return Places(
-        **sums,
-        side=places.side,
-        square=places.square[first],
-        offset=places.offset[first],
-    )
+    return Places(**sums, side=places.side, square=places.square[first])
 
 
 def _keys(square: Int32) -> Int64:

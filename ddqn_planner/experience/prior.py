@@ -6,13 +6,10 @@ import numpy as np
 
 from ddqn_planner.experience.places import Float32, Float64
 from ddqn_planner.grid import GridMap
-from ddqn_planner.grid.arguments import Occupancy
 from ddqn_planner.grid.inflation import clearance
 
-FEATURES = 7
+FEATURES = 3
 REACH = 3.0  # metres: what is farther away says nothing
-NARROW = 0.7, 1.2, 2.0  # metres: free widths up to which a passage counts as narrow
-STEEPNESS = 7  # of the step from narrow to wide passages
 # A feature whose deviation is 1 raises the log slowness by 0, with this inverse
 # variance; and it is taken to vary at least so much.
 RIDGE = 1.25
@@ -34,54 +31,16 @@ def map_features(grid: GridMap) -> Float32:
     -------
     (H, W, FEATURES) float32
         Two nearnesses of the nearest wall, which fall with the distance from 1 to 0,
-        the first one faster; the distance from the wall in metres, at most REACH; for
-        each width of NARROW whether the passage is narrower, from 0 to 1; and the
-        logarithm of the passage's length in metres.
+        the first one faster; and the distance from the wall in metres, at most REACH.
     """
-    occupied = grid.uninflated
-    with_wall = np.pad(occupied, 1, constant_values=True)
+    with_wall = np.pad(grid.uninflated, 1, constant_values=True)
     # From the middle of each cell to that of the nearest occupied one.
     cells_to_wall = clearance(with_wall)[1:-1, 1:-1].astype(np.float32)
     metres_to_wall = (cells_to_wall - 0.5) * np.float32(grid.resolution)
     metres_to_wall = np.minimum(metres_to_wall, REACH)
     beside_wall = np.exp(-metres_to_wall / 0.25)
     near_wall = np.exp(-metres_to_wall / 0.75)
-
-    # (H, W): the free metres around each cell in its row, and in its column.
-    width_of_rows = _free_widths(occupied, grid.resolution)
-    width_of_columns = _free_widths(occupied.T, grid.resolution).T
-    # A passage leads along the row or the column, whichever is free for longer; the
-    # other one is its width.
-    width = np.minimum(width_of_rows, width_of_columns)
-    length = np.maximum(width_of_rows, width_of_columns)
-    # Smooth steps: 1 where the passage is much narrower, 0 where it is much wider.
-    is_narrow = [
-        1 / (1 + np.exp(STEEPNESS * (width / narrow - 1))) for narrow in NARROW
-    ]
-    log_length = np.log(np.maximum(length, 0.1))
-    features = [beside_wall, near_wall, metres_to_wall, *is_narrow, log_length]
-    return np.stack(features, axis=-1)
-
-
-def _free_widths(occupied: Occupancy, resolution: float) -> Float32:
-    """Return how many metres are free in the row of each cell, around the cell: (H, W).
-
-    `occupied` is (H, W), and `resolution` in metres per cell. A wall stands around the
-    map. The width is 0 at occupied cells, and at most 2 * REACH.
-    """
-    width = occupied.shape[1]
-    column = np.arange(width, dtype=np.int32)
-    # (H, W): the column of the last wall up to each cell, and of the next wall from the
-    # cell on.
-    wall_or_left_edge = np.where(occupied, column, -1)
-    last_wall = np.maximum.accumulate(wall_or_left_edge, axis=1)
-    wall_or_right_edge = np.where(occupied, column, width)
-    from_right = wall_or_right_edge[:, ::-1]
-    next_wall = np.minimum.accumulate(from_right, axis=1)[:, ::-1]
-    # The last and the next wall of an occupied cell are the cell itself.
-    cells = np.maximum(next_wall - last_wall - 1, 0).astype(np.float32)
-    metres = cells * np.float32(resolution)
-    return np.asarray(np.minimum(metres, 2 * REACH))
+    return np.stack([beside_wall, near_wall, metres_to_wall], axis=-1)
 
 
 def regression(

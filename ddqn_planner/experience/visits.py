@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.experience.places import Float64, Int64
+from ddqn_planner.experience.places import Float64
 from ddqn_planner.experience.turns import (
     Steps,
     seconds_of_turns,
@@ -18,18 +18,11 @@ from ddqn_planner.experience.turns import (
     turning_at,
 )
 
-# Poses are averaged over the time in which the robot drives this many metres, or up to
-# the second if the poses are noisy.
-WINDOW = 0.15
-LONGEST_WINDOW = 0.3
-# Metres: the deviation of the averaged poses. More would hide slowness.
-AVERAGED_NOISE = 0.015
-# The median length of second differences of normal noise is so many times its
-# deviation.
-BEND_OF_NOISE = 2.88
-
-STAND_DISTANCE = 0.1  # metres within which a robot stands
-# Metres. A robot that drives leaves a place before it could have driven so far.
+# Poses are averaged over the time in which the robot drives this many metres. Without
+# averaging, pose noise would count as distance.
+WINDOW = 0.2
+SPOT = 0.1  # metres: a spot lies so far from the spot before it
+# Metres. A robot that drives leaves a spot before it could have driven so far.
 STAND = 1.5
 END = 2.0  # metres from the first and the last pose: there a wait is none on the way
 # Metres by which a localisation may correct a pose at once: the drive continues.
@@ -38,6 +31,7 @@ CORRECTION = 0.25
 RELOCATION = 1.0
 # Seconds between two poses for which a robot may have driven straight on.
 UNSEEN = 3.0
+LEFT_OUT = 1e9  # seconds of a move that is so slow that it is not believed
 # Seconds over which a robot whose pose is not believed counts as driving on.
 MEMORY = 60.0
 
@@ -48,60 +42,42 @@ class Poses(NamedTuple):
     time: Float64  # (N,): seconds of any clock
     position: Float64  # (N, 2): x and y, metres in the frame of the map
 
-
-class SecondsAt(NamedTuple):
-    """The seconds that a robot spent at each of N positions."""
-
-    position: Float64  # (N, 2): x and y, metres
-    seconds: Float64  # (N,)
-
-    @classmethod
-    def joined(cls, parts: Sequence[SecondsAt]) -> SecondsAt:
-        """Return the positions of several parts of a drive, one part after another."""
-        positions = [part.position for part in parts]
-        seconds = [part.seconds for part in parts]
-        return cls(
-            np.concatenate([np.zeros((0, 2)), *positions]),
-            np.concatenate([np.zeros(0), *seconds]),
-        )
+    def part(self, rows: slice | NDArray[np.int64]) -> Poses:
+        """Return some of the poses, by their indices."""
+        return Poses(self.time[rows], self.position[rows])
 
 
 class Visits(NamedTuple):
     """What a drive showed of V places, in the order in which it passed them."""
 
     position: Float64  # (V, 2): metres, where the robot passed the place
-    seconds: Float64  # (V,): that the robot drove in the place, without waits
     metres: Float64  # (V,): that the robot drove in the place
-    is_on_way: NDArray[np.bool_]  # (V,): whether it is not near an end of the drive
-    # The waits of the drive. A robot waits for what is ahead of it, often where routes
-    # part: a wait has the position to which the robot drove next, so that no other
-    # route is charged. Waits near an end of the drive are no waits on the way: there a
-    # robot docks, or waits for its next task, which says nothing of who passes by.
-    waits: SecondsAt
-    seconds_at_ends: float  # that the robot waited near the ends of the drive
-    turning_seconds: float  # that the robot needed to turn, on the whole drive
-    turns: Float64  # (2,): what the drive showed of them, see `sums_of_turns`
+    seconds: Float64  # (V,): that the robot drove in the place, without waits
+    # (V,): seconds. A robot waits for what is ahead of it, often where routes part: the
+    # place to which it drives next has the wait, so that no other route is charged.
+    waited: Float64
+    turned: Float64  # (V,): seconds that the robot needed to turn in the place
+    # (V,): whether it is not near an end of the drive. There a robot docks, or waits
+    # for its next task, which says nothing of who passes by.
+    is_on_way: NDArray[np.bool_]
+    turns: Float64  # (2,): what the drive showed of turning, see `sums_of_turns`
 
     @property
     def total_seconds(self) -> float:
-        """The seconds of the drive, with its waits."""
-        seconds = self.seconds.sum() + self.waits.seconds.sum()
-        return float(seconds) + self.seconds_at_ends + self.turning_seconds
+        """The seconds of the drive, with its waits and turns."""
+        return float((self.seconds + self.waited + self.turned).sum())
 
     @classmethod
-    def of_wait(cls, x: float, y: float, seconds: float) -> Visits:
-        """Return a wait of some seconds at x and y, in metres, and no driven place."""
-        waits = SecondsAt(np.array([[x, y]]), np.array([seconds]))
-        nothing = np.zeros(0)
-        is_on_way = np.zeros(0, np.bool_)
+    def of_wait(cls, position: Float64, seconds: float) -> Visits:
+        """Return a wait of some seconds at x and y, (2,) metres, without a drive."""
+        nothing = np.zeros(1)
         return cls(
-            position=np.zeros((0, 2)),
-            seconds=nothing,
+            position=position[None],
             metres=nothing,
-            is_on_way=is_on_way,
-            waits=waits,
-            seconds_at_ends=0.0,
-            turning_seconds=0.0,
+            seconds=nothing,
+            waited=np.array([seconds]),
+            turned=nothing,
+            is_on_way=np.ones(1, np.bool_),
             turns=np.zeros(2),
         )
 
@@ -109,8 +85,8 @@ class Visits(NamedTuple):
 class Limits(NamedTuple):
     """What of a drive is believed, and what counts as a wait."""
 
-    window: float  # seconds over which poses are averaged
     speed: float  # metres per second that the robot usually drives in the open
+    min_speed: float  # metres per second; slower moves are left out
     max_speed: float  # metres per second; faster moves are left out
     max_pause: float  # seconds; a longer pause is no wait
     turn_seconds: float = 0.0  # that the robot needs to turn by one radian
@@ -126,179 +102,102 @@ def visits_of(poses: Poses, side: float, limits: Limits) -> Visits:
     side : float
         The side of a place, which is a square; metres.
     limits : Limits
-        The seconds over which poses are averaged (`window`), the usual and the greatest
-        speed in metres per second, the longest wait in seconds (`max_pause`), and the
-        seconds per radian that turning takes (`turn_seconds`).
+        The usual, the least and the greatest speed in metres per second, the longest
+        wait in seconds, and the seconds per radian that turning takes.
     """
-    step_length = max(side, WINDOW) / 2  # metres
-    steps_of_parts = []
-    waits_of_parts = []
-    turning_seconds = 0.0
+    length = max(side / 2, SPOT)  # of a step, metres
+    steps = np.zeros((0, 5))
     turns = np.zeros(2)
     for part in _believed_parts(poses, limits):
-        means = averaged(part, limits.window)  # M mean poses
-        # A spot is a mean pose that lies STAND_DISTANCE from the spot before it. The
-        # robot may stand at its first pose and at the last spot: that is no wait on the
-        # way. So the first spot is left out, and no stand at the last one is computed.
-        spots = np.array(indices_apart(means.position, STAND_DISTANCE), np.int64)[1:]
-        if not len(spots):  # the robot stood all the time
-            continue
-        elapsed = np.diff(means.time[spots])  # (S - 1,) for S spots
-        turning_steps = _turning_steps(means.position[spots], elapsed)
-        turned = seconds_of_turns(turning_steps, limits.turn_seconds, limits.speed)
-        turns += sums_of_turns(turning_steps, limits.turn_seconds)
-        turning_seconds += float(turned.sum())
-        # (S - 1,): the seconds from each spot to the next one, turning and standing at
-        # the spot and then driving.
-        stood = _seconds_stood(means.time, spots, turned, limits.speed)
-        driven = elapsed - turned - stood
-        steps_of_parts.append(_steps_along(means.position[spots], driven, step_length))
-        next_position = means.position[spots[1:]]
-        is_wait = (stood > 0) & (stood <= limits.max_pause)
-        waits_of_parts.append(SecondsAt(next_position[is_wait], stood[is_wait]))
-    steps = SecondsAt.joined(steps_of_parts)
+        spots = _spots_of(part, limits)
+        if len(spots.time) > 1:  # the robot did not stand all the time
+            turning = _turning(spots)
+            turns += sums_of_turns(turning, limits.turn_seconds)
+            steps_of_part = _steps_along(spots, turning, length, limits)
+            steps = np.concatenate([steps, steps_of_part])
     # A correction of the pose that is too small for a jump may look like a fast move.
-    is_possible = step_length <= limits.max_speed * steps.seconds
-    possible_steps = SecondsAt(steps.position[is_possible], steps.seconds[is_possible])
-    waits = SecondsAt.joined(waits_of_parts)
-    ends = poses.position[[0, -1]]
-    visits = _visits_of_steps(possible_steps, step_length, side, waits, ends)
-    return visits._replace(turning_seconds=turning_seconds, turns=turns)
+    seconds = steps[:, 2]
+    is_possible = length <= limits.max_speed * seconds
+    is_possible &= length >= limits.min_speed * seconds
+    steps = steps[is_possible]  # (N, 5), see `_steps_along`
+    # A visit begins where a step lies in another place than the step before it. NaN
+    # differs from all: the first step begins a visit, too.
+    place = np.floor(steps[:, :2] / side)  # (N, 2): x and y of each place, in sides
+    is_first = (np.diff(place, axis=0, prepend=np.nan) != 0).any(axis=1)  # (N,)
+    first_steps = np.flatnonzero(is_first)  # (V,): the first step of each visit
+    step_count = np.diff(first_steps, append=len(steps))  # (V,)
+    # (V,) each: the sums over the steps of each visit.
+    x, y, driven, waited, turned = np.add.reduceat(steps, first_steps).T
+    position = np.column_stack([x, y]) / step_count[:, None]
+    ends = np.concatenate([poses.position[:1], poses.position[-1:]])
+    from_ends = position[:, None] - ends  # (V, 2, 2) metres
+    from_nearest_end: Float64 = _lengths(from_ends).min(axis=1)
+    metres = length * step_count
+    return Visits(
+        position, metres, driven, waited, turned, from_nearest_end > END, turns
+    )
 
 
-def _turning_steps(spots: Float64, elapsed: Float64) -> Steps:
-    """Return the steps from each of S spots to the next one: (S - 1,).
+def _spots_of(part: Poses, limits: Limits) -> Poses:
+    """Return mean poses of a part of a drive that lie SPOT or more apart.
 
-    `spots` is (S, 2), in metres, and `elapsed` (S - 1,) has the seconds of each step.
+    The robot may stand at its first pose and at the last spot: that is no wait on the
+    way. So the first spot is left out, and no stand at the last one is computed.
     """
-    turning = turning_at(spots)
-    step: Float64 = np.diff(spots, axis=0)  # metres
+    means = averaged(part, WINDOW / limits.speed)
+    return means.part(indices_apart(means.position, SPOT)[1:])
+
+
+def _turning(spots: Poses) -> Steps:
+    """Return the steps from each of S spots to the next one: (S - 1,)."""
+    turning = turning_at(spots.position)
     return Steps(
-        seconds=elapsed,
-        metres=np.hypot(step[:, 0], step[:, 1]),
+        seconds=np.diff(spots.time),
+        metres=_lengths(np.diff(spots.position, axis=0)),
         turning=(turning[1:] + turning[:-1]) / 2,
     )
 
 
-def _seconds_stood(
-    time: Float64, spots: Int64, turned: Float64, speed: float
-) -> Float64:
-    """Return how long a robot stood at each of S spots but the last: (S - 1,) seconds.
+def _steps_along(spots: Poses, moves: Steps, length: float, limits: Limits) -> Float64:
+    """Divide the path over S spots into N steps of one `length`, in metres.
 
-    The seconds in which it turned there do not count.
+    A shorter rest at the end is left out. `moves` are those from spot to spot.
 
-    Parameters
-    ----------
-    time : (M,) float64
-        The seconds of each mean pose of a drive.
-    spots : (S,) int64
-        The index of the first mean pose at each spot.
-    turned : (S - 1,) float64
-        The seconds in which the robot turned at each spot.
-    speed : float
-        The robot's usual speed, metres per second.
+    Returns
+    -------
+    (N, 5) float64
+        The x and y of the middle of each step in metres, and the seconds in which the
+        robot drove it, waited there and turned there.
     """
-    arrival = time[spots[:-1]]
-    last_time_there = time[spots[1:] - 1]
-    stood = np.maximum(last_time_there - arrival - turned, 0)
-    # A robot that drives leaves a spot before it could have driven so far.
-    stood[stood < STAND / speed] = 0
-    return stood
-
-
-def _visits_of_steps(
-    steps: SecondsAt,
-    step_length: float,
-    side: float,
-    waits: SecondsAt,
-    ends: Float64,
-) -> Visits:
-    """Return the visits of a drive: steps in a row that lie in the same place are one.
-
-    Parameters
-    ----------
-    steps : SecondsAt
-        The middle of each of N steps along the drive, and the seconds that it took.
-    step_length : float
-        The length of each step, metres.
-    side : float
-        The side of a place, which is a square; metres.
-    waits : SecondsAt
-        The waits of the drive.
-    ends : (2, 2) float64
-        The first and the last position of the drive, metres.
-    """
-    place = np.floor(steps.position / side)  # (N, 2): x and y of each place, in sides
-    # A visit begins where a step lies in another place than the step before it. NaN
-    # differs from all: the first step begins a visit, too.
-    is_first = (np.diff(place, axis=0, prepend=np.nan) != 0).any(axis=1)  # (N,)
-    first_steps = np.flatnonzero(is_first)  # (V,): the first step of each visit
-    step_count = np.diff(first_steps, append=len(place))  # (V,)
-    # (N, 3): x, y and the seconds of each step; (V, 3): their sums over each visit.
-    rows = np.column_stack([steps.position, steps.seconds])
-    sums = np.add.reduceat(rows, first_steps)
-    position = sums[:, :2] / step_count[:, None]
-    is_wait_on_way = _is_away(waits.position, ends)
-    return Visits(
-        position=position,
-        seconds=sums[:, 2],
-        metres=step_length * step_count,
-        is_on_way=_is_away(position, ends),
-        waits=SecondsAt(waits.position[is_wait_on_way], waits.seconds[is_wait_on_way]),
-        seconds_at_ends=float(waits.seconds[~is_wait_on_way].sum()),
-        turning_seconds=0.0,
-        turns=np.zeros(2),
-    )
-
-
-def _is_away(position: Float64, ends: Float64) -> NDArray[np.bool_]:
-    """Return which positions (N, 2) are farther than END from both ends (2, 2)."""
-    offset = position[:, None] - ends  # (N, 2, 2): metres from each end
-    distance: Float64 = np.hypot(offset[..., 0], offset[..., 1])  # (N, 2)
-    nearest: Float64 = distance.min(axis=1)
-    return nearest > END
-
-
-def speeds_of(poses: Poses, window: float) -> Float64:
-    """Return the speeds of a robot from each window of time to the next one, in m/s.
-
-    The poses are averaged over windows of `window` seconds. A speed is that from a mean
-    pose to the next one; two mean poses at the same time have none.
-    """
-    means = averaged(poses, window)
-    elapsed = np.abs(np.diff(means.time))
-    step: Float64 = np.diff(means.position, axis=0)  # metres
-    has_elapsed = elapsed > 0
-    speeds: Float64 = (
-        np.hypot(step[:, 0], step[:, 1])[has_elapsed] / elapsed[has_elapsed]
-    )
-    return speeds
-
-
-def window_of(poses: Poses, speed: float) -> float:
-    """Return over how many seconds to average poses: longer if they have more noise.
-
-    `speed` is the robot's usual speed, in metres per second.
-    """
-    # The second differences of the positions: mostly noise, as a robot turns slowly.
-    bend: Float64 = np.diff(poses.position, 2, axis=0)
-    bends: Float64 = np.hypot(bend[:, 0], bend[:, 1])
-    if not len(bends):
-        return WINDOW / speed
-    noise = float(np.median(bends)) / BEND_OF_NOISE  # metres
-    # The mean of `pose_count` poses has a noise of AVERAGED_NOISE.
-    pose_count = (noise / AVERAGED_NOISE) ** 2
-    period = float(np.median(np.abs(np.diff(poses.time))))  # seconds between poses
-    metres = pose_count * period * speed  # that the robot drives during these poses
-    return min(max(metres, WINDOW), LONGEST_WINDOW) / speed
+    turned = seconds_of_turns(moves, limits.turn_seconds, limits.speed)  # (S - 1,)
+    elapsed = moves.seconds - turned
+    has_stood = elapsed > STAND / limits.speed
+    stood = np.where(has_stood, elapsed - moves.metres / limits.speed, 0)
+    # A robot that seems to stand all the time does not drive: times are wrong.
+    is_pause = (stood > limits.max_pause) | has_stood.all()
+    driven = np.where(is_pause, LEFT_OUT, elapsed - stood)
+    # The next segment of the path has the wait.
+    waited = np.append(0, np.where(is_pause, 0, stood))[:-1]
+    # (S,) and (3, S): from the beginning of the path to each spot.
+    metres_to_spot = np.append(0, np.cumsum(moves.metres))
+    seconds = np.cumsum([driven, waited, turned], axis=1)
+    seconds_to_spot = np.pad(seconds, ((0, 0), (1, 0)))
+    # (N + 1,): from the beginning of the path to each point between two steps. The
+    # first point is the beginning of the path.
+    metres_to_point = np.arange(0, metres_to_spot[-1], length)
+    columns = [*spots.position.T, *seconds_to_spot]
+    points = np.column_stack(
+        [np.interp(metres_to_point, metres_to_spot, column) for column in columns]
+    )  # (N + 1, 5)
+    middles = (points[1:, :2] + points[:-1, :2]) / 2
+    return np.hstack([middles, np.diff(points[:, 2:], axis=0)])
 
 
 def averaged(poses: Poses, window: float) -> Poses:
     """Return M mean poses of N poses: one for each window of time that has poses.
 
     A mean pose is the mean time and the mean position of the poses in the window. The
-    windows of `window` seconds begin at the first pose. Without averaging, pose noise
-    would count as distance.
+    windows of `window` seconds begin at the first pose.
     """
     # (N,): the number of each pose's window.
     window_number = np.floor((poses.time - poses.time[:1]) / window)
@@ -311,7 +210,7 @@ def averaged(poses: Poses, window: float) -> Poses:
     return Poses(time=means[:, 0], position=means[:, 1:])
 
 
-def indices_apart(position: Float64, metres: float) -> list[int]:
+def indices_apart(position: Float64, metres: float) -> NDArray[np.int64]:
     """Choose positions of a path that lie apart, and return their indices.
 
     `position` is (N, 2), x and y in metres, N >= 1. The first position is chosen, and
@@ -323,7 +222,7 @@ def indices_apart(position: Float64, metres: float) -> list[int]:
         last_chosen = points[chosen[-1]]
         if math.dist(point, last_chosen) >= metres:
             chosen.append(index)
-    return chosen
+    return np.array(chosen)
 
 
 def _believed_parts(poses: Poses, limits: Limits) -> Iterator[Poses]:
@@ -332,59 +231,29 @@ def _believed_parts(poses: Poses, limits: Limits) -> Iterator[Poses]:
     A drive is cut where the pose jumps or the clock pauses or goes back. A part is left
     out if it has one pose, or if the robot cannot have driven to its first pose from
     the last pose of the last part that was believed; for the first part, from the first
-    pose of the drive. `limits` say how fast the robot may be, and how long it may
-    pause.
+    pose of the drive.
     """
     time, position = poses
     elapsed = np.diff(time)  # (N - 1,): seconds from each pose to the next one
-    step: Float64 = np.diff(position, axis=0)  # metres
-    reachable = limits.max_speed * np.minimum(elapsed, UNSEEN) + CORRECTION  # metres
-    is_jump = np.hypot(step[:, 0], step[:, 1]) > reachable
-    is_pause = elapsed > limits.max_pause
-    is_cut = is_jump | is_pause | (elapsed <= 0)
+    # (N - 1,): metres.
+    reachable = limits.max_speed * np.minimum(elapsed, UNSEEN) + CORRECTION
+    is_jump = _lengths(np.diff(position, axis=0)) > reachable
+    is_cut = is_jump | (elapsed > limits.max_pause) | (elapsed <= 0)
     first_poses = np.flatnonzero(is_cut) + 1  # of all parts but the first
     bounds: list[int] = [0, *first_poses.tolist(), len(time)]
     last_believed = 0  # the index of the last pose that was believed
     for start, end in pairwise(bounds):
+        if end - start < 2:
+            continue
         # The longest time for which the robot may have driven on without being seen.
         since_last: float = time[start] - time[last_believed]  # seconds
-        unseen = min(max(since_last, 0), MEMORY)
-        reach = limits.max_speed * unseen + RELOCATION  # metres
-        distance = math.dist(position[start], position[last_believed])
-        has_several_poses = end - start > 1
-        if has_several_poses and distance <= reach:
+        reach = limits.max_speed * min(max(since_last, 0), MEMORY) + RELOCATION
+        if math.dist(position[start], position[last_believed]) <= reach:
             last_believed = end - 1
-            yield Poses(time[start:end], position[start:end])
+            yield poses.part(slice(start, end))
 
 
-def _steps_along(path: Float64, seconds: Float64, step_length: float) -> SecondsAt:
-    """Divide a path into N steps of one length; a shorter rest at its end is left out.
-
-    Parameters
-    ----------
-    path : (P, 2) float64
-        The corners of the path, metres.
-    seconds : (P - 1,) float64
-        The driving time of each segment between two corners.
-    step_length : float
-        Metres.
-
-    Returns
-    -------
-    SecondsAt
-        The middle of each step, and its driving time.
-    """
-    steps: Float64 = np.diff(path, axis=0)  # (P - 1, 2)
-    metres = np.hypot(steps[:, 0], steps[:, 1])
-    # (P,): from the beginning of the path to each corner.
-    metres_to_corner = np.cumsum(np.append(0, metres))
-    seconds_to_corner = np.cumsum(np.append(0, seconds))
-    # (N + 1,): from the beginning of the path to each point between two steps. The
-    # first point is the beginning of the path.
-    metres_to_point = np.arange(0, metres_to_corner[-1], step_length)
-    seconds_to_point = np.interp(metres_to_point, metres_to_corner, seconds_to_corner)
-    x = np.interp(metres_to_point, metres_to_corner, path[:, 0])
-    y = np.interp(metres_to_point, metres_to_corner, path[:, 1])
-    points = np.column_stack([x, y])
-    middle = (points[1:] + points[:-1]) / 2
-    return SecondsAt(middle, np.diff(seconds_to_point))
+def _lengths(vectors: Float64) -> Float64:
+    """Return the lengths of vectors (..., 2)."""
+    lengths: Float64 = np.hypot(vectors[..., 0], vectors[..., 1])
+    return lengths

@@ -419,7 +419,8 @@ def test_forged_rows_are_named_and_leave_the_rest(tmp_path: Path, console: Any) 
     printed = console(*learn, "--out", tmp_path / "new.npz").out
     assert "row 5 of " in printed
     assert "it takes 1 s, but its samples 1e+06 s" in printed
-    assert "drive 3 taught nothing: the robot moves at 5e+03 m/s" in printed
+    assert "drive 3 taught nothing" in printed
+    assert "moves at up to 5e+03 m/s" in printed
     before = Experience.load(folder.experience_path)
     after = Experience.load(tmp_path / "new.npz")
     assert len(after.evidence.places) == pytest.approx(

@@ -166,12 +166,12 @@ def test_what_was_forgotten_does_not_return_from_the_own_file(tmp_path: Path) ->
 
 def test_a_prior_is_the_mean_of_those_of_all_robots_that_have_one() -> None:
     one, other, third = fleet()
-    one.prior = np.arange(7)
-    other.prior = np.full(7, 2.0)
+    one.prior = np.arange(3)
+    other.prior = np.full(3, 2.0)
     third.merge(one)
-    np.testing.assert_array_equal(third.prior, np.arange(7))
+    np.testing.assert_array_equal(third.prior, np.arange(3))
     third.merge(other)
-    np.testing.assert_array_equal(third.prior, (np.arange(7) + 2) / 2)
+    np.testing.assert_array_equal(third.prior, (np.arange(3) + 2) / 2)
 
 
 # Changes, of which nodes tell each other

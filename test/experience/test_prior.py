@@ -28,32 +28,20 @@ def test_another_resolution_of_the_same_walls_has_nearly_the_same_features(
     coarse = map_features(GridMap(occupancy, 0.25))
     fine = map_features(GridMap(occupancy.repeat(5, 0).repeat(5, 1), 0.05))[2::5, 2::5]
     difference = np.abs(fine - coarse)[~occupancy]
-    assert difference[:, 3:].max(initial=0) < 1e-5
-    assert (
-        difference[:, :3].max(initial=0) < 0.25 / 3
-    )  # a corner's distance depends on its cell
+    # A corner's distance depends on its cell.
+    assert difference.max(initial=0) < 0.25 / 3
 
 
-def test_features_tell_walls_and_narrow_ways_and_a_wall_stands_around_the_map() -> None:
+def test_features_tell_walls_and_a_wall_stands_around_the_map() -> None:
     occupancy = np.zeros((40, 40), dtype=bool)
     occupancy[20] = True
-    occupancy[20, 10] = False
     features = map_features(GridMap(occupancy, 0.25))
-    metres, narrow = features[..., 2], features[..., 3] * ~occupancy
+    metres = features[..., 2]
     assert metres[19, 30] == pytest.approx(0.125)
     assert metres[16, 30] == pytest.approx(0.875)
     assert metres[0, 0] == pytest.approx(0.125)
     framed = map_features(GridMap(np.pad(occupancy, 20, constant_values=True), 0.25))
     assert framed[20:-20, 20:-20] == pytest.approx(features, abs=1e-6)
-    assert np.unravel_index(narrow.argmax(), narrow.shape) == (20, 10)
-    assert narrow[20, 10] > 4 * np.delete(narrow[:, 10], 20).max()
-
-
-def test_a_passage_has_the_length_between_its_walls_up_to_6_metres() -> None:
-    for cells, metres in ((8, 2), (16, 4), (22, 5.5), (24, 6), (40, 6), (400, 6)):
-        passage = GridMap(np.zeros((4, cells), dtype=bool), 0.25)
-        log_length = map_features(passage)[..., 6]
-        assert np.exp(log_length) == pytest.approx(metres)
 
 
 def test_a_robots_body_moves_no_wall() -> None:
@@ -136,7 +124,7 @@ def test_where_narrow_lanes_were_slow_others_are_expected_to_be() -> None:
     experience = driven(*[*lanes, *open_ways] * 2)
     slowness = experience.slowness(grid)
     assert at(grid, slowness, 14, 8.6) > 2
-    assert at(grid, slowness, 14, 4) < 1.5
+    assert at(grid, slowness, 14, 4) < 1.7
     on_another = driven()
     on_another.prior = experience.prior_of(grid)
     turned = GridMap(grid.occupancy.T, 0.25)
@@ -147,7 +135,7 @@ def test_where_narrow_lanes_were_slow_others_are_expected_to_be() -> None:
 
 
 @pytest.mark.parametrize(
-    "prior", [np.zeros(3), np.full(FEATURES, np.nan), ["a"] * FEATURES, 1e9]
+    "prior", [np.zeros(7), np.full(FEATURES, np.nan), ["a"] * FEATURES, 1e9]
 )
 def test_what_is_no_prior_is_refused(prior: object) -> None:
     with pytest.raises(ValueError, match="prior"):

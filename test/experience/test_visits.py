@@ -14,7 +14,7 @@ from ddqn_planner.grid.arguments import MAX_SLOWNESS
 Float64 = NDArray[np.float64]
 
 SIDE = 0.25  # metres
-LIMITS = Limits(window=0.3, speed=0.5, max_speed=1.5, max_pause=90.0)
+LIMITS = Limits(speed=0.5, min_speed=0.005, max_speed=1.5, max_pause=90.0)
 
 
 @st.composite
@@ -40,7 +40,7 @@ def test_no_drive_shows_more_than_its_time_and_the_greatest_speed_allow(
 ) -> None:
     visits = visits_of(poses, SIDE, LIMITS)
     assert (visits.metres <= LIMITS.max_speed * visits.seconds + 1e-9).all()
-    assert (visits.waits.seconds <= LIMITS.max_pause).all()
+    assert (visits.waited <= LIMITS.max_pause).all()
     elapsed = np.maximum(np.diff(poses.time), 0)
     assert visits.total_seconds <= elapsed.sum() + 1e-6
     # Each pair of poses shows a way of a few metres at most, so that a short file with
