@@ -1,5 +1,6 @@
 """Networks with chosen weights, without a training."""
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,6 @@ from ddqn_planner.model import (
     ModelMetadata,
     QNetwork,
     RobotNetwork,
-    save_model,
 )
 from ddqn_planner.planning import Planner
 from ddqn_planner.robot.footprint import read_footprint
@@ -67,6 +67,23 @@ def robot_model(
     body: tuple[float, float, float] = BODY,
 ) -> None:
     """Write the model of a small robot that has learned its body exactly."""
+    robot_planner(motion, cell, body).save(path)
+
+
+def robot_planner(
+    motion: str, cell: float, body: tuple[float, float, float] = BODY
+) -> Planner:
+    """The planner of such a robot, which knows no field and no map."""
+    network = _robot_network(motion, cell, body)
+    rule = MoveRule.ROBOT_SAFE
+    metadata = ModelMetadata("robot", network.sizes, rule, 1.0, "", 0, 0, "")
+    return Planner(network, metadata)
+
+
+@cache
+def _robot_network(
+    motion: str, cell: float, body: tuple[float, float, float]
+) -> RobotNetwork:
     front, back, side = body
     corners = [(front, side), (-back, side), (-back, -side), (front, -side)]
     untrained = RobotNetwork.untrained(
@@ -74,8 +91,4 @@ def robot_model(
     )
     swept = untrained.swept_by_unit.astype(np.float32)
     learned = {"weight": 2 * swept, "threshold": np.ones(len(swept), np.float32)}
-    network = RobotNetwork(untrained.sizes, {**untrained.tensors, **learned})
-    rule = MoveRule.ROBOT_SAFE
-    save_model(
-        path, network, ModelMetadata("robot", network.sizes, rule, 1.0, "", 0, 0, "")
-    )
+    return RobotNetwork(untrained.sizes, {**untrained.tensors, **learned})

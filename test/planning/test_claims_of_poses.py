@@ -12,7 +12,7 @@ import bodies
 import numpy as np
 import pytest
 from bodies import least_costs
-from networks import robot_model
+from networks import robot_planner
 from numpy.typing import NDArray
 
 from ddqn_planner import GridMap, Planner
@@ -29,11 +29,9 @@ ROUNDED = 1e-4  # of a cost: the planner's sums are float32
 
 
 @pytest.fixture(scope="module")
-def planner(tmp_path_factory: pytest.TempPathFactory) -> Planner:
+def planner() -> Planner:
     """A robot that turns on the spot, 0.5 m long and 0.4 m wide."""
-    file = tmp_path_factory.mktemp("robot") / "robot.safetensors"
-    robot_model(file, "differential", CELL)
-    return Planner.load(file)
+    return robot_planner("differential", CELL)
 
 
 def fresh(planner: Planner) -> Planner:

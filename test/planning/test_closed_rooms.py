@@ -1,12 +1,11 @@
 """Goals inside and outside closed rooms, for bodies with a heading."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from networks import robot_model
+from networks import robot_planner
 
 from ddqn_planner import GridMap, Planner
 from ddqn_planner.model import RobotNetwork
@@ -52,11 +51,10 @@ def plan(planner: Planner, start: State, goals: Sequence[State]) -> PosePlan:
 
 @pytest.mark.parametrize("states_of_small_room", [200, 2**14])
 def test_goals_outside_a_closed_room_hide_no_goal_inside(
-    tmp_path: Path, monkeypatch: Any, states_of_small_room: int
+    monkeypatch: Any, states_of_small_room: int
 ) -> None:
     monkeypatch.setattr(pose_field, "UNGUIDED", states_of_small_room)
-    robot_model(tmp_path / "car.safetensors", "ackermann", CELL)
-    planner = Planner.load(tmp_path / "car.safetensors")
+    planner = robot_planner("ackermann", CELL)
     alone = plan(planner, START, [INSIDE])
     for goals in ([INSIDE, *AROUND], [FAR, INSIDE], [*AROUND, INSIDE, FAR]):
         found = plan(planner, START, goals)

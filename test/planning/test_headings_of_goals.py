@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from networks import robot_model
+from networks import robot_planner
 
 from ddqn_planner import GridMap, Planner
 from ddqn_planner.model import RobotNetwork
@@ -20,10 +20,8 @@ ANY = 0.0, math.pi  # the tolerance of a goal without a heading
 
 
 @pytest.fixture(scope="module")
-def car(tmp_path_factory: pytest.TempPathFactory) -> Planner:
-    file = tmp_path_factory.mktemp("robot") / "car.safetensors"
-    robot_model(file, "ackermann", CELL)
-    return Planner.load(file)
+def car() -> Planner:
+    return robot_planner("ackermann", CELL)
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from networks import robot_model
+from networks import robot_planner
 
 from ddqn_planner import GridMap, Planner
 from ddqn_planner.grid.grid_map import Exploration
@@ -24,10 +24,8 @@ START, GOAL = (
 
 
 @pytest.fixture(scope="module")
-def planner(tmp_path_factory: pytest.TempPathFactory) -> Planner:
-    file = tmp_path_factory.mktemp("robot") / "robot.safetensors"
-    robot_model(file, "differential", CELL)
-    return Planner.load(file)
+def planner() -> Planner:
+    return robot_planner("differential", CELL)
 
 
 def plan(planner: Planner, grid: GridMap, start: Any, **how: Any) -> Any:

@@ -3,7 +3,6 @@
 import math
 from functools import cache
 from itertools import pairwise
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +11,7 @@ import shapely
 from bodies import edges_of_primitive
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from networks import BODY, robot_model
+from networks import BODY, robot_planner
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
@@ -43,16 +42,9 @@ class Robot(NamedTuple):
     poses: PosePlanner
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("robots")
-
-
 @cache
-def robot(folder: Path, motion: str) -> Robot:
-    file = folder / f"{motion}.safetensors"
-    robot_model(file, motion, CELL)
-    planner = Planner.load(file)
+def robot(motion: str) -> Robot:
+    planner = robot_planner(motion, CELL)
     assert isinstance(planner.network, RobotNetwork)
     assert planner.pose_planner is not None
     return Robot(planner, planner.network, planner.pose_planner)
@@ -125,10 +117,10 @@ def cost_with_escape(robot: Robot, grid: GridMap, start: State, goal: State) -> 
 @example(motion="ackermann", seed=1)
 @example(motion="differential", seed=2)
 def test_a_way_out_touches_what_the_start_covers_and_the_rest_nothing(
-    folder: Path, motion: str, seed: int
+    motion: str, seed: int
 ) -> None:
     random = np.random.default_rng(seed)
-    body = robot(folder, motion)
+    body = robot(motion)
     occupancy = random.random((HEIGHT, WIDTH)) < 0.01
     if random.random() < 0.5:  # a wall, as long as you like
         occupancy[random.integers(HEIGHT), random.integers(WIDTH) :] = True
@@ -201,10 +193,8 @@ def hall(*blocks: tuple[int, int, int, int]) -> GridMap:
 
 
 @pytest.mark.parametrize("motion", ["differential", "ackermann"])
-def test_a_robot_leaves_a_mark_but_drives_through_no_wall(
-    folder: Path, motion: str
-) -> None:
-    body = robot(folder, motion)
+def test_a_robot_leaves_a_mark_but_drives_through_no_wall(motion: str) -> None:
+    body = robot(motion)
     start, goal = (pose_of(body, hall(), (x, 20, 0)) for x in (20, 45))
 
     def status(grid: GridMap, radius: float = math.inf) -> PlanStatus:
@@ -232,8 +222,8 @@ def test_a_robot_leaves_a_mark_but_drives_through_no_wall(
     assert backward.poses[:, 0].max() <= start[0] + 1e-9
 
 
-def test_a_robot_on_its_way_out_keeps_its_path(folder: Path) -> None:
-    body = robot(folder, "differential")
+def test_a_robot_on_its_way_out_keeps_its_path() -> None:
+    body = robot("differential")
     grid = hall((22, 21, 23, 22), (18, 18, 19, 19))
     start, goal = (pose_of(body, grid, (x, 20, 0)) for x in (20, 45))
     radius = math.inf
@@ -261,10 +251,8 @@ def test_a_robot_on_its_way_out_keeps_its_path(folder: Path) -> None:
     assert max(steps) <= CELL / 2 + 1e-9
 
 
-def test_a_free_robot_uses_no_path_of_one_that_started_on_obstacles(
-    folder: Path,
-) -> None:
-    body = robot(folder, "differential")
+def test_a_free_robot_uses_no_path_of_one_that_started_on_obstacles() -> None:
+    body = robot("differential")
     grid = hall((22, 20, 23, 21))
     start, goal = (pose_of(body, grid, (x, 20, 0)) for x in (20, 45))
     first = body.planner.plan_poses(grid, start, goal, start_clearing_radius=math.inf)
