@@ -123,7 +123,8 @@ def _members(arrays: Arrays, side: float) -> list[RobotEvidence]:
     }
     errors = arrays["errors"]
     surprises = arrays["surprises"]
-    # (R, 3) each: the rows at which places, errors and surprises of a robot end.
+    # (R, 3) each: how many places, errors and surprises a robot has, and the rows at
+    # which they end.
     counts: Int64 = arrays["counts"]
     ends = np.cumsum(counts, axis=0)
     totals = [sums.shape[1], len(errors), len(surprises)]
@@ -199,7 +200,8 @@ def _old_evidence(
         remaining = 0.5 ** ((driven - driven_before) / half_life)
         weight = weight * remaining
         sum_of_log = sum_of_log * remaining
-        passages = waited = 0 * weight
+        passages = np.zeros(len(weight))
+        waited = passages
     else:
         # The weight of passages since a robot first waited near, the seconds waited, a
         # prediction, and x and y.
