@@ -19,7 +19,7 @@ import driving_scenes as scenes
 import driving_worlds as worlds
 import numpy as np
 from driving_learners import LEARNERS
-from driving_missions import Job, Result, planner, run
+from driving_missions import KNOWN, Job, Result, planner, run
 from driving_worlds import RULE, SPEED, drive
 from figures import draw_times, save_figure
 from random_maps import generate_map
@@ -69,6 +69,23 @@ def compared(options: Options) -> Sections:
         if "From mission to mission" not in sections:
             curve = _curve(options.out / "curve.png", results)
             sections["From mission to mission"] = curve
+    return sections
+
+
+def limit(options: Options) -> Sections:
+    """Compare with those who know the mean times of places, and of turns.
+
+    It is measured in worlds where turns or directions take time.
+    """
+    sections = {}
+    for title, kinds_of_set in options.sets.items():
+        names = [kind for kind in kinds_of_set if kinds.class_of(kind) == kinds.TURNS]
+        if not names:
+            continue
+        results = _runs(names, (EXPERIENCE, *KNOWN), options)
+        learned = [result for result in results if result.learner == EXPERIENCE]
+        results += [result.of_shortest_path() for result in learned]
+        sections[f"{title}, limits of turns and directions"] = _by_law(results)
     return sections
 
 
@@ -168,6 +185,7 @@ def speed(_: Options) -> Sections:
 
 FIGURES: Final[dict[str, Callable[[Options], Sections]]] = {
     "compared": compared,
+    "limit": limit,
     "hall": scenes.hall,
     "one_wait": scenes.one_wait,
     "doors": scenes.doors,

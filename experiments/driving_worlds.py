@@ -74,6 +74,30 @@ class World:
             self.grid, slowness=slowness, seconds_per_cell=self.grid.resolution / SPEED
         )
 
+    def mean_times(self, clock: float, has_turns: bool) -> GridMap:
+        """Return the map of one who knows the mean time of each place, but no waits.
+
+        It is the mean over all directions of driving. With `has_turns`, what turning
+        takes is known, too.
+        """
+        law = self.law
+        slowness = self.slowness(clock)
+        if law.uphill is not None:
+            factor = law.whole_drive(clock) if law.whole_drive is not None else 1.0
+            angle = np.arange(HEADINGS) * np.pi / 4
+            directions = np.stack([np.cos(angle), np.sin(angle)])  # (2, HEADINGS)
+            climb = np.maximum(law.uphill @ directions, 0)  # (H, W, HEADINGS)
+            slowness = slowness + factor * climb.mean(axis=2)
+        if law.stop is not None:
+            slowness = slowness + law.stop.mean * SPEED
+        seconds = self.grid.resolution / SPEED
+        turn_cost = law.turn_seconds / (np.pi / 4) / seconds  # in cells per radian
+        return self.grid.with_times(
+            np.maximum(slowness, 1).astype(np.float32),
+            seconds,
+            turn_cost if has_turns else 0.0,
+        )
+
     def routes(self, planner: Planner, start: Cell, goal: Cell, clock: float) -> Routes:
         """Return the routes of one who knows nothing, and of one who knows slowness."""
         maps = {"shortest": self.grid, "best possible": self.known(clock)}
