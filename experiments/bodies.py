@@ -33,9 +33,11 @@ from ddqn_planner.grid import MOVES, Cell, MoveRule
 from ddqn_planner.model import ModelMetadata, RobotNetwork
 from ddqn_planner.planning.path_finder import last_step
 from ddqn_planner.planning.plan import PosePlan, PoseRequest
+from ddqn_planner.robot.driving_costs import DrivingCosts
 from ddqn_planner.robot.footprint import read_footprint
 from ddqn_planner.robot.motions import HEADINGS as DEFAULT_HEADINGS
-from ddqn_planner.robot.motions import Motion, Motions, make_motions
+from ddqn_planner.robot.motions import Motion, Motions
+from ddqn_planner.training.robot import MotionOptions, read_motions
 from ddqn_planner.version import __version__
 from ddqn_planner.warm_up import warm_up
 
@@ -67,14 +69,19 @@ Pose = tuple[float, float, float]
 
 
 def robot(
-    footprint: str, motion: Motion | str, headings: int = DEFAULT_HEADINGS
+    footprint: str,
+    motion: Motion | str,
+    headings: int = DEFAULT_HEADINGS,
+    costs: DrivingCosts = DrivingCosts(),  # noqa: B008 - it never changes
 ) -> Planner:
     """Return the planner of a body that knows its swept cells exactly.
 
     It needs no training.
     """
     corners = read_footprint(footprint)
-    motions = make_motions(motion, RADII[Motion(motion)], CELL, headings)
+    motion = Motion(motion)
+    options = MotionOptions(motion, RADII[motion], CELL, headings, costs=costs)
+    motions = read_motions(options)
     network = RobotNetwork.untrained(corners, motions)
     network.tensors["weight"] = network.swept_by_unit.astype(np.float32)
     network.tensors["threshold"] = np.full(network.sizes["units"], 0.5, np.float32)

@@ -232,6 +232,7 @@ PICTURES: Mapping[str, Callable[[], Any]] = {
     "kinds": page_pictures.kinds,
     "decisions": page_pictures.decisions,
     "speed": page_pictures.speed,
+    "bends": page_pictures.bends,
     "python_api": page_pictures.python_api,
 }
 

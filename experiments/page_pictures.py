@@ -3,10 +3,12 @@
 doc_pictures.py saves them.
 """
 
+import math
 import re
 from pathlib import Path
 from typing import Any, Final
 
+import bodies
 import numpy as np
 from figures import COLOURS, draw_path, plt
 from numpy.typing import NDArray
@@ -26,6 +28,10 @@ from ddqn_planner.model.networks import (
     observation_background,
 )
 from ddqn_planner.pictures import VALUE_COLOURS, draw_obstacles
+from ddqn_planner.planning.path_finder import last_step
+from ddqn_planner.planning.plan import PoseRequest
+from ddqn_planner.robot.directions import directions_of_travel
+from ddqn_planner.robot.driving_costs import DrivingCosts
 from ddqn_planner.training import paper_scenario
 
 BENCHMARKS: Final = Path(__file__).resolve().parents[1] / "docs" / "benchmarks.md"
@@ -43,6 +49,15 @@ OBSERVED: Final = (
 )
 ARROWS: Final = "→↗↑↖←↙↓↘"
 CAR: Final = "--model car --start 30 97 --goal 495 280 --yaws 0 1.57"
+HALL_WIDTH: Final = 360  # cells
+HALL_HEIGHT: Final = 180
+HALL_ENDS: Final = ((2.5, 2.5, math.pi), ((15.5, 6.5, 0.5),))  # start, and goals
+LENGTHS_ALONE: Final = DrivingCosts(bend=1.0, cusp=0.0)
+COSTS_OF_DRIVING: Final = {
+    "where lengths alone count": LENGTHS_ALONE,
+    "by default": DrivingCosts(),
+}
+ARROWS_OF_PATH: Final = 24
 VIA: Final[Cell] = (2, 16)
 GOALS: Final[tuple[Cell, ...]] = ((17, 19), (11, 2), (13, 10))
 
@@ -216,6 +231,44 @@ def python_api() -> Any:
         x, y = np.transpose(cells)
         axes.scatter(x, y, 90, "black", marker="*", edgecolors="white", zorder=4)
     return figure
+
+
+def bends() -> Any:
+    """Draw a car's path where lengths alone count, and where bends and cusps do."""
+    grid = GridMap(np.zeros((HALL_HEIGHT, HALL_WIDTH), np.bool_), bodies.CELL)
+    figure, panels = plt.subplots(2, 1, figsize=(7.2, 6.4), layout="constrained")
+    costs_and_panels = zip(COSTS_OF_DRIVING.items(), panels, strict=True)
+    for (name, costs), axes in costs_and_panels:
+        footprint = bodies.FOOTPRINTS["car"]
+        planner = bodies.robot(footprint, "ackermann", costs=costs)
+        assert planner.pose_planner is not None
+        is_finished = costs != LENGTHS_ALONE
+        request = PoseRequest(grid, *HALL_ENDS, finished=is_finished)
+        poses = last_step(planner.pose_planner.steps(request)).poses  # (N, 3)
+        start, (goal,) = HALL_ENDS
+        shape = bodies.shape_of(poses, start, goal)
+        draw_directions(axes, poses)
+        axes.set_aspect("equal")
+        axes.set(
+            xlim=(0, HALL_WIDTH * bodies.CELL), ylim=(0, HALL_HEIGHT * bodies.CELL)
+        )
+        words = f"{shape.turning:.0f} degrees and {shape.cusps:.1f} cusps per 10 m"
+        axes.set_title(f"{name}: {words}", loc="left", fontsize=10)
+    panels[1].set(xlabel="x [m]")
+    panels[0].legend(loc="upper left", frameon=False)
+    return figure
+
+
+def draw_directions(axes: Any, poses: NDArray[np.float64]) -> None:
+    """Draw a path (N, 3), in metres: ahead and in reverse in different colours."""
+    in_cells = poses / (bodies.CELL, bodies.CELL, 1)
+    is_reverse = np.append(directions_of_travel(in_cells) < 0, False)
+    is_before = np.roll(is_reverse, 1) | is_reverse
+    reverse = np.where(is_before[:, None], poses[:, :2], np.nan)
+    axes.plot(*poses[:, :2].T, color=COLOURS[0], linewidth=2, label="ahead")
+    axes.plot(*reverse.T, color=COLOURS[1], linewidth=3, label="in reverse")
+    x, y, yaw = poses[:: len(poses) // ARROWS_OF_PATH].T
+    axes.quiver(x, y, np.cos(yaw), np.sin(yaw), scale=40, width=0.003, zorder=5)
 
 
 def save_command_line(path: Path) -> None:
