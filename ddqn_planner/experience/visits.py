@@ -131,7 +131,7 @@ def visits_of(poses: Poses, side: float, limits: Limits) -> Visits:
     position = np.column_stack([x, y]) / step_count[:, None]
     ends = np.concatenate([poses.position[:1], poses.position[-1:]])
     from_ends = position[:, None] - ends  # (V, 2, 2) metres
-    from_nearest_end: Float64 = _lengths(from_ends).min(axis=1)
+    from_nearest_end: Float64 = _lengths(from_ends).min(axis=1, initial=np.inf)
     metres = length * step_count
     return Visits(
         position, metres, driven, waited, turned, from_nearest_end > END, turns
@@ -173,8 +173,9 @@ def _steps_along(spots: Poses, moves: Steps, length: float, limits: Limits) -> F
     elapsed = moves.seconds - turned
     has_stood = elapsed > STAND / limits.speed
     stood = np.where(has_stood, elapsed - moves.metres / limits.speed, 0)
-    # A robot that seems to stand all the time does not drive: times are wrong.
-    is_pause = (stood > limits.max_pause) | has_stood.all()
+    # If the whole part is too slow, the times are wrong.
+    is_too_slow = moves.metres.sum() < limits.min_speed * moves.seconds.sum()
+    is_pause = (stood > limits.max_pause) | is_too_slow
     driven = np.where(is_pause, LEFT_OUT, elapsed - stood)
     # The next segment of the path has the wait.
     waited = np.append(0, np.where(is_pause, 0, stood))[:-1]
