@@ -141,6 +141,22 @@ def test_transforms_with_rounded_rotations_count_and_those_without_do_not(
     np.testing.assert_allclose(samples, driven(5.0), atol=1e-9)
 
 
+def test_transforms_that_do_not_lead_from_the_robot_to_the_map_give_no_pose(
+    tmp_path: Path,
+) -> None:
+    messages = []
+    for message in tree("", 5.0):
+        # Another frame moves more often, and two frames are the parents of each other.
+        beside = [transform(100 + t, "base_link", "camera", t, 0) for t in range(5)]
+        circle = [transform(1, "up", "down", 1, 0), transform(1, "down", "up", 1, 0)]
+        robot = [transform(1, "up", "other/base_link", 1, 0)]
+        sent = {"transforms": [*beside, *circle, *robot]}
+        messages += [message, Message("/tf", TRANSFORMS, sent)]
+    poses = read_bag(write_bag(tmp_path / "bag", messages))
+    assert poses.source == "/tf of base_link"
+    np.testing.assert_allclose(poses.samples, driven(5.0), atol=1e-9)
+
+
 BY_TURNS = zip(tree("", 9.0, "/robot2/tf"), tree("", 1.0, "/robot1/tf"), strict=True)
 # The poses of two robots, their messages, and what chooses the second robot.
 TWO_ROBOTS: dict[str, tuple[list[Message], dict[str, str]]] = {

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from ddqn_planner import Experience, GridMap, Planner
 from ddqn_planner.experience import ExperienceFileError
 from ddqn_planner.experience.experience import EXPLORATION
-from ddqn_planner.experience.places import SUMS
+from ddqn_planner.experience.places import NOISE, SUMS
 from ddqn_planner.grid import MoveRule, shortest_distances
 
 PLANNER = Planner.load("any_map")
@@ -431,7 +431,7 @@ def test_a_file_of_an_older_version_is_of_one_robot_also_if_it_is_copied(
 ) -> None:
     loaded = Experience.load(path)
     places = loaded.evidence.places
-    weight, log, nothing = places.weight, places.sum_of_log, 0 * places.weight
+    weight, log, nothing = 5 * places.weight, 5 * places.sum_of_log, 0 * places.weight
     x, y = places.position.T
     tables = {  # with failures, and when each place was visited; with predictions
         1: (weight, log, weight * 9, x, y, nothing),
@@ -440,10 +440,28 @@ def test_a_file_of_an_older_version_is_of_one_robot_also_if_it_is_copied(
     options = list(loaded.options.values())
     for version, columns in tables.items():
         evidence = np.column_stack(columns)
-        np.savez(path, version=version, options=options, evidence=evidence, driven=60.0)
+        driven_seconds = 0.5 * loaded.half_life  # since the last visit
+        np.savez(
+            path,
+            version=version,
+            options=options,
+            evidence=evidence,
+            driven=driven_seconds,
+        )
         old, copy = Experience.load(path), Experience.load(path)
         slowness = old.slowness(HALL)
         assert at(HALL, slowness, 7, 5) == pytest.approx(3, rel=0.15)
+        # Only the first version tells how long ago the last visit was.
+        remaining = 0.5**0.5 if version == 1 else 1.0
+        old_places = old.evidence.places
+        np.testing.assert_allclose(old_places.weight, remaining * weight, rtol=1e-6)
+        several = old_places.weight > 2
+        assert several.any()
+        variance = (
+            old_places.sum_of_squares - old_places.sum_of_log * old_places.mean_log()
+        )
+        assumed = NOISE * (old_places.weight - 1)
+        np.testing.assert_allclose(variance[several], assumed[several], rtol=1e-3)
         old.merge(copy)
         np.testing.assert_array_equal(old.slowness(HALL), slowness)
 
