@@ -161,7 +161,23 @@ class Finish:
         new_head = self.finished(head, start, joint, grid, world)
         if new_head is head:
             return path
-        return new_head.followed_by(path.part(count - 1, len(path.poses)))
+        rest = path.part(count - 1, len(path.poses))
+        more_cusps = new_head.cusps_to(rest) - head.cusps_to(rest)
+        return new_head.followed_by(rest, more_cusps * self._rates.cusp)
+
+    def finished_after(
+        self, escape: int, path: PosePath, goal: Any, grid: GridMap, world: World
+    ) -> PosePath:
+        """Return a path that is finished from pose number `escape` on.
+
+        For the rest, see `finished`.
+        """
+        head = path.part(0, escape + 1)
+        rest = path.part(escape, len(path.poses))
+        new_rest = self.finished(rest, rest.poses[0], goal, grid, world)
+        # If it is the same cusp as before, it counts twice.
+        extra_cost = head.cusps_to(new_rest) * self._rates.cusp
+        return head.followed_by(new_rest, extra_cost)._replace(escape=escape)
 
     def _tracks(
         self, path: PosePath, start: Any, goal: Any, grid: GridMap, course: Course

@@ -58,9 +58,22 @@ class PosePath(NamedTuple):
             self.least_costs[part],
         )
 
-    def followed_by(self, rest: "PosePath") -> "PosePath":
-        """Return the path and then another one, which begins in its last pose."""
-        costs_of_rest = rest.costs[1:] - rest.costs[0]
+    def cusps_to(self, rest: "PosePath") -> int:
+        """Return whether a cusp lies between a path and the next one: 1, else 0."""
+        together = np.concatenate([self.poses, rest.poses[1:]])
+        cusps = [
+            int(cusps_before(directions_of_travel(poses))[-1])
+            for poses in (together, self.poses, rest.poses)
+        ]
+        return cusps[0] - cusps[1] - cusps[2]
+
+    def followed_by(self, rest: "PosePath", extra_cost: float) -> "PosePath":
+        """Return the path and then another one, which begins in its last pose.
+
+        `extra_cost` is what the cusp between both costs more than the costs of the
+        other one say.
+        """
+        costs_of_rest = rest.costs[1:] - rest.costs[0] + extra_cost
         return self._replace(
             poses=np.concatenate([self.poses, rest.poses[1:]]),
             cells=np.concatenate([self.cells, rest.cells[1:]]),

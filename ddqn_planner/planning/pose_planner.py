@@ -221,11 +221,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         goal = goals[number] if number >= 0 else last_pose
         if not path.escape:
             return self._finish.finished(path, request.start, goal, grid, world)
-        escape = path.part(0, path.escape + 1)
-        rest = path.part(path.escape, len(path.poses))
-        start = rest.poses[0]
-        finished_rest = self._finish.finished(rest, start, goal, grid, world)
-        return escape.followed_by(finished_rest)._replace(escape=path.escape)
+        return self._finish.finished_after(path.escape, path, goal, grid, world)
 
     def _reason(self, request: PoseRequest, plan: PosePlan) -> PausingGenerator[str]:
         """Return why there is no path, in words.

@@ -10,11 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from planning.test_poses import BODIES, CELL, planner, robot
 
-from ddqn_planner import GridMap
+from ddqn_planner import GridMap, Planner
 from ddqn_planner.planning.path_finder import last_step
 from ddqn_planner.planning.plan import Pose, PosePlan, PoseRequest
 from ddqn_planner.planning.pose_curves import write_pieces
 from ddqn_planner.planning.pose_finish import END_COST
+from ddqn_planner.planning.pose_paths import cost_of_poses
 from ddqn_planner.planning.pose_planner import PosePlanner
 from ddqn_planner.robot.driving_costs import least_radius_of, rates_of
 from ddqn_planner.robot.motions import turn_between
@@ -115,6 +116,27 @@ def test_ends_are_exact_where_nothing_is_near(motion: str) -> None:
         again = plan(body, grid, start, goal, finished=True)
         assert np.array_equal(found.poses, again.poses)
     assert exact >= 9
+
+
+def test_the_rest_of_a_finished_path_costs_what_its_poses_do() -> None:
+    """So with the cusps of the curves that lead a robot back to its path."""
+    random = np.random.default_rng(4)
+    body = Planner.load("car").pose_planner
+    assert body is not None
+    occupancy = np.zeros((120, 120), np.bool_)
+    occupancy[:70, 60] = True
+    grid = GridMap(occupancy, 0.05)
+    for _ in range(3):
+        start, goal = (
+            (*random.uniform((low, 1.2), (low + 1.2, 4.5)), random.uniform(-3, 3))
+            for low in (1.2, 4)
+        )
+        path = plan(body, grid, start, goal, finished=True).poses
+        for pose in path[: len(path) // 2 : 9]:
+            x, y, yaw = pose + random.uniform(-0.01, 0.01, 3)
+            rest = plan(body, grid, (x, y, yaw), goal, finished=True)
+            cost = cost_of_poses(rest.poses, grid, rates_of(body.motions))
+            assert rest.cost == pytest.approx(cost, rel=0.01)
 
 
 @settings(max_examples=10)
