@@ -77,9 +77,16 @@ OPTIONS: Final = (
         0.0,
         "obstacles so near to a start do not count, metres",
     ),
-    Option("yaw-tolerance", float, 0.0, "body: how far such a goal may turn, radians"),
+    Option(
+        "yaw-tolerance",
+        float,
+        0.0,
+        "body: how far such a goal may turn, radians; pi or more: any heading",
+    ),
     Option("either-direction", bool, False, "body: the goal also in reverse"),
-    Option("bound", float, 1.0, "body: how many times the least cost a path may have"),
+    Option(
+        "bound", float, 1.0, "body: how many times the least cost a path may have; inf"
+    ),
     Option("cells", bool, False, "print each cell of the path, as X Y"),
     Option("csv", Path, None, "write the path's cells and metres, or its poses"),
     Option("json", bool, False, "print JSON instead of text"),

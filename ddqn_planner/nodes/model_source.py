@@ -36,10 +36,11 @@ NEW_OBJECTS = 20_000
 # cell: more is told.
 ROOM = 0.05
 MOST_LETTERS = 500  # of a footprint in a message
-REMEDY = (
-    "train one with ddqn-planner train-robot and name it in the parameter models, "
-    "or follow a trainer (a costmap's footprint has its footprint_padding)"
+TRAIN = (
+    "train one with ddqn-planner train-robot and name it in the parameter models "
+    "(a costmap's footprint contains its footprint_padding)"
 )
+WAIT_OR_TRAIN = f"wait for that of a trainer, if one runs, or {TRAIN}"
 MOST_TRAINED = 8  # models of the trainer that are kept, for footprints that come again
 
 
@@ -135,6 +136,8 @@ class ModelSource:
         # The trainer's models for footprints.
         self._trained: deque[LoadedModel] = deque(maxlen=MOST_TRAINED)
         self._network_in_use: QNetwork | None = None
+        # The network of the last warning that a body is larger than the footprint.
+        self._larger_network: QNetwork | None = None
         self.loading: Future | None = None
         """Of the `FirstModels`, until `wait_until_loaded` uses or refuses them."""
 
@@ -294,7 +297,9 @@ class ModelSource:
         self.file = ""
         problem = f"no model covers the footprint {in_words(footprint)}"
         reach = f"it reaches {metres:.2g} m beyond the body of {nearest.source}"
-        self._diagnostics.refuse("model", f"{problem}: {reach}; {REMEDY}")
+        self._diagnostics.refuse(
+            "model", f"{problem}: {reach}; {self._remedy}", log=had_planner
+        )
         return had_planner
 
     def _warn_if_larger(self, footprint: Corners, model: LoadedModel) -> None:
@@ -302,13 +307,22 @@ class ModelSource:
         assert isinstance(model.network, RobotNetwork)
         metres = excess(model.body, footprint)
         if metres <= max(ROOM, model.network.motions.resolution):
+            self._larger_network = None
             return
         self.unfit = model
+        if model.network is self._larger_network:
+            return  # a footprint may change all the time, as that of an arm
+        self._larger_network = model.network
         problem = f"no model has the footprint {in_words(footprint)}"
         larger = f"that of {model.source}, which reaches {metres:.2g} m beyond it"
         self._node.get_logger().warning(
-            f"{problem}; planning with a larger body, {larger}; {REMEDY}"
+            f"{problem}; planning with a larger body, {larger}; {self._remedy}"
         )
+
+    @property
+    def _remedy(self) -> str:
+        """What to do about a footprint that has no model, in words."""
+        return WAIT_OR_TRAIN if self._node.value("follow_trainer") else TRAIN
 
     # Describing
 
@@ -351,6 +365,7 @@ class ModelSource:
         self._bodies = None
         self._trained.clear()
         self._network_in_use = None
+        self._larger_network = None
         gc.unfreeze()
         gc.collect()
 

@@ -64,6 +64,7 @@ class TrainedBodies:
         self._worker = worker
         self._models = models
         self._on_change = on_change
+        self._last_footprint: Corners | None = None  # at the last look
         self._asked_for: Corners | None = None
         self._asked_at = 0.0  # in seconds of the steady clock
         group = MutuallyExclusiveCallbackGroup()  # the callbacks wait for the worker
@@ -76,11 +77,14 @@ class TrainedBodies:
     async def _ask(self) -> None:
         """Ask for a model of the footprint, if no model has nearly this body.
 
-        It is asked for once if another model covers it, and again until one does.
+        It is asked for once if another model covers it, and again until one does. A
+        footprint that still changes, as that of an arm that moves, is not asked for.
         """
         nearest = self._models.unfit
         footprint = self._models.footprint
-        if nearest is None or footprint is None:
+        is_steady = footprint is self._last_footprint
+        self._last_footprint = footprint
+        if nearest is None or footprint is None or not is_steady:
             return
         now = time.monotonic()
         if footprint is self._asked_for:

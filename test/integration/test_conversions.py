@@ -451,6 +451,11 @@ def test_a_pose_is_transformed_by_the_transform_of_its_time_or_refused(
         assert in_map.header.stamp.sec == found
         assert in_map.pose.position.x == 3.0
     frames = listening(100, 110)
+    for asked, found in asked_found:
+        transform = frames.transform_at(pose_at(asked).header, "map")
+        assert transform.header.stamp.sec == found
+    with pytest.raises(ValueError, match="extrapol"):
+        frames.transform_at(pose_at(99.5).header, "map")
     for stamped, reason in (
         (pose_at(98.9), r"the goal's frame is 'odom'.*extrapol.*; publish"),
         (pose_at(110.5), r"the goal's frame is 'odom'.*extrapol.*; publish"),

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from networks import BODY, robot_model
 from std_msgs.msg import Header
 
-from ddqn_planner.grid import GridMap
+from ddqn_planner import GridMap, Planner
 from ddqn_planner.nodes.conversions import quaternion
 from ddqn_planner.nodes.diagnostics import PlannerDiagnostics
 from ddqn_planner.nodes.footprint_source import TOPIC, FootprintSource
@@ -125,6 +125,9 @@ def test_a_planner_that_is_replaced_is_freed_with_its_fields(tmp_path: Path) -> 
     front, back, side = BODY
     in_small = read_footprint([(front, side), (-back, side), (-back, -side)])
     grid = GridMap(np.zeros((30, 30)), 0.1)
+    # Functions that are compiled for the first time hold what they were called with.
+    read_planner: Any = Planner.load(small)
+    read_planner.plan_poses(grid, (1, 1, 0), (2, 2, 1))
     freed: list[weakref.ref[Any]] = []
     for footprint, file in 2 * [(in_small, small), (-in_small, large)]:
         source.use_footprint(footprint)

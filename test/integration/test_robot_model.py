@@ -256,7 +256,8 @@ def test_the_model_that_covers_the_footprint_is_used_during_a_drive(
     # A footprint that no model covers has no path, and the log says what to do.
     words = carry(robot, 0.5, loaded, behind=0.3)
     robot.plans.wait(lambda path: not path.poses)
-    reason = f"no model covers .*{words}.* 0.1 m beyond .*{extended.name}; train one"
+    reach = f"0.1 m beyond .*{extended.name}"
+    reason = f"no model covers .*{words}.* {reach}; wait for .*train one"
     robot.wait_for_reason(reason, {"status": "NO_MODEL"})
     assert not robot.get_plan(at(robot, START, 0.5), at(robot, BEYOND, 0.0)).poses
     # The smallest model that covers a footprint is used, and is told if it is larger.
