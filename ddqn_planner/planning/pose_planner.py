@@ -37,6 +37,7 @@ from ddqn_planner.planning.pose_world import (
     world_of,
     world_with_escape,
 )
+from ddqn_planner.robot.directions import first_direction
 from ddqn_planner.robot.driving_costs import rates_of
 from ddqn_planner.robot.motions import turn_between
 
@@ -413,7 +414,8 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         ratio = 1.0  # of the cost of the rest to that of the new path
         if has_new_path:
             new_cost = self._cost_along(plan.poses, grid)
-            if not request.keeps(rest_cost, new_cost):
+            cusp_cost = self._cost_of_cusp_between(rest, plan.poses, grid)
+            if not request.keeps(rest_cost, new_cost + cusp_cost):
                 return plan
             if new_cost:
                 ratio = rest_cost / new_cost
@@ -433,6 +435,21 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
             field_ms=plan.field_ms,
             rollout_ms=plan.rollout_ms,
         )
+
+    def _cost_of_cusp_between(
+        self,
+        path: NDArray[np.float64],
+        new_path: NDArray[np.float64],
+        grid: GridMap,
+    ) -> float:
+        """Return what it costs a robot that drives along a path to leave on a new one.
+
+        That is the cost of a cusp, in cells, if one path leads off ahead and the other
+        in reverse, else 0. Both are poses (N, 3) in the map frame.
+        """
+        direction = first_direction(paths.in_cells(path, grid))
+        new_direction = first_direction(paths.in_cells(new_path, grid))
+        return self._rates.cusp if direction * new_direction < 0 else 0.0
 
     def _check_resolution(self, grid: GridMap) -> None:
         """Raise a ValueError if the robot learned cells of another size."""

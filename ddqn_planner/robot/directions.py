@@ -94,6 +94,16 @@ def directions_of_travel(poses: Poses) -> NDArray[np.int64]:
     return np.where(is_along, np.sign(ahead), 0).astype(np.int64)
 
 
+def first_direction(poses: Poses) -> int:
+    """Return the direction in which a path (N, 3) leaves, see `directions_of_travel`.
+
+    It is 0 for a path without a step ahead or in reverse.
+    """
+    directions = directions_of_travel(poses)
+    driven = directions[directions != 0]
+    return int(driven[0]) if len(driven) else 0
+
+
 def cusps_before(directions: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return how many cusps lie before the end of each of N - 1 steps: (N,), from 0.
 

@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import bodies
 import numpy as np
 import pytest
 from networks import robot_planner
@@ -14,7 +15,7 @@ from ddqn_planner.planning import PlanStatus
 from ddqn_planner.planning.path_finder import last_step
 from ddqn_planner.planning.pose_paths import cost_of_poses
 from ddqn_planner.planning.pose_planner import PoseRequest
-from ddqn_planner.robot.driving_costs import rates_of
+from ddqn_planner.robot.driving_costs import DrivingCosts, rates_of
 
 CELL = 0.1
 START, GOAL = (
@@ -167,3 +168,17 @@ def test_a_kept_path_costs_as_much_time_as_it_takes(planner: Planner) -> None:
         assert np.array_equal(found.poses, aside)
     assert kept_timed.cost == pytest.approx(0.2 * kept.cost)
     assert kept_timed.bound == pytest.approx(kept.bound)
+
+
+def test_a_robot_that_drives_ahead_turns_back_only_where_a_cusp_pays() -> None:
+    hall = GridMap(np.zeros((30, 60)), bodies.CELL)
+    start, ahead, back = ((*hall.cell_to_world((x, 15)), 0.0) for x in (30, 38, 24))
+    ends = {}
+    for cusp in (0.0, 2.0):  # metres
+        costs = DrivingCosts(cusp=cusp, reverse=1.0)
+        body = bodies.robot("0.1", "ackermann", costs=costs)
+        way = body.plan_poses(hall, start, ahead).poses
+        request = PoseRequest(hall, start, (back, ahead), under_way=way)
+        new = last_step(body.steps(request))
+        ends[cusp] = new.poses[-1, 0]
+    assert ends == pytest.approx({0.0: back[0], 2.0: ahead[0]})
