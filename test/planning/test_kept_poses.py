@@ -177,8 +177,9 @@ def test_a_robot_that_drives_ahead_turns_back_only_where_a_cusp_pays() -> None:
     for cusp in (0.0, 2.0):  # metres
         costs = DrivingCosts(cusp=cusp, reverse=1.0)
         body = bodies.robot("0.1", "ackermann", costs=costs)
+        assert body.pose_planner is not None
         way = body.plan_poses(hall, start, ahead).poses
         request = PoseRequest(hall, start, (back, ahead), under_way=way)
-        new = last_step(body.steps(request))
+        new = last_step(body.pose_planner.steps(request))
         ends[cusp] = new.poses[-1, 0]
     assert ends == pytest.approx({0.0: back[0], 2.0: ahead[0]})
