@@ -19,7 +19,7 @@ from ddqn_planner.robot.motions import Motions, dense_poses
 SHIFT: Final = 2  # so many bits tell where in its tile a cell lies, along a side
 TILE: Final = 1 << SHIFT  # cells along a side of a tile
 # Occupied cells around the map, so that a body sweeps none beyond the bits.
-BORDER: Final = 128
+BORDER: Final = 192
 State: TypeAlias = tuple[int, int, int]  # x, y, heading
 # Cells between two points of the origin's path, which tell the cells that it passes.
 FINE = 0.01
@@ -367,8 +367,8 @@ def world_of(
     occupied_bits = older.occupied_bits.copy()
     _write_rows(occupied_bits, grid, first_row, last_row + 1)
     # The tiles from which a body may reach one of the cells become unseen.
-    near_rows = _tiles_near(first_row, last_row)
-    near_columns = _tiles_near(first_column, last_column)
+    near_rows = _tiles_near(first_row, last_row, body.reach)
+    near_columns = _tiles_near(first_column, last_column, body.reach)
     nearness = older.nearness.copy()
     nearness[near_rows, near_columns] = UNSEEN
     passability = older.passability.copy()
@@ -418,18 +418,20 @@ def world_with_escape(world: World, cells: NDArray[np.int64]) -> World:
     first_column, first_row = cells.min(axis=0).tolist()
     last_column, last_row = cells.max(axis=0).tolist()
     passability = world.passability.copy()
-    near_rows = _tiles_near(first_row, last_row)
-    passability[near_rows, _tiles_near(first_column, last_column)] = UNSEEN
+    near_rows = _tiles_near(first_row, last_row, world.body.reach)
+    near_columns = _tiles_near(first_column, last_column, world.body.reach)
+    passability[near_rows, near_columns] = UNSEEN
     return world._replace(escape_bits=escape_bits, passability=passability)
 
 
-def _tiles_near(first: int, last: int) -> slice:
-    """Return the rows of tiles that lie within `BORDER` cells of some rows of cells.
+def _tiles_near(first: int, last: int, reach: int) -> slice:
+    """Return the rows of tiles within a body's reach, in cells, of some rows of cells.
 
     `first` and `last` are the first and the last of these rows of cells. Columns are
     counted in the same way.
     """
-    return slice(max(first - BORDER, 0) // TILE, (last + 1 + BORDER) // TILE + 1)
+    distance = reach + TILE  # the reach is counted from the middle of a tile, too
+    return slice(max(first - distance, 0) // TILE, (last + distance) // TILE + 1)
 
 
 def _new_world(grid: GridMap, body: Body) -> World:

@@ -24,7 +24,9 @@ MIN_COSINE: Final = 2 / 3
 SMALLEST_COSINE: Final = 1e-3  # of a concave corner, so that it can be divided by
 MAX_DEPTH: Final = 4  # of open brackets, and the text around them
 MARGIN: Final = 0.1  # cells by which the swept cells are those of a larger body
-MAX_REACH: Final = 120  # cells that a primitive may sweep to each side
+MAX_REACH: Final = 180  # cells that a primitive may sweep to each side
+# By which a reach is longer, at most, as motions end in the centres of cells.
+ROUNDED_CELLS: Final = 10
 
 REMEDY: Final = (
     "give a radius, or points '[[x, y], ...]', metres from the robot's origin"
@@ -457,8 +459,12 @@ def _reach(radius: float, motions: Motions) -> int:
     distances = np.hypot(poses[:, 0], poses[:, 1])  # cells from the start
     reach = math.ceil(radius + float(distances.max())) + 1
     if reach > MAX_REACH:
+        # In whole centimetres. Motions end in the centres of cells, so they are longer
+        # by some cells than the coarser resolution alone makes them.
+        ratio = reach / (MAX_REACH - ROUNDED_CELLS)
+        coarse = math.ceil(100 * motions.resolution * ratio) / 100
         problem = f"the body sweeps {reach} cells to a side; at most {MAX_REACH} can be"
-        remedy = f"give a coarser resolution than {motions.resolution} m"
+        remedy = f"give a resolution of {coarse:g} m, or a smaller turning radius"
         raise ValueError(f"{problem} learned: {remedy}")
     return reach
 

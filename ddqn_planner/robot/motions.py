@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise, product
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -46,7 +46,7 @@ SPACING = 0.5  # cells
 ANGLE = math.radians(5)
 
 CELL_SIZES: Final = (0.001, 10.0)  # metres: a body covers too many finer cells
-MAX_TURNING_RADIUS: Final = 100  # cells
+MAX_TURNING_RADIUS: Final = 360  # cells: a bend leads up to 0.47 times as far
 
 MAX_LATTICE_BYTES = 2**26  # Nav2's own files have up to 1 MB
 MAX_DISTANCE: Final = 100.0  # metres from the start of a lattice's primitive
@@ -419,8 +419,9 @@ def _nearest_end(directions: Float64, min_length: float) -> _Corner:
     # All cells in a square around the origin, which contains the nearest end: sides
     # that are whole numbers of steps end in the centre of a cell.
     max_distance = math.ceil(2 * (min_length + LONGEST_STEP))
-    coordinates = range(-max_distance, max_distance + 1)
-    cells = np.array(list(product(coordinates, repeat=2)))  # (N, 2)
+    coordinates = np.arange(-max_distance, max_distance + 1)
+    x, y = np.meshgrid(coordinates, coordinates, indexing="ij")
+    cells = np.column_stack([x.ravel(), y.ravel()])  # (N, 2)
     # The lengths of the two sides that lead to each cell: directions @ lengths = cells.
     lengths = np.linalg.solve(directions, cells.T)  # (2, N)
     is_possible = (lengths >= min_length - 1e-9).all(axis=0)  # (N,)

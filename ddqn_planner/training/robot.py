@@ -56,7 +56,7 @@ ROBOT: Final = HyperParameters(
     gamma=0.2,
     obstacle_reward=-1000.0,
     p_r=1.0,
-    steps=40_000_000,
+    steps=200_000_000,
     replay_capacity=200_000,
     learning_starts=250,
     target_interval=2000,
@@ -64,6 +64,10 @@ ROBOT: Final = HyperParameters(
 )
 PER_UNIT: Final = ("batch_size", "learning_starts", "environments")
 LARGEST_COUNT: Final = 4096  # of each of the three, for all units
+# On a map of more cells, a place of the view is met less often: so the three are larger
+# by the same factor. Else weights would lose more between two collisions than these
+# teach.
+SMALL_MAP: Final = 10_000  # cells
 # Of a network that knows nothing.
 FIRST_WEIGHT: Final = 0.3
 FIRST_THRESHOLD: Final = 1.0
@@ -74,6 +78,19 @@ UPDATES_PER_PROOF: Final = 100
 MOST_STEPS: Final = 10**12
 MARGIN: Final = 0.02  # of the proof, with which the training ends
 FREE_BORDER: Final = 5  # cells by which a map is larger than what the robot sees
+
+
+def _parameters_for(units: int, cells: int) -> HyperParameters:
+    """Return the hyper-parameters for so many units and cells of a map."""
+    factor = max(1.0, cells / SMALL_MAP)
+    counts = {
+        name: min(LARGEST_COUNT, round(factor * units * getattr(ROBOT, name)))
+        for name in PER_UNIT
+    }
+    # A batch's gradient is a mean: each transition teaches as much as on a small map.
+    small_batch = min(LARGEST_COUNT, units * ROBOT.batch_size)
+    learning_rate = ROBOT.learning_rate * counts["batch_size"] / small_batch
+    return replace(ROBOT, learning_rate=learning_rate, **counts)
 
 
 class RobotTrainer:
@@ -105,17 +122,14 @@ class RobotTrainer:
         )
         self.seed = as_seed(seed)
         units = self.network.sizes["units"]
-        counts = {
-            name: min(LARGEST_COUNT, units * getattr(ROBOT, name)) for name in PER_UNIT
-        }
-        self.parameters = replace(ROBOT, **counts)
+        side = self.network.swept_by_unit.shape[1]  # of a unit's view, cells
+        self.width = side + FREE_BORDER  # of a square map, cells
+        self.headings = motions.headings
+        self.parameters = _parameters_for(units, self.width**2)
         seeds = np.random.SeedSequence(self.seed).spawn(4)
         map_generator, *generators = [np.random.default_rng(item) for item in seeds]
         # They draw first poses, actions, and batches.
         self._initial, self._exploration, self._sampling = generators
-        side = self.network.swept_by_unit.shape[1]  # of a unit's view, cells
-        self.width = side + FREE_BORDER  # of a square map, cells
-        self.headings = motions.headings
         self._draw_maps(map_generator)
         self._tabulate_moves(motions)
         self._list_starts()
@@ -140,7 +154,7 @@ class RobotTrainer:
         obstacle per map, a collision tells which place the body swept.
         """
         cells = self.width**2  # of a map
-        maps = max(4, min(16, 60_000 // cells))  # fewer, if they are large
+        maps = max(1, min(16, 60_000 // cells))  # fewer, if they are large
         # The first of three cells is not used. Without it, a seed would draw others.
         drawn_M3 = [random.choice(cells, 3, replace=False) for _ in range(maps)]
         _, goal_cell_M, obstacle_M = np.transpose(drawn_M3)

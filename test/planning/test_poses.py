@@ -182,6 +182,27 @@ def test_plans_cost_the_least_within_their_bound_also_after_repairs(
             grid = grid.with_patch(patch_of, x, y)
 
 
+def test_paths_of_many_headings_cost_the_least() -> None:
+    random = np.random.default_rng(3)
+    grid = GridMap(random.random((18, 20)) < 0.02, CELL)
+    motions = make_motions("ackermann", 0.2, CELL, headings=32)
+    corners = read_footprint(BODIES["ackermann"])
+    swept = swept_cells(corners, motions)
+    body = PosePlanner(
+        SimpleNamespace(motions=motions, swept=lambda: swept, footprint=corners)
+    )
+    goal = 12, 9, 21
+    best = least_costs(grid, motions, swept, goal)  # (H, W, headings)
+    starts = random.choice(np.argwhere(np.isfinite(best)), 8)
+    for y, x, heading in starts.tolist():
+        start, end = (
+            (*grid.cell_to_world(cell), float(motions.angles[number]))
+            for *cell, number in ((x, y, heading), goal)
+        )
+        found = plan(body, grid, start, end, bound=1.0)
+        assert found.cost == pytest.approx(best[y, x, heading], rel=1e-4)
+
+
 @pytest.mark.parametrize("seed", [0, 5])
 def test_what_the_map_tells_changes_no_least_path(seed: int) -> None:
     random = np.random.default_rng(seed)

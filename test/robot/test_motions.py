@@ -2,6 +2,8 @@
 
 import json
 import math
+import re
+from dataclasses import replace
 from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
@@ -9,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
-from hypothesis import assume, example, given
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from ddqn_planner.robot.footprint import inside, read_footprint, swept_cells
@@ -92,6 +94,7 @@ FORMS = {
 LONG = "[[0.7, 0.2], [-0.2, 0.2], [-0.2, -0.2], [0.7, -0.2]]"
 
 
+@settings(max_examples=25)
 @given(
     motion=st.sampled_from(Motion),
     radius=st.floats(0.05, 1.5),
@@ -244,7 +247,7 @@ def test_only_a_car_cannot_turn_on_the_spot_and_all_can_reverse() -> None:
     [
         (("flying", 0.5, 0.05), "'flying' is unknown; give one of differential"),
         (("ackermann", 0.0, 0.05), "a car cannot turn on the spot: give at least"),
-        (("ackermann", 50, 0.05), "is 50 m; give at most 100 cells"),
+        (("ackermann", 50, 0.05), "is 50 m; give at most 360 cells"),
         (("differential", -1, 0.05), "turning radius is -1"),
         (("differential", 0.5, 0), "resolution is 0"),
     ],
@@ -343,9 +346,25 @@ def test_wrong_footprints_are_named(text: Any, problem: str) -> None:
         read_footprint(text)
 
 
-def test_a_body_that_is_too_large_for_its_cells_is_refused() -> None:
-    with pytest.raises(ValueError, match="give a coarser resolution"):
-        swept_cells(read_footprint("8.0"), make_motions("differential", 0.5, 0.05))
+@pytest.mark.parametrize(
+    ("footprint", "radius", "resolution"),
+    [("8.6", 0.5, 0.05), ("1.5", 17.9, 0.05)],
+)
+def test_a_body_that_is_too_large_for_its_cells_fits_larger_cells(
+    footprint: str, radius: float, resolution: float
+) -> None:
+    def reach(cell_size: float) -> int:
+        """Cells that a disc may sweep to each side, of its longest primitive alone."""
+        motions = make_motions("ackermann", radius, cell_size)
+        farthest = max(motions.poses, key=lambda poses: np.abs(poses[-1, :2]).max())
+        longest = replace(motions, poses=(farthest[[0, -1]],))
+        return swept_cells(read_footprint(footprint), longest).shape[-1] // 2
+
+    with pytest.raises(ValueError, match=r"sweeps .* cells to a side") as e:
+        reach(resolution)
+    remedy = re.search(r"give a resolution of ([\d.]+) m", str(e.value))
+    assert remedy
+    assert 130 < reach(float(remedy[1])) <= 180
 
 
 def lattice_content() -> dict[str, Any]:
