@@ -16,7 +16,12 @@ if TYPE_CHECKING:
     )
     from ddqn_planner.training.hyper_parameters import HyperParameters
     from ddqn_planner.training.one_map import train
-    from ddqn_planner.training.robot import RobotTrainer, train_robot
+    from ddqn_planner.training.robot import (
+        MotionOptions,
+        RobotTrainer,
+        read_motions,
+        train_robot,
+    )
     from ddqn_planner.training.run import TrainingRun
     from ddqn_planner.training.scenario import Scenario, map_scenario, paper_scenario
     from ddqn_planner.training.trainer import Trainer
@@ -39,6 +44,7 @@ __all__ = [
     "GridEnvironment",
     "GridVectorEnvironment",
     "HyperParameters",
+    "MotionOptions",
     "Progress",
     "RobotTrainer",
     "Scenario",
@@ -52,6 +58,7 @@ __all__ = [
     "map_scenario",
     "paper_scenario",
     "random_scenarios",
+    "read_motions",
     "train",
     "train_robot",
 ]
@@ -68,6 +75,7 @@ _MODULES = {
     "GridEnvironment": "gymnasium_environments",
     "GridVectorEnvironment": "environment",
     "HyperParameters": "hyper_parameters",
+    "MotionOptions": "robot",
     "Progress": "episodes",
     "RobotTrainer": "robot",
     "Scenario": "scenario",
@@ -81,6 +89,7 @@ _MODULES = {
     "map_scenario": "scenario",
     "paper_scenario": "scenario",
     "random_scenarios": "any_map",
+    "read_motions": "robot",
     "train": "one_map",
     "train_robot": "robot",
 }

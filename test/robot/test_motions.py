@@ -358,7 +358,8 @@ def test_a_body_that_is_too_large_for_its_cells_fits_larger_cells(
         motions = make_motions("ackermann", radius, cell_size)
         farthest = max(motions.poses, key=lambda poses: np.abs(poses[-1, :2]).max())
         longest = replace(motions, poses=(farthest[[0, -1]],))
-        return swept_cells(read_footprint(footprint), longest).shape[-1] // 2
+        swept = swept_cells(read_footprint(footprint), longest)
+        return int(swept.shape[-1]) // 2
 
     with pytest.raises(ValueError, match=r"sweeps .* cells to a side") as e:
         reach(resolution)
