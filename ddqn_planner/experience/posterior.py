@@ -29,9 +29,9 @@ CORRELATION = 1.0  # metres: how far the slowness of a place tells of that of ot
 # Slowness is rounded to steps of this share: fields need no repair for less.
 STEP = 0.02
 OPEN_STEP = 0.1  # of the log slowness of the fastest moves
-# The length of the residuals of the equations up to which they count as solved: then
-# no place's log slowness is off by more than a step.
-RESIDUAL = 0.002
+# The error of the log slowness up to which the equations count as solved: the root mean
+# square over all places, if the error is the same everywhere.
+ACCURACY = 0.01
 VARIANCE = 1.0  # of the log slowness of places around the expected one
 # Neighbours are alike: so many places of a path tell as much of the map's features as
 # one place alone.
@@ -118,6 +118,7 @@ class Posterior:
         kappa = (spacing / CORRELATION) ** 2
         self._ties = TIE / (1 + kappa) * links
         self._variance_of_lattice = math.log1p(32 / kappa) / (4 * math.pi)
+        self._largest_residual = ACCURACY * kappa * math.sqrt(self._count)
         self._diagonal = kappa + links.sum(axis=1)  # (P,)
         # (P, P): the precision of the field, whose diagonal grows with the visits.
         self._precision = diags_array(self._diagonal, format="csr") - links
@@ -248,7 +249,9 @@ class Posterior:
         # Twice, as `cg` ends when the residuals are 1e5 times smaller than at first.
         for _ in range(2):
             residual = strength * log - self._precision @ self._beyond
-            change, _ = cg(self._precision, residual, atol=RESIDUAL, M=preconditioner)
+            change, _ = cg(
+                self._precision, residual, atol=self._largest_residual, M=preconditioner
+            )
             self._beyond = self._beyond + change
 
     def _paint(self, log: Float64) -> Float32:
