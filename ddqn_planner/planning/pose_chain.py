@@ -304,11 +304,7 @@ def _nodes_of(tracks: list[Track], planned_costs: Float64) -> Nodes:
     group, path = np.nonzero(has_node.T)
     node_number = np.full((len(tracks), len(indices) + 1), NO_NODE)
     node_number[path, group] = np.arange(len(path))
-    # Of the stretch from each group to the next one; the last one has none.
-    turns = np.abs(np.diff(planned.poses[:, 2], prepend=planned.poses[0, 2]))
-    turn = np.diff(np.cumsum(turns)[indices], append=np.nan)  # (G,)
-    cost = np.diff(np.where(has_node, costs, np.nan), append=np.nan)  # (T, G)
-    weight = np.nan_to_num(cost + TURN_WEIGHT * turn) + CURVE_WEIGHT  # (T, G)
+    weights = _weights_of_stretches(planned.poses[:, 2], indices, costs)  # (T, G)
     is_after = np.append(is_behind, is_behind[-1])[indices]  # (G,)
     is_before = is_behind[np.maximum(indices - 1, 0)]
     poses = np.array([track.poses[indices] for track in tracks])  # (T, G, 3)
@@ -318,7 +314,7 @@ def _nodes_of(tracks: list[Track], planned_costs: Float64) -> Nodes:
         path=path,
         pose_index=indices[group],
         next_node=node_number[path, group + 1],
-        next_weight=weight[path, group],
+        next_weight=weights[path, group],
         next_direction=np.where(is_after, REVERSE, FORWARD)[group],
         first=np.append(0, np.cumsum(has_node.sum(axis=0))),
         cost_before=planned_costs[indices],
@@ -327,6 +323,29 @@ def _nodes_of(tracks: list[Track], planned_costs: Float64) -> Nodes:
         chosen_node=np.full(shape, NO_NODE),
         chosen_word=np.full(shape, KEPT),
     )
+
+
+def _weights_of_stretches(yaw: Float64, indices: Int64, costs: Float64) -> Float64:
+    """Return the weight of the stretch from each group of nodes to the next: (T, G).
+
+    It is 0 where there is no such stretch.
+
+    Parameters
+    ----------
+    yaw : (N,)
+        Of each pose of the planned path.
+    indices : (G,)
+        Of the pose of each group.
+    costs : (T, G)
+        Of each track up to there, or infinite.
+    """
+    turns = np.abs(np.diff(yaw, prepend=yaw[0]))  # (N,): before each pose
+    turn = np.diff(np.cumsum(turns)[indices])  # (G - 1,)
+    known_costs = np.where(np.isfinite(costs), costs, np.nan)
+    cost = np.diff(known_costs, axis=1)  # (T, G - 1)
+    weights = np.zeros(costs.shape)
+    weights[:, :-1] = np.nan_to_num(cost + TURN_WEIGHT * turn + CURVE_WEIGHT)
+    return weights
 
 
 def _node_poses(poses: Float64, is_behind: NDArray[np.bool_]) -> Int64:

@@ -65,15 +65,17 @@ def _without_start(
     x, y, yaw = pose.tolist()
     cos = math.cos(yaw)
     sin = math.sin(yaw)
-    turned = points @ np.array([[cos, sin], [-sin, cos]])
-    corner = np.array([x + 0.5, y + 0.5])  # from the corner of cell (0, 0)
-    # (5 M, 2): also of points a little beside, as the learned body is a little larger.
-    around = (corner + turned + AROUND[:, None]).reshape(-1, 2)
-    cells = np.floor(around).astype(np.int64)
+    turned_points = points @ np.array([[cos, sin], [-sin, cos]])
+    # (M, 2): from the corner of cell (0, 0), so that rounding down gives the cell.
+    placed_points = np.add(turned_points, (x + 0.5, y + 0.5))
+    # (5 M, 2): also a little beside, as the learned body is a little larger.
+    with_margin = (placed_points + AROUND[:, None]).reshape(-1, 2)
+    cells = np.floor(with_margin).astype(np.int64)
     height, width = occupied.shape
     is_on_map = ((cells >= 0) & (cells < (width, height))).all(axis=1)
     distance = np.hypot(cells[:, 0] - x, cells[:, 1] - y)
-    column, row = cells[is_on_map & (distance <= radius * ROUNDING)].T
+    is_ignored = is_on_map & (distance <= radius * ROUNDING)
+    column, row = cells[is_ignored].T
     without_start: Occupancy = occupied.copy()
     without_start[row, column] = False
     return without_start

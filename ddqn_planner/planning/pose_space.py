@@ -868,21 +868,34 @@ def _turn_into_height(search: Any, last_key: Any, multipliers: Any, box: Any) ->
             corner[y, x] = min(corner[y, x], least_steps) / STRAIGHT * side
     for y in range(multipliers.shape[0]):
         for x in range(multipliers.shape[1]):
-            first = corner[y, x]
-            second = corner[y, x + 1]
-            third = corner[y + 1, x]
-            fourth = corner[y + 1, x + 1]
-            lowest = min(first, second, third, fourth)
-            lowest_side = min(
-                first + second, third + fourth, first + third, second + fourth
-            )
-            # The greatest height to which no straight line climbs by more than the
-            # tile's cells cost, from a corner or from the middle of a side.
-            straight = side * multipliers[y, x]
-            from_corner = lowest + straight * DIAGONAL / STRAIGHT / 2
-            middle = min(from_corner, lowest_side / 2 + straight / 2)
-            if max(first, second, third, fourth) == np.inf:
-                middle = np.float32(np.inf)  # no state lies in this tile
-            aim.middle_height[y, x] = middle
+            cost_of_side = side * multipliers[y, x]
+            aim.middle_height[y, x] = _height_of_middle(x, y, corner, cost_of_side)
     # All of the start's tile has the height 0, as its corners.
     aim.middle_height[aim.start_y >> aim.shift, aim.start_x >> aim.shift] = 0
+
+
+@inlined
+def _height_of_middle(x: int, y: int, corner: Any, cost_of_side: Any) -> Any:
+    """Return the height of the middle of tile (y, x), from those of its corners.
+
+    It is the greatest to which no straight line climbs by more than the tile's cells
+    cost, from a corner or from the middle of a side. It is infinite for a tile in which
+    no state lies. `corner` (R + 1, C + 1) has the heights of all corners, and
+    `cost_of_side` is that of a line as long as a side of the tile.
+    """
+    low_left = corner[y, x]
+    low_right = corner[y, x + 1]
+    high_left = corner[y + 1, x]
+    high_right = corner[y + 1, x + 1]
+    if max(low_left, low_right, high_left, high_right) == np.inf:
+        return np.float32(np.inf)
+    lowest_corner = min(low_left, low_right, high_left, high_right)
+    # Twice the heights of the middles of the sides.
+    low = low_left + low_right
+    high = high_left + high_right
+    left = low_left + high_left
+    right = low_right + high_right
+    half_diagonal = cost_of_side * DIAGONAL / STRAIGHT / 2
+    from_corner = lowest_corner + half_diagonal
+    from_side = min(low, high, left, right) / 2 + cost_of_side / 2
+    return np.float32(min(from_corner, from_side))

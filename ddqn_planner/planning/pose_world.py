@@ -386,14 +386,17 @@ def covered_cells(state: State, grid: GridMap, body: Body) -> NDArray[np.int64]:
     x, y, heading = state
     mask = body.standing_mask + heading
     rows = slice(body.first_row[mask], body.first_row[mask + 1])
+    # (R, 64): cells of each row of the mask.
     octets = body.row_bits[rows].view(np.uint8).reshape(-1, 8)
-    bits = np.unpackbits(octets, axis=1, bitorder="little")  # (R, 64)
-    row, bit = np.nonzero(bits)
-    begin = body.row_begin[rows][row]  # (K, 2): y and x of the first cell of each row
-    cells = np.column_stack([x + begin[:, 1] + bit, y + begin[:, 0]])
+    is_covered = np.unpackbits(octets, axis=1, bitorder="little")
+    row, bit = np.nonzero(is_covered)  # (K,) each
+    first_y, first_x = body.row_begin[rows][row].T  # of the first cell of the row
+    cells = np.column_stack([x + first_x + bit, y + first_y])
     is_on_map = ((cells >= 0) & (cells < (grid.width, grid.height))).all(axis=1)
-    cells = cells[is_on_map]
-    return cells[grid.uninflated[cells[:, 1], cells[:, 0]]]
+    cells_on_map = cells[is_on_map]
+    is_occupied = grid.uninflated[cells_on_map[:, 1], cells_on_map[:, 0]]
+    occupied_cells: NDArray[np.int64] = cells_on_map[is_occupied]
+    return occupied_cells
 
 
 def world_with_escape(world: World, cells: NDArray[np.int64]) -> World:
