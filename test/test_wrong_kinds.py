@@ -220,7 +220,7 @@ def lattice() -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"heading_angles": [0.1] * 15}, "it has 15 headings; give 16"),
+        ({"heading_angles": [0.1] * 15}, "it has 15 headings; give one of 16, "),
         (
             {"heading_angles": [math.nan] * 16},
             "heading_angles holds nan; give finite radians",
