@@ -164,7 +164,8 @@ class Declared(NamedTuple):
         if kind is bool:
             return "true or false"
         if kind is list:
-            return f"a list of {self.allowed}, such as [r1, r2]"
+            example = "[r1, r2]" if self.allowed == NAMESPACES else "[car, my/file]"
+            return f"a list of {self.allowed}, such as {example}"
         return TYPES[kind] if kind is str else f"{TYPES[kind]}, {self.limits}"
 
     def _shown(self, value: object) -> str:

@@ -15,6 +15,7 @@ from ddqn_planner.robot.cover import TOLERANCE
 from ddqn_planner.robot.footprint import Corners, read_footprint
 
 TOPIC = "published_footprint"
+DIGITS = 4  # of a corner's metres, of which messages have about seven in all
 
 
 class FootprintSource:
@@ -63,7 +64,7 @@ class FootprintSource:
             corners = self._in_robot_frame(message)
             if corners is None or self._is_like_last(corners):
                 return
-            footprint = read_footprint(corners)
+            footprint = read_footprint(corners.round(DIGITS))
             self._last_corners = corners
             self._on_footprint(footprint)
 

@@ -111,9 +111,10 @@ class TrainedBodies:
             footprint = self._models.footprint
             if nearest is None or footprint is None:
                 return
-            is_own = has_same_motions(model, nearest)
-            is_own &= excess(footprint, model.body) <= TOLERANCE
-            if is_own and self._models.use_trained(model):
+            if not has_same_motions(model, nearest):
+                return  # it is another robot's
+            is_covered = excess(footprint, model.body) <= TOLERANCE
+            if is_covered and self._models.use_trained(model):
                 self._on_change()
 
 

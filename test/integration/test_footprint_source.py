@@ -1,7 +1,6 @@
 """The footprint that a costmap publishes, and the model that it chooses."""
 
 import weakref
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,14 +8,14 @@ import numpy as np
 from geometry_msgs.msg import Point32, Polygon, PolygonStamped, TransformStamped
 from hypothesis import given
 from hypothesis import strategies as st
-from networks import BODY, robot_model
+from networks import BODY, robot_planner
 from std_msgs.msg import Header
 
-from ddqn_planner import GridMap, Planner
+from ddqn_planner import GridMap
 from ddqn_planner.nodes.conversions import quaternion
 from ddqn_planner.nodes.diagnostics import PlannerDiagnostics
 from ddqn_planner.nodes.footprint_source import TOPIC, FootprintSource
-from ddqn_planner.nodes.model_source import ModelSource, read_bodies, read_model
+from ddqn_planner.nodes.model_source import LoadedModel, ModelSource
 from ddqn_planner.nodes.worker import Worker
 from ddqn_planner.robot.cover import TOLERANCE
 from ddqn_planner.robot.footprint import Corners, placed, read_footprint
@@ -113,25 +112,27 @@ def test_a_footprint_is_told_once_wherever_the_robot_is(
     assert len(told) == 2
 
 
-def test_a_planner_that_is_replaced_is_freed_with_its_fields(tmp_path: Path) -> None:
+def loaded(name: str, body: tuple[float, float, float]) -> LoadedModel:
+    planner = robot_planner("differential", 0.1, body)
+    return LoadedModel(planner.network, planner.metadata, name)
+
+
+def test_a_planner_that_is_replaced_is_freed_with_its_fields() -> None:
     node: Any = Node()
-    small, large = tmp_path / "small.safetensors", tmp_path / "large.safetensors"
-    robot_model(small, "differential", 0.1)
-    robot_model(large, "differential", 0.1, (0.4, 0.4, 0.3))
+    small, large = loaded("small", BODY), loaded("large", (0.4, 0.4, 0.3))
     source = ModelSource(node, PlannerDiagnostics(node), Worker(node))
-    source.use(read_model(str(small)))
+    source.use(small)
     assert not source.needs_footprint
-    source.use_bodies(read_bodies([str(large), ""]))
+    source.use_bodies([large])
     front, back, side = BODY
     in_small = read_footprint([(front, side), (-back, side), (-back, -side)])
     grid = GridMap(np.zeros((30, 30)), 0.1)
     # Functions that are compiled for the first time hold what they were called with.
-    read_planner: Any = Planner.load(small)
-    read_planner.plan_poses(grid, (1, 1, 0), (2, 2, 1))
+    robot_planner("differential", 0.1).plan_poses(grid, (1, 1, 0), (2, 2, 1))
     freed: list[weakref.ref[Any]] = []
-    for footprint, file in 2 * [(in_small, small), (-in_small, large)]:
+    for footprint, name in 2 * [(in_small, "small"), (-in_small, "large")]:
         source.use_footprint(footprint)
-        assert source.file == str(file)
+        assert source.file == name
         assert [reference() for reference in freed] == [None] * len(freed)
         planner: Any = source.planner
         assert len(planner.plan_poses(grid, (1, 1, 0), (2, 2, 1)).poses)
@@ -143,4 +144,4 @@ def test_a_planner_that_is_replaced_is_freed_with_its_fields(tmp_path: Path) -> 
     assert source.planner is None
     assert freed[-1]() is None
     source.use_bodies([])
-    assert source.file == str(small)
+    assert source.file == "small"

@@ -45,6 +45,7 @@ MEANT = [
     ("robots", ["/r1", "r2/"], ["r1", "r2"]),
     ("robots", ["r1", "/r1", "/fleet/r1/"], ["r1", "fleet/r1"]),
     ("robots", "r1", ["r1"]),
+    ("models", [" car", "", "/a/b/", "car "], ["car", "/a/b/"]),
 ]
 
 
@@ -77,6 +78,7 @@ WRONG = [
     ("robot_frame", " ", "is ' '; name the robot's frame"),
     ("robots", [1, 2], r"is \[1, 2\], a list; give a list of namespaces"),
     ("robots", 3, "is 3, a whole number; give a list of namespaces"),
+    ("models", 3, "is 3, a whole number; give a list of models that know a body"),
     *(
         ("robots", [bad], f"holds '{bad}', which is no name")
         for bad in ("r 1", "1r", "a//b", "~", "ü")
