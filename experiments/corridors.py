@@ -5,7 +5,7 @@ Starts and goals lie up to half a metre beside its axis and up to half a radian 
 direction. A cell is occupied if its centre lies in a wall: so a body that drives
 exactly along the axis needs up to 7 cm more than its width, too. The last columns tell
 what requests of 50 to 60 m need on a map of 2000 x 2000 cells, as bodies.py measures
-them.
+them. Bends and cusps cost nothing: they do not change where a car passes.
 """
 
 import argparse
@@ -29,6 +29,7 @@ from bodies import (
 from tables import table
 
 from ddqn_planner import GridMap, Planner
+from ddqn_planner.robot.driving_costs import DrivingCosts
 from ddqn_planner.robot.motions import OCTANTS, Motion
 from ddqn_planner.warm_up import warm_up
 
@@ -38,6 +39,7 @@ WIDTH: Final = 0.6  # metres, of the car
 WIDEST: Final = 60  # centimetres more than the car is wide: all corridors are tried
 END: Final = 4.0  # metres from the middle of a corridor to starts and goals
 ANGLES: Final = np.radians(np.linspace(0, 45, 14))
+LENGTHS_ALONE: Final = DrivingCosts(bend=1.0, cusp=0.0)
 BORDER: Final = 0.55  # metres of free space around long requests
 
 
@@ -100,7 +102,7 @@ def rows(options: argparse.Namespace) -> Iterator[list[Any]]:
     """Yield a row for each number of headings."""
     grid = blocks(0.1, options.seed)
     for headings in options.headings:
-        planner = robot(FOOTPRINTS["car"], Motion.ACKERMANN, headings)
+        planner = robot(FOOTPRINTS["car"], Motion.ACKERMANN, headings, LENGTHS_ALONE)
         for _ in warm_up(planner):  # what is compiled first takes long
             pass
         random = np.random.default_rng(options.seed)

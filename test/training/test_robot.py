@@ -117,6 +117,7 @@ WRONG = {
     "--motion differential --lattice x.json": "one of the two",
     "": "neither motion nor lattice is given; give one of the two: motion differential",
     "--lattice none.json": "none.json: it cannot be read (No such file or directory)",
+    "--motion differential --headings 24": "headings is 24; give one of 16, 32, 64",
     "--motion differential --padding -0.1": "padding is -0.1",
     "--motion differential --steps 0": "--steps is 0; give a whole number, 1 to",
     "--motion differential --steps -5": "--steps is -5; give a whole number, 1 to",
