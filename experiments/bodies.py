@@ -121,6 +121,22 @@ class Oracle:
         Poses are tried every 2 cm and every 2 degrees between those of `poses` (N, 3):
         x, y in metres and the yaw in radians.
         """
+        outlines = self._outlines(poses)
+        touching, _ = self.obstacles.query(outlines, predicate="intersects")
+        return len(np.unique(touching))
+
+    def clearance(self, poses: NDArray[np.float64]) -> float:
+        """Return the least distance between the body and an obstacle, in metres.
+
+        Poses are tried as in `collisions`.
+        """
+        _, distances = self.obstacles.query_nearest(
+            self._outlines(poses), return_distance=True, all_matches=False
+        )
+        return float(distances.min())
+
+    def _outlines(self, poses: NDArray[np.float64]) -> NDArray[np.object_]:
+        """Return the body's polygons (M,) at the poses of a path and between them."""
         x, y, _ = poses.T
         yaw = np.unwrap(poses[:, 2])
         metres = np.hypot(np.diff(x), np.diff(y))
@@ -141,9 +157,10 @@ class Oracle:
         ahead, left = self.corners.T  # metres from the origin of the body
         outline_x = cos * ahead - sin * left + x[:, None]  # (M, corners)
         outline_y = sin * ahead + cos * left + y[:, None]
-        outlines = shapely.polygons(np.stack([outline_x, outline_y], axis=-1))
-        touching, _ = self.obstacles.query(outlines, predicate="intersects")
-        return len(np.unique(touching))
+        outlines: NDArray[np.object_] = shapely.polygons(
+            np.stack([outline_x, outline_y], axis=-1)
+        )
+        return outlines
 
 
 def occupied_cells(grid: GridMap) -> NDArray[np.object_]:
