@@ -150,12 +150,13 @@ class ModelSource:
     def _load_and_compile(self) -> FirstModels:
         """Load the models that the parameters name, in the worker's thread."""
         bodies = []
-        problem_of_bodies = ""
+        problems = []
         for name in self._node.value("models"):
             try:
                 bodies += read_bodies([name])
             except Exception as error:
-                problem_of_bodies = str(error) or repr(error)
+                problems.append(str(error) or repr(error))
+        problem_of_bodies = " / ".join(problems)
         try:
             model = read_model(self._node.value("model"))
             compiling = self._compile(model)

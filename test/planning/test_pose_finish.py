@@ -12,7 +12,7 @@ from planning.test_poses import BODIES, CELL, planner, robot
 
 from ddqn_planner import GridMap, Planner
 from ddqn_planner.planning.path_finder import last_step
-from ddqn_planner.planning.plan import Pose, PosePlan, PoseRequest
+from ddqn_planner.planning.plan import Pose, PosePlan, PoseRequest, are_joined
 from ddqn_planner.planning.pose_curves import write_pieces
 from ddqn_planner.planning.pose_finish import END_COST
 from ddqn_planner.planning.pose_paths import cost_of_poses
@@ -115,6 +115,9 @@ def test_ends_are_exact_where_nothing_is_near(motion: str) -> None:
         exact += ends_off(found, start, goal) == (0.0, 0.0)
         again = plan(body, grid, start, goal, finished=True)
         assert np.array_equal(found.poses, again.poses)
+        # The next leg of a way begins where this one ends.
+        request = PoseRequest(grid, start, (goal,)).after(found, start)
+        assert are_joined([found, last_step(body.steps(request))])
     assert exact >= 9
 
 
