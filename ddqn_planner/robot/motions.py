@@ -37,6 +37,10 @@ HEADINGS_OF_LATTICES: Final = range(16, 65, 8)
 MAX_BEND: Final = math.atan2(1, 2) + 1e-9
 
 STRIDE = 0.4  # metres of a long step straight ahead
+SHIFTED_HEADINGS: Final = 32  # more headings come with drives that shift a robot aside
+# Cells from the begin of such a drive to its end, beside the radius of its arcs.
+MAX_SHIFT: Final = 40
+SHARES_OF_TURN: Final = (0.76, 1.24)  # its arcs', of the turn to the next heading
 LONG_STEP: Final = 6.0  # cells: a short step that is longer needs no long one
 LONGEST_STEP: Final = 10.0  # cells, of any heading in `OCTANTS`
 BEHIND = 2.0  # cost of a metre that is not driven ahead; Nav2's reverse_penalty
@@ -179,6 +183,10 @@ def make_motions(
         for end in _ends_of_bends(heading, angles):
             bend = _driven_ahead(heading, end, _bend(heading, end, angles, radius))
             primitives += [bend, _driven_behind(bend)]
+        if headings > SHIFTED_HEADINGS:
+            for poses in _shifts(heading, angles, radius):
+                shift = _driven_ahead(heading, heading, poses)
+                primitives += [shift, _driven_behind(shift)]
         if motion is not Motion.ACKERMANN:
             for end in _neighbours(heading, headings):
                 primitives.append(_turn_on_the_spot(heading, end, angles, cell_size))
@@ -368,6 +376,44 @@ def _bend(start: int, end: int, angles: Float64, radius: float) -> Poses:
     first_line = _line(np.zeros(2), arc[0, :2], arc[0, 2])
     last_line = _line(arc[-1, :2], corner.end_cell, arc[-1, 2])
     return np.concatenate([first_line[:-1], arc, last_line[1:]])
+
+
+def _shifts(heading: int, angles: Float64, radius: float) -> list[Poses]:
+    """Return a drive to each side that ends in the heading in which it begins.
+
+    Two arcs lead about half as far aside as a straight drive in the next heading: so a
+    robot that follows a direction between two headings turns less from it.
+
+    Parameters
+    ----------
+    heading : int
+        The first and the last heading.
+    angles : (H,) float64
+        The yaw of each heading, radians.
+    radius : float
+        The least radius of the arcs, in cells.
+    """
+    yaw = float(angles[heading])
+    distance = MAX_SHIFT + math.ceil(radius)
+    coordinates = np.arange(-distance, distance + 1)
+    x, y = np.meshgrid(coordinates, coordinates, indexing="ij")
+    cells = np.column_stack([x.ravel(), y.ravel()])  # (N, 2)
+    ahead = cells @ [math.cos(yaw), math.sin(yaw)]  # (N,)
+    left = cells @ [-math.sin(yaw), math.cos(yaw)]
+    turn = 2 * np.arctan2(left, ahead)  # of the first arc, back by the second
+    is_wide = ahead >= 2 * max(radius, 1.0) * np.sin(np.abs(turn))
+    shifts = []
+    for neighbour in _neighbours(heading, len(angles)):
+        share = turn / float(turn_between(yaw, angles[neighbour]))
+        lowest, highest = SHARES_OF_TURN
+        is_shift = (ahead > 0) & (lowest <= share) & (share <= highest)
+        nearest = int(np.where(is_shift & is_wide, ahead, np.inf).argmin())
+        first_turn = float(turn[nearest])
+        arc_radius = float(ahead[nearest]) / (2 * math.sin(abs(first_turn)))
+        first = _arc(np.zeros(2), yaw, first_turn, arc_radius)
+        last = _arc(first[-1, :2], float(first[-1, 2]), -first_turn, arc_radius)
+        shifts.append(np.concatenate([first, last[1:]]))
+    return shifts
 
 
 def _arc(start: Float64, start_yaw: float, turn: float, radius: float) -> Poses:
