@@ -37,7 +37,6 @@ Stages = Sequence[tuple[int, int]]
 
 STAGES: Final = ((0, 20), (20, 50), (50, 100))
 LATE: Final = STAGES[-1]
-LONG_STAGES: Final = ((0, 200), (200, 600), (600, 1000))
 # New to the world, and after all that is slow has moved.
 MOVED_STAGES: Final = ((0, 10), (10, 50), (100, 110), (110, 150))
 NEW_STAGES: Final = ((0, 5), (0, 20))
@@ -96,15 +95,6 @@ def faulty(options: Options) -> Sections:
         results = _runs(kinds_of_set, (EXPERIENCE,), options, is_faulty=True)
         sections[f"{title}, with faults"] = _by_class(results)
         sections[f"{title}, expected times with faults"] = _forecasts(results)
-    return sections
-
-
-def long(options: Options) -> Sections:
-    """Measure a thousand missions."""
-    sections = {}
-    for title, kinds_of_set in options.sets.items():
-        results = _runs(kinds_of_set, (EXPERIENCE,), options, missions=1000)
-        sections[f"{title}, a thousand missions"] = _by_class(results, LONG_STAGES)
     return sections
 
 
@@ -192,7 +182,6 @@ FIGURES: Final[dict[str, Callable[[Options], Sections]]] = {
     "two_speeds": scenes.two_speeds,
     "zones": scenes.zones,
     "faulty": faulty,
-    "long": long,
     "moved": moved,
     "priors": priors,
     "speed": speed,
