@@ -219,24 +219,13 @@ class Experience:
             min_speed=self.nominal_speed / MAX_SLOWNESS,
             max_speed=self.nominal_speed * MAX_SPEED_FACTOR,
             max_pause=self.max_pause,
-            turn_seconds=self.turn_seconds,
         )
-        visits = self._visits_of(poses, limits)
+        visits = visits_of(poses, self.evidence.side, limits, self._fleet.turns)
         places = len(visits.seconds)
         if not places:
             return Learned(0, 0.0, _why_nothing(poses, count, limits))
         self._learn(visits)
         return Learned(places, visits.total_seconds)
-
-    def _visits_of(self, poses: Poses, limits: Limits) -> Visits:
-        """Return the visits of a drive, without the time in which the robot turned.
-
-        How long turning takes is learned from the drive itself, too.
-        """
-        visits = visits_of(poses, self.evidence.side, limits)
-        turn_seconds = seconds_per_radian(self._fleet.turns + visits.turns)
-        limits = limits._replace(turn_seconds=turn_seconds)
-        return visits_of(poses, self.evidence.side, limits)
 
     def record_failure(self, position: Sequence[float]) -> None:
         """Learn that the robot failed at a place, as if it had waited there.

@@ -11,7 +11,7 @@ from ddqn_planner.experience.places import Float64
 STEP = 0.15  # metres between two points at which a path's turning is computed
 REACH = 3  # points to each side of a point that tell its turning
 STRAIGHT = 0.3  # radians: a smaller angle between two directions is noise
-SEGMENT = 8  # steps of a drive that are compared with those before and behind them
+SEGMENT = 8  # moves of a drive that are compared with those before and behind them
 # The share of its time that a segment may take more than its neighbours, beside what
 # turning takes. Much more has another cause, and counts less.
 USUAL = 0.5
@@ -20,8 +20,8 @@ ASSUMED = 1.0
 LEAST_SECONDS = 0.15  # per radian: less is noise
 
 
-class Steps(NamedTuple):
-    """N steps of a drive, one after another."""
+class Moves(NamedTuple):
+    """N moves of a drive, one after another."""
 
     seconds: Float64  # (N,): with stands
     metres: Float64  # (N,)
@@ -54,14 +54,14 @@ def turning_of(path: Float64) -> float:
     `path` is (N, 2), in metres: x and y of its corners.
     """
     steps: Float64 = np.diff(path, axis=0)
-    metres_to_corner = np.cumsum(np.append(0, np.hypot(steps[:, 0], steps[:, 1])))
+    metres_to_corner = sums_up_to(np.hypot(steps[:, 0], steps[:, 1]))
     metres = np.arange(0, metres_to_corner[-1], STEP)
     x = np.interp(metres, metres_to_corner, path[:, 0])
     y = np.interp(metres, metres_to_corner, path[:, 1])
     return float(turning_at(np.column_stack([x, y])).sum())
 
 
-def sums_of_turns(steps: Steps, seconds_per_radian: float) -> Float64:
+def sums_of_turns(moves: Moves, seconds_per_radian: float) -> Float64:
     """Return what a drive shows of the seconds that turning takes: (2,) float64.
 
     They are sums over its segments: of the squared turning, in radians squared, and of
@@ -69,9 +69,9 @@ def sums_of_turns(steps: Steps, seconds_per_radian: float) -> Float64:
     beside it, as slow places are longer than turns. `seconds_per_radian` is what older
     drives showed.
     """
-    length = len(steps.seconds) // SEGMENT * SEGMENT
+    length = len(moves.seconds) // SEGMENT * SEGMENT
     # (3, S) for S segments.
-    sums = np.array(steps)[:, :length].reshape(3, -1, SEGMENT).sum(axis=2)
+    sums = np.array(moves)[:, :length].reshape(3, -1, SEGMENT).sum(axis=2)
     if sums.shape[1] < 3:
         return np.zeros(2)
     seconds, metres, turning = sums
@@ -96,14 +96,14 @@ def seconds_per_radian(sums: Float64) -> float:
     return seconds if seconds > LEAST_SECONDS else 0.0
 
 
-def seconds_of_turns(steps: Steps, seconds_per_radian: float, speed: float) -> Float64:
-    """Return how many seconds of each step the robot turned: (N,).
+def seconds_of_turns(moves: Moves, seconds_per_radian: float, speed: float) -> Float64:
+    """Return how many seconds of each move the robot turned: (N,).
 
-    They are a part of those by which the step took longer than at the robot's usual
+    They are a part of those by which the move took longer than at the robot's usual
     speed, in metres per second.
     """
-    extra = np.maximum(steps.seconds - steps.metres / speed, 0)  # (N,)
-    seconds = seconds_per_radian * _sum_near(steps.turning)
+    extra = np.maximum(moves.seconds - moves.metres / speed, 0)  # (N,)
+    seconds = seconds_per_radian * _sum_near(moves.turning)
     extra_near = np.maximum(_sum_near(extra), seconds)
     share = np.divide(
         seconds, extra_near, out=np.zeros(len(extra)), where=extra_near > 0
@@ -112,9 +112,14 @@ def seconds_of_turns(steps: Steps, seconds_per_radian: float, speed: float) -> F
 
 
 def _sum_near(values: Float64) -> Float64:
-    """Return the sums of the values (N,) at up to REACH steps before and behind."""
+    """Return the sums of the values (N,) at up to REACH moves before and behind."""
     number = np.arange(len(values))
-    sums = np.append(0, np.cumsum(values))
+    sums = sums_up_to(values)
     end = np.minimum(number + REACH + 1, len(values))
     near: Float64 = sums[end] - sums[np.maximum(number - REACH, 0)]
     return near
+
+
+def sums_up_to(values: Float64) -> Float64:
+    """Return the sum of the first 0, 1, ... N of N values: (N + 1,)."""
+    return np.append(0, np.cumsum(values))

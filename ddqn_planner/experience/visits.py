@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from ddqn_planner.experience.places import Float64
 from ddqn_planner.experience.turns import (
-    Steps,
+    Moves,
     seconds_of_turns,
+    seconds_per_radian,
     sums_of_turns,
+    sums_up_to,
     turning_at,
 )
 
@@ -89,10 +91,11 @@ class Limits(NamedTuple):
     min_speed: float  # metres per second; slower moves are left out
     max_speed: float  # metres per second; faster moves are left out
     max_pause: float  # seconds; a longer pause is no wait
-    turn_seconds: float = 0.0  # that the robot needs to turn by one radian
 
 
-def visits_of(poses: Poses, side: float, limits: Limits) -> Visits:
+def visits_of(
+    poses: Poses, side: float, limits: Limits, older_turns: Float64
+) -> Visits:
     """Return the places that a robot passed on a drive, and its waits on the way.
 
     Parameters
@@ -102,19 +105,27 @@ def visits_of(poses: Poses, side: float, limits: Limits) -> Visits:
     side : float
         The side of a place, which is a square; metres.
     limits : Limits
-        The usual, the least and the greatest speed in metres per second, the longest
-        wait in seconds, and the seconds per radian that turning takes.
+        The usual, the least and the greatest speed in metres per second, and the
+        longest wait in seconds.
+    older_turns : (2,) float64
+        What older drives showed of turning, see `sums_of_turns`.
     """
     length = max(side / 2, SPOT)  # of a step, metres
-    steps = np.zeros((0, 5))
+    parts = [_spots_of(part, limits) for part in _believed_parts(poses, limits)]
+    # In a part with one spot, the robot stood all the time.
+    paths = [(spots, _moves_over(spots)) for spots in parts if len(spots.time) > 1]
+    # How long turning takes is learned from the drive itself, too.
     turns = np.zeros(2)
-    for part in _believed_parts(poses, limits):
-        spots = _spots_of(part, limits)
-        if len(spots.time) > 1:  # the robot did not stand all the time
-            turning = _turning(spots)
-            turns += sums_of_turns(turning, limits.turn_seconds)
-            steps_of_part = _steps_along(spots, turning, length, limits)
-            steps = np.concatenate([steps, steps_of_part])
+    for _ in range(2):
+        turn_seconds = seconds_per_radian(older_turns + turns)
+        turns = np.zeros(2)
+        for _, moves in paths:
+            turns += sums_of_turns(moves, turn_seconds)
+    steps_of_paths = [
+        _steps_along(spots, moves, turn_seconds, length, limits)
+        for spots, moves in paths
+    ]
+    steps = np.concatenate([np.zeros((0, 5)), *steps_of_paths])
     # A correction of the pose that is too small for a jump may look like a fast move.
     seconds = steps[:, 2]
     is_possible = length <= limits.max_speed * seconds
@@ -148,20 +159,23 @@ def _spots_of(part: Poses, limits: Limits) -> Poses:
     return means.part(indices_apart(means.position, SPOT)[1:])
 
 
-def _turning(spots: Poses) -> Steps:
-    """Return the steps from each of S spots to the next one: (S - 1,)."""
+def _moves_over(spots: Poses) -> Moves:
+    """Return the moves from each of S spots to the next one: (S - 1,)."""
     turning = turning_at(spots.position)
-    return Steps(
+    return Moves(
         seconds=np.diff(spots.time),
         metres=_lengths(np.diff(spots.position, axis=0)),
         turning=(turning[1:] + turning[:-1]) / 2,
     )
 
 
-def _steps_along(spots: Poses, moves: Steps, length: float, limits: Limits) -> Float64:
+def _steps_along(
+    spots: Poses, moves: Moves, turn_seconds: float, length: float, limits: Limits
+) -> Float64:
     """Divide the path over S spots into N steps of one `length`, in metres.
 
-    A shorter rest at the end is left out. `moves` are those from spot to spot.
+    A shorter rest at the end is left out. `moves` are those from spot to spot, and
+    `turn_seconds` those of turning by one radian.
 
     Returns
     -------
@@ -169,7 +183,7 @@ def _steps_along(spots: Poses, moves: Steps, length: float, limits: Limits) -> F
         The x and y of the middle of each step in metres, and the seconds in which the
         robot drove it, waited there and turned there.
     """
-    turned = seconds_of_turns(moves, limits.turn_seconds, limits.speed)  # (S - 1,)
+    turned = seconds_of_turns(moves, turn_seconds, limits.speed)  # (S - 1,)
     elapsed = moves.seconds - turned
     has_stood = elapsed > STAND / limits.speed
     stood = np.where(has_stood, elapsed - moves.metres / limits.speed, 0)
@@ -179,10 +193,9 @@ def _steps_along(spots: Poses, moves: Steps, length: float, limits: Limits) -> F
     driven = np.where(is_pause, LEFT_OUT, elapsed - stood)
     # The next segment of the path has the wait.
     waited = np.append(0, np.where(is_pause, 0, stood))[:-1]
-    # (S,) and (3, S): from the beginning of the path to each spot.
-    metres_to_spot = np.append(0, np.cumsum(moves.metres))
-    seconds = np.cumsum([driven, waited, turned], axis=1)
-    seconds_to_spot = np.pad(seconds, ((0, 0), (1, 0)))
+    # (S,) each: from the beginning of the path to each spot.
+    metres_to_spot = sums_up_to(moves.metres)
+    seconds_to_spot = [sums_up_to(seconds) for seconds in (driven, waited, turned)]
     # (N + 1,): from the beginning of the path to each point between two steps. The
     # first point is the beginning of the path.
     metres_to_point = np.arange(0, metres_to_spot[-1], length)

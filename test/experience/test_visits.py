@@ -38,7 +38,7 @@ def forged_poses(draw: st.DrawFn) -> Poses:
 def test_no_drive_shows_more_than_its_time_and_the_greatest_speed_allow(
     poses: Poses,
 ) -> None:
-    visits = visits_of(poses, SIDE, LIMITS)
+    visits = visits_of(poses, SIDE, LIMITS, np.zeros(2))
     assert (visits.metres <= LIMITS.max_speed * visits.seconds + 1e-9).all()
     assert (visits.waited <= LIMITS.max_pause).all()
     elapsed = np.maximum(np.diff(poses.time), 0)
