@@ -95,7 +95,6 @@ class Posterior:
         `nominal_speed` is in metres per second.
         """
         from scipy.ndimage import distance_transform_edt
-        from scipy.sparse import diags_array
 
         self.grid = grid
         self.side = side
@@ -109,19 +108,18 @@ class Posterior:
         )
         is_near = cells_away <= 1.5 * block
         self._nearest_place = np.where(is_near, self.place[y, x], NO_PLACE)  # (H, W)
-        links = _links_of(self.place, block, self._count)
+        self._links = _links_of(self.place, block, self._count)
         # Neighbours are linked with the strength 1, and each place is drawn to its
         # expected value with the strength kappa. On such a lattice the values have
         # about the variance ln(32 / kappa) / 4 pi; for large kappa, where that would be
         # negative, 1 is added to the argument.
         spacing = block * grid.resolution  # metres from a place to the next
         kappa = (spacing / CORRELATION) ** 2
-        self._ties = TIE / (1 + kappa) * links
+        self._tie = TIE / (1 + kappa)
         self._variance_of_lattice = math.log1p(32 / kappa) / (4 * math.pi)
         self._largest_residual = ACCURACY * kappa * math.sqrt(self._count)
-        self._diagonal = kappa + links.sum(axis=1)  # (P,)
-        # (P, P): the precision of the field, whose diagonal grows with the visits.
-        self._precision = diags_array(self._diagonal, format="csr") - links
+        # (P,): of the precision of the field; it grows with the visits.
+        self._diagonal = kappa + self._links.sum(axis=1)
         self._beyond = np.zeros(self._count)  # of the log slowness, see `_solve`
         # (P, FEATURES): the means over the cells of each place.
         cells = self._sums(self.place, np.ones(self.place.shape))
@@ -203,7 +201,7 @@ class Posterior:
         known = visits / (1 / VARIANCE + visits)  # the share that was seen
         around = np.column_stack([known, passages, waited])
         for _ in range(LINKS_AROUND):
-            around = around + self._ties @ around
+            around = around + self._tie * (self._links @ around)
         known_around, passages_around, waited_around = around.T / SUM_AROUND
         self.unknown = np.sqrt(1 - np.clip(known_around, known, 1))
         wait = waited_around / (passages_around + ASSUMED_PASSAGES)  # seconds
@@ -237,22 +235,26 @@ class Posterior:
         log : (P,) float64
             That log slowness, less the expected one.
         """
-        from scipy.sparse import diags_array
-        from scipy.sparse.linalg import cg
-
         # All is scaled so that the field has the given variance.
         strength = VARIANCE / self._variance_of_lattice * visits  # (P,)
         diagonal = self._diagonal + strength
-        self._precision.setdiag(diagonal)
-        preconditioner = diags_array(1 / diagonal)
-        # From the last solution, so that places far from all changes stay as they are.
-        # Twice, as `cg` ends when the residuals are 1e5 times smaller than at first.
-        for _ in range(2):
-            residual = strength * log - self._precision @ self._beyond
-            change, _ = cg(
-                self._precision, residual, atol=self._largest_residual, M=preconditioner
-            )
-            self._beyond = self._beyond + change
+        # By conjugate gradients from the last solution, so that places far from all
+        # changes stay as they are. The equations' left sides are the product of x with
+        # `diagonal`, less its product with the links.
+        solution = self._beyond
+        residual = strength * log - (diagonal * solution - self._links @ solution)
+        direction = np.zeros(self._count)
+        last_product = 1.0
+        while math.sqrt(residual @ residual) > self._largest_residual:
+            scaled = residual / diagonal
+            product = residual @ scaled
+            direction = scaled + product / last_product * direction
+            image = diagonal * direction - self._links @ direction
+            length = product / (direction @ image)
+            solution = solution + length * direction
+            residual = residual - length * image
+            last_product = product
+        self._beyond = solution
 
     def _paint(self, log: Float64) -> Float32:
         """Return the slowness of cells: (H, W), of which the log is `log` (P,).
