@@ -81,8 +81,9 @@ def test_places_near_visits_are_surer_and_none_is_behind_a_wall() -> None:
     posterior = Posterior(GridMap(occupancy, SIDE), SIDE, nominal_speed=0.5)
     middle = np.array([[10.5, 2.5]]) * SIDE
     unsure = []
-    for weight in (0.0, 1.0, 10.0):
-        places = Places.at(middle, SIDE, weight=np.array([weight]))
+    for weight in ([0.0], [1.0], [10.0]):  # as many visits at the usual speed
+        visits = np.array(weight)
+        places = Places.at(middle, SIDE, weight=visits, sum_of_slowness=visits)
         posterior.update(places, 0.0, np.zeros(FEATURES))
         unsure.append(posterior.uncertainty)
     nothing, little, much = unsure
