@@ -529,7 +529,7 @@ class Experience:
             if state is None:
                 raise ValueError("it is an experience; use `from_bytes`")
         except Exception as error:  # of many kinds
-            raise ExperienceFileError(f"no changes of experience: {error}") from error
+            raise ExperienceFileError(f"no experience: {error}") from error
         if state != self.state:
             return False
         for drive in drives:

@@ -25,7 +25,8 @@ from ddqn_planner.experience.prior import FEATURES
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
 
 MAX_FILE_BYTES = 2**27  # a larger file is refused before it is read
-VERSION = 4
+VERSION = 5
+TURNLESS_VERSION = 4  # of 0.6.0, without turns and with a prior of other features
 LOG_VERSION = 3  # of one robot, with the logarithms of slowness alone
 FIRST_VERSION = 1  # until 0.4.0; 2 was never released
 MOST = 1e12  # no sum of what drives showed is greater: seconds, weights or squares
@@ -97,14 +98,15 @@ def content_from_bytes(data: bytes) -> Content:
     arrays = _unpacked(data)
     version = int(arrays["version"])
     options: list[float] = arrays["options"].astype(np.float64).tolist()
-    if version == VERSION:
+    if version in (VERSION, TURNLESS_VERSION):
         members = _members(arrays, side=options[1] / 2)
     elif version in (FIRST_VERSION, LOG_VERSION):
         # Copies of an old file are the evidence of the same robot.
         identity = hashlib.sha256(data).hexdigest()[:32]
         members = [_old_evidence(arrays, options, identity)]
     else:
-        raise ValueError(f"it has version {version}, not {VERSION}")
+        remedy = "let those who write and read it have one version of ddqn_planner"
+        raise ValueError(f"it has version {version}, not {VERSION}; {remedy}")
     for robot in members:
         _check(robot)
     state = int(arrays["state"]) if "state" in arrays else None
@@ -130,7 +132,7 @@ def _members(arrays: Arrays, side: float) -> list[RobotEvidence]:
     totals = [sums.shape[1], len(errors), len(surprises)]
     if (counts < 0).any() or ends[-1].tolist() != totals:
         raise ValueError("its counts cannot be true")
-    # The files of 0.6.0 have no turns.
+    # Files of TURNLESS_VERSION have none.
     arrays = {"turns": np.zeros((len(counts), 2)), **arrays}
     values = [arrays[name].tolist() for name in VALUES]
     members = []

@@ -56,8 +56,9 @@ class ExpectedTimes:
         # The layout of the message in which the experience came; it holds a digest.
         self._layout: MultiArrayLayout | None = None
         self._trainer: Client | None = None  # of the service that sends experience
-        # Whether the trainer's last message told of changes of another experience than
-        # the one in use: the planner came late, or has missed a message.
+        # Whether the trainer's last message told of changes that cannot be read, or of
+        # another experience than the one in use: the planner came late, or has missed a
+        # message.
         self._is_behind = False
         # The experience of the file that the parameter names, if it was loaded when
         # the parameter was set, and is not in use yet.
@@ -135,8 +136,9 @@ class ExpectedTimes:
                 return False
             if kind == CHANGES:
                 return self._apply_changes(message.layout, data)
+            # If this one cannot be read, neither can the answer to another request.
+            self._is_behind = False
             newer = Experience.from_bytes(data)
-        self._is_behind = False
         if newer is not None and self._experience is not None:
             newer.take_posterior_from(self._experience)
         self._experience = newer
@@ -149,6 +151,7 @@ class ExpectedTimes:
         `layout` and `data` are those of the trainer's message.
         """
         experience = self._experience
+        self._is_behind = True  # also if the changes cannot be read
         is_applied = experience is not None and experience.apply_changes(data)
         self._is_behind = not is_applied
         if is_applied:

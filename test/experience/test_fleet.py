@@ -225,7 +225,7 @@ def test_broken_changes_are_refused() -> None:
     changes = original.changes_since(state)
     assert changes is not None
     for broken in (b"", changes[:-20], original.to_bytes(), "x", None):
-        with pytest.raises(ExperienceFileError, match="no changes of experience"):
+        with pytest.raises(ExperienceFileError, match="no experience"):
             copy.apply_changes(broken)  # type: ignore[arg-type]
     with pytest.raises(ExperienceFileError, match="no experience"):
         Experience.from_bytes(changes)

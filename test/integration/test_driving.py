@@ -252,11 +252,13 @@ def test_the_robot_goes_round_what_was_slow_until_it_forgets(
     unknown.record_failure((5.0, 5.0))
     changes = unknown.changes_since(state)
     assert changes is not None
-    site.experience.clear()
-    site.client.publish("trainer/experience", bytes_message(CHANGES, changes), LATCHED)
-    assert Experience.from_bytes(
-        bytes_of("experience", site.experience.wait(is_whole))
-    ).evidence.driven == pytest.approx(330, rel=0.1)
+    for data in (changes, changes[:-20]):  # or as if another version had written it
+        site.experience.clear()
+        message = bytes_message(CHANGES, data)
+        site.client.publish("trainer/experience", message, LATCHED)
+        whole = bytes_of("experience", site.experience.wait(is_whole))
+        known = Experience.from_bytes(whole).evidence
+        assert known.driven == pytest.approx(330, rel=0.1)
     assert not is_below(site.client.get_plan(*ends))
 
     site.episodes.clear()

@@ -28,6 +28,7 @@ from rclpy.utilities import try_shutdown
 from std_msgs.msg import Header, UInt8MultiArray
 
 from ddqn_planner import Experience, GridMap, MoveRule, Planner
+from ddqn_planner.experience import experience_file
 from ddqn_planner.grid import inflate
 from ddqn_planner.grid.inflation import Inflation
 from ddqn_planner.nodes.base_node import BaseNode
@@ -698,7 +699,25 @@ def test_changes_are_planned_with_where_they_follow_on_what_is_known(
     np.testing.assert_allclose(source.slowness(), expected, rtol=0.021)
     broken = bytes_message(CHANGES, bytes(messages[1].data)[:-9])
     finished(source.times.on_message(broken))
-    assert "no changes of experience" in source.diagnostics.refused["experience"]
+    assert "no experience" in source.diagnostics.refused["experience"]
+
+
+def test_what_another_version_sends_is_refused_in_the_same_words(
+    source: Source, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    experience = Experience(0.5)
+    finished(source.times.on_message(message_of(experience)))
+    state = experience.state
+    experience.record_failure((5.0, 5.0))
+    with monkeypatch.context() as newer:
+        newer.setattr(experience_file, "VERSION", 99)
+        changes = experience.changes_since(state)
+        whole = message_of(experience)
+    assert changes is not None
+    for message in (bytes_message(CHANGES, changes), whole):
+        finished(source.times.on_message(message))
+        reason = source.diagnostics.refused["experience"]
+        assert reason.startswith("no experience: it has version 99, not 5; let those")
 
 
 def test_a_file_is_planned_with_or_refused_or_none_is_set(
