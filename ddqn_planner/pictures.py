@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.files import as_path, write_atomically
 from ddqn_planner.grid import LENGTHS, MOVES, Cell, GridMap
+from ddqn_planner.robot.directions import cusps_before, directions_of_travel
 from ddqn_planner.robot.footprint import placed
 
 if TYPE_CHECKING:
@@ -22,6 +23,8 @@ Array = NDArray[np.float64]
 
 OBSTACLE_COLOUR = "#22223b"
 PATH_COLOUR = "#d1495b"
+REVERSE_COLOUR = "#1e88e5"
+GOAL_COLOUR = "#f3c6cc"  # of a body at the goal: pale, so that the path shows on it
 DIRECTION_COLOUR = "#6c757d"
 # From the worst value to the best: light to dark, so that the order shows without
 # colours, too.
@@ -36,6 +39,10 @@ MAX_TEXT_WIDTH = 64  # signs in a row, two characters for each
 MAX_SIDE_WITH_LINES = 64
 MAX_ARROWS = 48  # arrows of one-way zones along the longest side of a map
 OUTLINES = 30  # of a body along its path
+# A picture shows a part of the map that has less than this share of the map's area.
+LARGEST_PART = 0.5
+MARGIN_IN_BODIES = 2  # around that part, in lengths of the body
+NARROWEST_PART = 0.5  # its shorter side, as a share of its longer side
 # The mean direction of a cell that is not one-way is shorter: 0, except for rounding.
 SHORTEST_DIRECTION = 1e-9
 
@@ -46,6 +53,23 @@ class BodyPicture(NamedTuple):
     footprint: Array  # (K, 2): its corners (x, y), for a robot at (0, 0) that faces +x
     poses: Array  # (N, 3): (x, y, yaw) along the path; none without a path
     ends: Array  # (2, 3): where it starts, and where it has to arrive
+
+
+class View(NamedTuple):
+    """The part of a map that a picture shows; in cells, from the first one's centre."""
+
+    x: tuple[float, float]  # the least and the greatest
+    y: tuple[float, float]
+
+    @property
+    def width(self) -> float:
+        """The number of cells from left to right."""
+        return self.x[1] - self.x[0]
+
+    @property
+    def height(self) -> float:
+        """The number of cells from bottom to top."""
+        return self.y[1] - self.y[0]
 
 
 def draw_text(grid: GridMap, cells: Sequence[Cell]) -> str:
@@ -111,14 +135,16 @@ def save_picture(
     value_label
         What the colours show.
     body
-        A body, drawn along its poses.
+        A body, drawn along its poses. If the map is much larger than the path, the
+        picture shows the part of the map around the path.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
     file = as_path(path)
     ending = picture_format(file)  # an error comes before the work
-    aspect = min(max(grid.height / grid.width, 0.4), 1.0)
+    view = whole_map(grid) if body is None else view_of_body(grid, body)
+    aspect = min(max(view.height / view.width, 0.4), 1.0)
     inches = (7.2, 1.5 + 5.1 * aspect)  # with room for the title and the legend
     figure = Figure(figsize=inches, dpi=120, layout="constrained")
     axes = figure.subplots()
@@ -133,12 +159,50 @@ def save_picture(
         draw_body(axes, *body)
     elif cells:
         _draw_path(axes, cells)
+    axes.set(xlim=view.x, ylim=view.y)
     if cells or body is not None:
-        figure.legend(loc="outside lower center", ncols=4, frameon=False)
+        figure.legend(
+            loc="outside lower center", ncols=6, frameon=False, columnspacing=1.4
+        )
     # Into memory first: after an error an old file is still complete.
     content = io.BytesIO()
     figure.savefig(content, format=ending)
     write_atomically(file, content.getvalue())
+
+
+def whole_map(grid: GridMap) -> View:
+    """Return the view of a map from its first cell to its last."""
+    return View((-0.5, grid.width - 0.5), (-0.5, grid.height - 0.5))
+
+
+def view_of_body(grid: GridMap, body: BodyPicture) -> View:
+    """Return the part of a map around a body's path, or else the complete map.
+
+    The map is shown completely if the part has more than half of its area.
+    """
+    footprint, poses, ends = body
+    outlines = placed(footprint, np.concatenate([poses, ends])).reshape(-1, 2)
+    lowest = outlines.min(axis=0)  # (2,): x and y
+    highest = outlines.max(axis=0)
+    side = np.ptp(footprint, axis=0).max()
+    size = highest - lowest + 2 * MARGIN_IN_BODIES * side
+    size = np.maximum(size, NARROWEST_PART * size.max())
+    centre = (lowest + highest) / 2
+    everything = whole_map(grid)
+    part = View(
+        _clipped(centre[0], size[0], everything.x),
+        _clipped(centre[1], size[1], everything.y),
+    )
+    largest_area = LARGEST_PART * grid.width * grid.height
+    return part if part.width * part.height < largest_area else everything
+
+
+def _clipped(
+    centre: float, size: float, limits: tuple[float, float]
+) -> tuple[float, float]:
+    """Return an interval of a size about a centre, as far as it lies in the limits."""
+    low, high = limits
+    return max(low, float(centre - size / 2)), min(high, float(centre + size / 2))
 
 
 def picture_format(path: Path, option: str = "the picture") -> str:
@@ -247,29 +311,91 @@ def _draw_path(axes: Axes, cells: Sequence[Cell]) -> None:
 def draw_body(axes: Axes, footprint: Array, poses: Array, ends: Array) -> None:
     """Draw what a body sweeps along a path, and the body at the path's two ends.
 
-    Lengths are in cells. `footprint` (K, 2) holds the corners of a body at (0, 0) that
-    faces +x, `poses` (N, 3) x, y and yaw along the path, and `ends` (2, 3) the start
-    and the goal.
+    All lengths are in the unit of the axes. `footprint` (K, 2) holds the corners of a
+    body at (0, 0) that faces +x, `poses` (N, 3) x, y and yaw along the path, and `ends`
+    (2, 3) the start and the goal.
     """
+    if len(poses):
+        _draw_swept(axes, placed(footprint, poses))
+        _draw_driven(axes, poses)
+    colours = {"start": "white", "goal": GOAL_COLOUR}
+    nose = _nose(footprint)
+    pose: Array
+    for pose, (label, colour) in zip(ends, colours.items(), strict=True):
+        outline = placed(footprint, pose)
+        axes.fill(
+            *outline.T, label=label, facecolor=colour, edgecolor=PATH_COLOUR, zorder=3
+        )
+        axes.fill(*placed(nose, pose).T, facecolor=OBSTACLE_COLOUR, zorder=3)
+
+
+def _draw_swept(axes: Axes, outlines: Array) -> None:
+    """Draw a body's outlines (N, K, 2) along its path, some of them with their edge."""
     from matplotlib.collections import PolyCollection
 
-    if len(poses):
-        swept: Any = placed(footprint, poses)  # (N, K, 2): its corners at all poses
-        axes.add_collection(
-            PolyCollection(swept, facecolor=VALUE_COLOURS[1], label="swept")
+    polygons: Any = outlines
+    axes.add_collection(
+        PolyCollection(polygons, facecolor=VALUE_COLOURS[1], label="swept")
+    )
+    step = len(outlines) // OUTLINES + 1
+    some = PolyCollection(
+        polygons[::step],
+        facecolor=VALUE_COLOURS[2],
+        edgecolor=VALUE_COLOURS[3],
+        alpha=0.3,
+    )
+    axes.add_collection(some)
+
+
+def _draw_driven(axes: Axes, poses: Array) -> None:
+    """Draw a line along poses (N, 3), above the body at both ends.
+
+    Stretches in reverse have another colour, and a diamond marks each cusp.
+    """
+    from matplotlib.collections import LineCollection
+
+    directions = directions_of_travel(poses)  # (N - 1,)
+    is_reverse = directions < 0
+    changes = np.flatnonzero(np.diff(is_reverse)) + 1  # the first poses of stretches
+    first = np.concatenate([[0], changes])
+    last = np.append(changes, len(poses) - 1)
+    stretches: dict[bool, list[Array]] = {False: [], True: []}
+    for begin, end in zip(first.tolist(), last.tolist(), strict=True):
+        is_driven_back = bool(is_reverse[begin : begin + 1].any())
+        stretches[is_driven_back].append(poses[begin : end + 1, :2])
+    colours = {False: PATH_COLOUR, True: REVERSE_COLOUR}
+    labels = {False: "path", True: "in reverse"}
+    for is_driven_back, lines in stretches.items():
+        if lines:
+            collection = LineCollection(
+                lines,
+                colors=colours[is_driven_back],
+                linewidths=2,
+                label=labels[is_driven_back],
+                zorder=4,
+            )
+            axes.add_collection(collection)
+    cusps = np.flatnonzero(np.diff(cusps_before(directions)))
+    if len(cusps):
+        x, y, _ = poses[cusps].T
+        axes.scatter(
+            x,
+            y,
+            18,
+            color="white",
+            edgecolors=OBSTACLE_COLOUR,
+            marker="D",
+            label="cusp",
+            zorder=5,
         )
-        step = len(swept) // OUTLINES + 1
-        outlines = PolyCollection(
-            swept[::step],
-            facecolor=VALUE_COLOURS[2],
-            edgecolor=VALUE_COLOURS[3],
-            alpha=0.3,
-        )
-        axes.add_collection(outlines)
-        axes.plot(*poses.T[:2], color=PATH_COLOUR, linewidth=2, label="path")
-    # A triangle with its tip at the front of the body shows the heading. Its base lies
-    # at the robot's origin; at the body's back if the origin is behind the body, and in
-    # the middle of the body if the origin is ahead of the body.
+
+
+def _nose(footprint: Array) -> Array:
+    """Return a triangle (3, 2) with its tip at the front of a body, for its heading.
+
+    Its base lies at the robot's origin; at the body's back if the origin is behind the
+    body, and in the middle of the body if the origin is ahead of the body.
+    """
     back: float
     front: float
     left: float
@@ -278,15 +404,7 @@ def draw_body(axes: Axes, footprint: Array, poses: Array, ends: Array) -> None:
     base = max(0.0, back)
     if front <= 0:
         base = (front + back) / 2
-    triangle = np.array([[front, 0], [base, left / 2], [base, -left / 2]])
-    colours = {"start": "white", "goal": PATH_COLOUR}
-    pose: Array
-    for pose, (label, colour) in zip(ends, colours.items(), strict=True):
-        outline = placed(footprint, pose)
-        axes.fill(
-            *outline.T, label=label, facecolor=colour, edgecolor=PATH_COLOUR, zorder=3
-        )
-        axes.fill(*placed(triangle, pose).T, facecolor=OBSTACLE_COLOUR, zorder=3)
+    return np.array([[front, 0], [base, left / 2], [base, -left / 2]])
 
 
 def draw_obstacles(axes: Axes, grid: GridMap) -> None:
