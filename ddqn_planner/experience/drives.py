@@ -1,5 +1,7 @@
 """A robot's drives: divided from its poses, and recorded in a folder that learns."""
 
+from __future__ import annotations
+
 import math
 import re
 from collections.abc import Callable, Iterator
@@ -15,7 +17,7 @@ from ddqn_planner.experience.experience import (
     Experience,
     Learned,
 )
-from ddqn_planner.experience.places import Float64
+from ddqn_planner.experience.places import Float64, lengths
 from ddqn_planner.experience.visits import (
     SPOT,
     Poses,
@@ -74,6 +76,10 @@ class Sample(NamedTuple):
         """Metres."""
         return self.x, self.y
 
+    def distance(self, other: Sample) -> float:
+        """Return how many metres away another sample is."""
+        return math.dist(self.position, other.position)
+
 
 class DriveEnd(str, Enum):
     """How a drive ended."""
@@ -104,8 +110,7 @@ class Drive(NamedTuple):
     @property
     def extent(self) -> float:
         """How far from its start the robot came, metres."""
-        from_start = self.positions - self.positions[:1]
-        return float(np.linalg.norm(from_start, axis=1).max(initial=0))
+        return float(lengths(self.positions - self.positions[:1]).max(initial=0))
 
     def teach(self, experience: Experience, grid: GridMap | None = None) -> Learned:
         """Let `experience` learn from this drive, and return what it has learned.
@@ -142,7 +147,7 @@ class Drive(NamedTuple):
 
 def _length(path: Float64) -> float:
     """Return the length of a path (N, 2), metres."""
-    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+    return float(lengths(np.diff(path, axis=0)).sum())
 
 
 def read_drives(
@@ -229,7 +234,7 @@ class DriveRecorder:
         if self._last is not None and seconds < self._last.seconds - JUMP:
             self.end()
             self.forget()
-        if self._stand is None or _distance(self._stand, sample) > SPOT:
+        if self._stand is None or sample.distance(self._stand) > SPOT:
             self._stand = sample
             if self._last is not None and not self._samples:
                 self._samples = [self._last]  # a drive begins there
@@ -244,7 +249,7 @@ class DriveRecorder:
         the last one. The robot has `stood` there for so many seconds.
         """
         recorded = self._samples[-1]
-        is_far = _distance(recorded, sample) >= SAMPLE_DISTANCE
+        is_far = sample.distance(recorded) >= SAMPLE_DISTANCE
         if is_far or abs(sample.seconds - recorded.seconds) >= SAMPLE_PERIOD:
             self._samples.append(sample)
         if stood >= STAND_PERIOD and self._is_at_goal:
@@ -294,11 +299,6 @@ class DriveRecorder:
         has_failed = outcome is DriveEnd.ABORTED and len(samples) > 0
         if drive.extent >= SHORTEST or has_failed:
             self._on_drive(drive)
-
-
-def _distance(first: Sample, second: Sample) -> float:
-    """Return how many metres two samples are apart."""
-    return math.hypot(second.x - first.x, second.y - first.y)
 
 
 class DriveFolder(WorkFolder):

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ddqn_planner.experience.evidence import Evidence
 from ddqn_planner.experience.experience_file import (
@@ -20,7 +20,7 @@ from ddqn_planner.experience.experience_file import (
     content_to_bytes,
 )
 from ddqn_planner.experience.fleet import Fleet, RobotEvidence, Version
-from ddqn_planner.experience.places import FARTHEST, Float32, Float64, Int64
+from ddqn_planner.experience.places import FARTHEST, Float32, Float64, Int64, lengths
 from ddqn_planner.experience.posterior import Posterior
 from ddqn_planner.experience.prior import FEATURES
 from ddqn_planner.experience.turns import seconds_per_radian, turning_of
@@ -435,8 +435,8 @@ class Experience:
         # The M + 1 cells along the path, (M + 1, 2), and their positions on it, (M +
         # 1,): 2.5 is the middle of the third segment.
         path, position = cells_along(corners)
-        steps: NDArray[np.float64] = np.diff(corners, axis=0)  # (K - 1, 2) cells
-        metres_of_segment = np.hypot(steps[:, 0], steps[:, 1]) * grid.resolution
+        steps = np.diff(corners.astype(np.float64), axis=0)  # (K - 1, 2) cells
+        metres_of_segment = lengths(steps) * grid.resolution
         segment = position[:-1].astype(np.int64)  # (M,): the segment of each move
         metres = np.diff(position) * metres_of_segment[segment]  # (M,)
         x = path[:, 0]
@@ -627,10 +627,8 @@ def _why_nothing(poses: Poses, count: int, limits: Limits) -> str:
     `poses` are those of its `count` poses that can be true.
     """
     elapsed = np.diff(poses.time)
-    steps: Float64 = np.diff(poses.position, axis=0)
-    metres = np.hypot(steps[:, 0], steps[:, 1])
-    from_start = poses.position - poses.position[:1]
-    extent = np.hypot(from_start[:, 0], from_start[:, 1]).max(initial=0)
+    metres = lengths(np.diff(poses.position, axis=0))
+    extent = lengths(poses.position - poses.position[:1]).max(initial=0)
     speed = (metres / np.abs(elapsed)).max(initial=0)
     return (
         f"{len(poses.time)} of {count} poses are possible and differ in their time, "

@@ -176,6 +176,11 @@ def squares_at(position: Float64, side: float) -> Int32:
     return np.floor(position / side).astype(np.int32)
 
 
+def lengths(vectors: Float64) -> Float64:
+    """Return the lengths of vectors (..., 2): (...)."""
+    return np.asarray(np.hypot(vectors[..., 0], vectors[..., 1]))
+
+
 def _united(places: Places) -> Places:
     """Return places in the order of their squares, where each square stands once.
 

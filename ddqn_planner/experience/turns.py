@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ddqn_planner.experience.places import Float64
+from ddqn_planner.experience.places import Float64, lengths
 
 STEP = 0.15  # metres between two points at which a path's turning is computed
 REACH = 3  # points to each side of a point that tell its turning
@@ -53,8 +53,7 @@ def turning_of(path: Float64) -> float:
 
     `path` is (N, 2), in metres: x and y of its corners.
     """
-    steps: Float64 = np.diff(path, axis=0)
-    metres_to_corner = sums_up_to(np.hypot(steps[:, 0], steps[:, 1]))
+    metres_to_corner = sums_up_to(lengths(np.diff(path, axis=0)))
     metres = np.arange(0, metres_to_corner[-1], STEP)
     x = np.interp(metres, metres_to_corner, path[:, 0])
     y = np.interp(metres, metres_to_corner, path[:, 1])

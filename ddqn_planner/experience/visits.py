@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.experience.places import Float64
+from ddqn_planner.experience.places import Float64, lengths
 from ddqn_planner.experience.turns import (
     Moves,
     seconds_of_turns,
@@ -131,18 +131,14 @@ def visits_of(
     is_possible = length <= limits.max_speed * seconds
     is_possible &= length >= limits.min_speed * seconds
     steps = steps[is_possible]  # (N, 5), see `_steps_along`
-    # A visit begins where a step lies in another place than the step before it. NaN
-    # differs from all: the first step begins a visit, too.
+    # A visit begins where a step lies in another place than the step before it.
     place = np.floor(steps[:, :2] / side)  # (N, 2): x and y of each place, in sides
-    is_first = (np.diff(place, axis=0, prepend=np.nan) != 0).any(axis=1)  # (N,)
-    first_steps = np.flatnonzero(is_first)  # (V,): the first step of each visit
-    step_count = np.diff(first_steps, append=len(steps))  # (V,)
-    # (V,) each: the sums over the steps of each visit.
-    x, y, driven, waited, turned = np.add.reduceat(steps, first_steps).T
-    position = np.column_stack([x, y]) / step_count[:, None]
+    sums, step_count = _sums_of_runs(steps, place)  # (V, 5) and (V,)
+    position = sums[:, :2] / step_count[:, None]
+    driven, waited, turned = sums[:, 2:].T
     ends = np.concatenate([poses.position[:1], poses.position[-1:]])
     from_ends = position[:, None] - ends  # (V, 2, 2) metres
-    from_nearest_end: Float64 = _lengths(from_ends).min(axis=1, initial=np.inf)
+    from_nearest_end = lengths(from_ends).min(axis=1, initial=np.inf)
     metres = length * step_count
     return Visits(
         position, metres, driven, waited, turned, from_nearest_end > END, turns
@@ -164,7 +160,7 @@ def _moves_over(spots: Poses) -> Moves:
     turning = turning_at(spots.position)
     return Moves(
         seconds=np.diff(spots.time),
-        metres=_lengths(np.diff(spots.position, axis=0)),
+        metres=lengths(np.diff(spots.position, axis=0)),
         turning=(turning[1:] + turning[:-1]) / 2,
     )
 
@@ -215,13 +211,21 @@ def averaged(poses: Poses, window: float) -> Poses:
     """
     # (N,): the number of each pose's window.
     window_number = np.floor((poses.time - poses.time[:1]) / window)
-    # (M,): the first pose in each window. NaN differs from all: the first pose is one.
-    first_poses = np.flatnonzero(np.diff(window_number, prepend=np.nan) != 0)
-    pose_count = np.diff(first_poses, append=len(poses.time))  # (M,)
-    # (N, 3): the time, x and y of each pose; (M, 3): their means in each window.
-    rows = np.column_stack([poses.time, poses.position])
-    means = np.add.reduceat(rows, first_poses) / pose_count[:, None]
+    rows = np.column_stack([poses.time, poses.position])  # (N, 3)
+    sums, pose_count = _sums_of_runs(rows, window_number[:, None])
+    means = sums / pose_count[:, None]  # (M, 3)
     return Poses(time=means[:, 0], position=means[:, 1:])
+
+
+def _sums_of_runs(rows: Float64, labels: Float64) -> tuple[Float64, NDArray[np.int64]]:
+    """Return the sums over M runs of rows, (M, K), and how many rows they have: (M,).
+
+    `rows` are (N, K). A run begins where `labels` (N, L) differ from those before.
+    """
+    # NaN differs from all: the first row begins a run, too.
+    is_first = (np.diff(labels, axis=0, prepend=np.nan) != 0).any(axis=1)  # (N,)
+    first_rows = np.flatnonzero(is_first)  # (M,)
+    return np.add.reduceat(rows, first_rows), np.diff(first_rows, append=len(rows))
 
 
 def indices_apart(position: Float64, metres: float) -> NDArray[np.int64]:
@@ -251,7 +255,7 @@ def _believed_parts(poses: Poses, limits: Limits) -> Iterator[Poses]:
     elapsed = np.diff(time)  # (N - 1,): seconds from each pose to the next one
     # (N - 1,): metres.
     reachable = limits.max_speed * np.minimum(elapsed, UNSEEN) + CORRECTION
-    is_jump = _lengths(np.diff(position, axis=0)) > reachable
+    is_jump = lengths(np.diff(position, axis=0)) > reachable
     is_cut = is_jump | (elapsed > limits.max_pause) | (elapsed <= 0)
     first_poses = np.flatnonzero(is_cut) + 1  # of all parts but the first
     bounds: list[int] = [0, *first_poses.tolist(), len(time)]
@@ -265,9 +269,3 @@ def _believed_parts(poses: Poses, limits: Limits) -> Iterator[Poses]:
         if math.dist(position[start], position[last_believed]) <= reach:
             last_believed = end - 1
             yield poses.part(slice(start, end))
-
-
-def _lengths(vectors: Float64) -> Float64:
-    """Return the lengths of vectors (..., 2)."""
-    lengths: Float64 = np.hypot(vectors[..., 0], vectors[..., 1])
-    return lengths
