@@ -217,7 +217,7 @@ def averaged(poses: Poses, window: float) -> Poses:
     return Poses(time=means[:, 0], position=means[:, 1:])
 
 
-def _sums_of_runs(rows: Float64, labels: Float64) -> tuple[Float64, NDArray[np.int64]]:
+def _sums_of_runs(rows: Float64, labels: Float64) -> tuple[Float64, Float64]:
     """Return the sums over M runs of rows, (M, K), and how many rows they have: (M,).
 
     `rows` are (N, K). A run begins where `labels` (N, L) differ from those before.
@@ -225,7 +225,8 @@ def _sums_of_runs(rows: Float64, labels: Float64) -> tuple[Float64, NDArray[np.i
     # NaN differs from all: the first row begins a run, too.
     is_first = (np.diff(labels, axis=0, prepend=np.nan) != 0).any(axis=1)  # (N,)
     first_rows = np.flatnonzero(is_first)  # (M,)
-    return np.add.reduceat(rows, first_rows), np.diff(first_rows, append=len(rows))
+    row_count = np.diff(first_rows, append=len(rows)).astype(np.float64)
+    return np.add.reduceat(rows, first_rows), row_count
 
 
 def indices_apart(position: Float64, metres: float) -> NDArray[np.int64]:
