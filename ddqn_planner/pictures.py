@@ -317,7 +317,7 @@ def draw_body(axes: Axes, footprint: Array, poses: Array, ends: Array) -> None:
     """
     if len(poses):
         _draw_swept(axes, placed(footprint, poses))
-        _draw_driven(axes, poses)
+        draw_driven(axes, poses)
     colours = {"start": "white", "goal": GOAL_COLOUR}
     nose = _nose(footprint)
     pose: Array
@@ -347,7 +347,7 @@ def _draw_swept(axes: Axes, outlines: Array) -> None:
     axes.add_collection(some)
 
 
-def _draw_driven(axes: Axes, poses: Array) -> None:
+def draw_driven(axes: Axes, poses: Array) -> None:
     """Draw a line along poses (N, 3), above the body at both ends.
 
     Stretches in reverse have another colour, and a diamond marks each cusp.

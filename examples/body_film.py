@@ -14,17 +14,26 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.animation import FuncAnimation, PillowWriter
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from numpy.typing import NDArray
+from PIL import Image
 
 from ddqn_planner import GridMap, Planner
 from ddqn_planner.files import as_path
 from ddqn_planner.model import RobotNetwork
-from ddqn_planner.pictures import PATH_COLOUR, VALUE_COLOURS, draw_obstacles
+from ddqn_planner.pictures import (
+    GOAL_COLOUR,
+    PATH_COLOUR,
+    VALUE_COLOURS,
+    draw_driven,
+    draw_obstacles,
+    save_film,
+)
+from ddqn_planner.planning.pose_paths import in_cells
 from ddqn_planner.robot.footprint import placed
 
-FRAMES_PER_SECOND = 20
-LAST_FRAMES = 30  # in which the robots stand at their goals
+FRAME_MS = 50
+LAST_FRAME_MS = 1500  # the robots stand at their goals
 TRACE = 6  # poses from one outline that stays to the next
 
 Pose = tuple[float, float, float]
@@ -95,28 +104,35 @@ def main(arguments: Sequence[str]) -> int:
         print(f"{model}: {metres:.2f} m in {plan.field_ms:.0f} ms")
         axes.axis("off")
         draw_obstacles(axes, grid)
-        # The centre of the first cell is (0, 0) in the picture.
-        outlines = placed(planner.network.footprint, plan.poses) / grid.resolution - 0.5
-        x, y = plan.poses.T[:2] / grid.resolution - 0.5
-        axes.plot(x, y, color=PATH_COLOUR, linewidth=1)
-        (body,) = axes.fill([], [], color=PATH_COLOUR, alpha=0.9)
+        poses = in_cells(plan.poses, grid)
+        outlines = placed(planner.network.footprint / grid.resolution, poses)
+        draw_driven(axes, poses)
+        (body,) = axes.fill([], [], facecolor=GOAL_COLOUR, edgecolor=PATH_COLOUR)
         drives.append(Drive(outlines, axes, body))
 
-    def draw(frame: int) -> Sequence[Any]:
-        for drive in drives:
-            number = min(frame, len(drive.outlines) - 1)
-            outline = drive.outlines[number]
-            drive.body.set_xy(outline)
-            if frame == number and frame % TRACE == 0:
-                colour = VALUE_COLOURS[2]
-                drive.axes.fill(*outline.T, color=colour, alpha=0.25, zorder=0)
-        return [drive.body for drive in drives]
-
     longest = max(len(drive.outlines) for drive in drives)
-    frames = [*range(0, longest, 2), *[longest] * LAST_FRAMES]
-    animation = FuncAnimation(figure, draw, frames)
-    animation.save(file, PillowWriter(FRAMES_PER_SECOND))
+    canvas: Any = FigureCanvasAgg(figure)
+    frames = []
+    for pose in [*range(0, longest, 2), longest]:
+        for drive in drives:
+            draw_body_at(drive, pose)
+        canvas.draw()
+        image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+        # These colours cover all that are drawn, also those of a short stretch.
+        few_colours = image.quantize(64, Image.Quantize.MAXCOVERAGE)
+        frames.append(few_colours.convert("RGB"))
+    save_film(file, frames, FRAME_MS, LAST_FRAME_MS)
     return 0
+
+
+def draw_body_at(drive: Drive, pose: int) -> None:
+    """Move the body to a pose of its path, or to the last one, and draw its trace."""
+    number = min(pose, len(drive.outlines) - 1)
+    outline = drive.outlines[number]
+    drive.body.set_xy(outline)
+    if pose == number and pose % TRACE == 0:
+        colour = VALUE_COLOURS[2]
+        drive.axes.fill(*outline.T, color=colour, alpha=0.25, zorder=0)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ from ddqn_planner.training.environment import paper_scenario
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
 DPI = 130
-PALETTE = 128  # colours of a file, which keep it small
+PALETTE = 256  # colours of a file, which keep it small
 RULE = MoveRule.ROBOT_SAFE
 
 OFFICE_DETAIL = (240, 160)  # width and height of its lower left corner, in cells
@@ -241,6 +241,7 @@ PICTURES: Mapping[str, Callable[[], Any]] = {
 FILES: Mapping[str, Callable[[Path], None]] = {
     "own_map.png": training_pictures.save_own_map,
     "training.gif": training_pictures.save_film,
+    "beside_smac.gif": page_pictures.save_beside_smac,
     "command_line.png": page_pictures.save_command_line,
 }
 

@@ -5,20 +5,23 @@ doc_pictures.py saves them.
 
 import math
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
 import bodies
 import numpy as np
-from figures import COLOURS, draw_path, plt
+from beside import CELL_OF_MAP, CELLS_OF_MAP, inflated_as_nav2
+from figures import COLOURS, draw_path, frame_of, plt
 from numpy.typing import NDArray
+from PIL import Image
 from random_maps import KINDS, generate_map
 
 from ddqn_planner import GridMap, MoveRule, Planner
 from ddqn_planner.cli import main as run_command
 from ddqn_planner.grid import OCCUPIED, Cell
 from ddqn_planner.grid.noise import random_requests
-from ddqn_planner.model import PaperQNetwork, PropagationQNetwork
+from ddqn_planner.model import PaperQNetwork, PropagationQNetwork, RobotNetwork
 from ddqn_planner.model.move_costs import every_patch, legal_in_patches
 from ddqn_planner.model.networks import (
     FREE,
@@ -27,11 +30,19 @@ from ddqn_planner.model.networks import (
     ROBOT,
     observation_background,
 )
-from ddqn_planner.pictures import VALUE_COLOURS, draw_obstacles
+from ddqn_planner.pictures import (
+    VALUE_COLOURS,
+    BodyPicture,
+    draw_body,
+    draw_obstacles,
+    view_of_body,
+)
+from ddqn_planner.pictures import save_film as save_frames
 from ddqn_planner.planning.path_finder import last_step
 from ddqn_planner.planning.plan import PoseRequest
-from ddqn_planner.robot.directions import directions_of_travel
+from ddqn_planner.planning.pose_paths import in_cells
 from ddqn_planner.robot.driving_costs import DrivingCosts
+from ddqn_planner.robot.footprint import placed, read_footprint
 from ddqn_planner.training import paper_scenario
 
 BENCHMARKS: Final = Path(__file__).resolve().parents[1] / "docs" / "benchmarks.md"
@@ -57,7 +68,17 @@ COSTS_OF_DRIVING: Final = {
     "where lengths alone count": LENGTHS_ALONE,
     "by default": DrivingCosts(),
 }
-ARROWS_OF_PATH: Final = 24
+LEGEND_OF_BODIES: Final = ("swept", "path", "in reverse", "cusp", "start", "goal")
+BODY_COLOUR: Final = "#f4a259"
+METRES_OF_FRAME: Final = 0.2  # that the bodies drive from one frame to the next
+FRAME_MS: Final = 100
+LAST_FRAME_MS: Final = 2500
+# A request of `beside.py`, and the path of Smac Hybrid-A* for it, in metres.
+SMAC_PATH: Final = Path(__file__).with_name("smac_hybrid_path.csv")
+BESIDE_ENDS: Final = (
+    (13.89563148322319, 6.207666988704605, -1.5067393994722427),
+    (9.08231766120358, 12.837409056012099, -2.825320458597536),
+)
 VIA: Final[Cell] = (2, 16)
 GOALS: Final[tuple[Cell, ...]] = ((17, 19), (11, 2), (13, 10))
 
@@ -247,7 +268,7 @@ def bends() -> Any:
         poses = last_step(planner.pose_planner.steps(request)).poses  # (N, 3)
         start, (goal,) = HALL_ENDS
         shape = bodies.shape_of(poses, start, goal)
-        draw_directions(axes, poses)
+        draw_body(axes, read_footprint(footprint), poses, np.array(poses[[0, -1]]))
         axes.set_aspect("equal")
         axes.set(
             xlim=(0, HALL_WIDTH * bodies.CELL), ylim=(0, HALL_HEIGHT * bodies.CELL)
@@ -255,20 +276,82 @@ def bends() -> Any:
         words = f"{shape.turning:.0f} degrees and {shape.cusps:.1f} cusps per 10 m"
         axes.set_title(f"{name}: {words}", loc="left", fontsize=10)
     panels[1].set(xlabel="x [m]")
-    panels[0].legend(loc="upper left", frameon=False)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=6, frameon=False)
     return figure
 
 
-def draw_directions(axes: Any, poses: NDArray[np.float64]) -> None:
-    """Draw a path (N, 3), in metres: ahead and in reverse in different colours."""
-    in_cells = poses / (bodies.CELL, bodies.CELL, 1)
-    is_reverse = np.append(directions_of_travel(in_cells) < 0, False)
-    is_before = np.roll(is_reverse, 1) | is_reverse
-    reverse = np.where(is_before[:, None], poses[:, :2], np.nan)
-    axes.plot(*poses[:, :2].T, color=COLOURS[0], linewidth=2, label="ahead")
-    axes.plot(*reverse.T, color=COLOURS[1], linewidth=3, label="in reverse")
-    x, y, yaw = poses[:: len(poses) // ARROWS_OF_PATH].T
-    axes.quiver(x, y, np.cos(yaw), np.sin(yaw), scale=40, width=0.003, zorder=5)
+def save_beside_smac(path: Path) -> None:
+    """Save a film of a car beside Nav2's Smac Hybrid-A*, both at the same speed."""
+    grid = blocks()
+    planner = Planner.load("car")
+    assert isinstance(planner.network, RobotNetwork)
+    footprint = planner.network.footprint
+    with_costs = inflated_as_nav2(grid, bodies.inner_radius(footprint))
+    plan = planner.plan_poses(with_costs, *BESIDE_ENDS)
+    smac_path = np.loadtxt(SMAC_PATH, delimiter=",", skiprows=1)  # (N, 3)
+    drives = {"ddqn_planner": plan.poses, "Smac Hybrid-A* (Nav2 1.3.13)": smac_path}
+    longest = max(metres_along(poses)[-1] for poses in drives.values())
+    frames = [
+        _frame_beside_smac(grid, footprint, drives, metres)
+        for metres in np.arange(0, longest + METRES_OF_FRAME, METRES_OF_FRAME)
+    ]
+    save_frames(path, frames, FRAME_MS, LAST_FRAME_MS)
+
+
+def metres_along(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the metres (N,) from the first of N poses to each of them."""
+    steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
+    metres: NDArray[np.float64] = np.append(0, np.cumsum(steps))
+    return metres
+
+
+def _frame_beside_smac(
+    grid: GridMap,
+    footprint: NDArray[np.float64],
+    drives: Mapping[str, NDArray[np.float64]],
+    metres: float,
+) -> Image.Image:
+    """Draw each path with the body where it is after some metres."""
+    figure, panels = plt.subplots(1, 2, figsize=(8.4, 5.6), layout="constrained")
+    start, goal = BESIDE_ENDS
+    ends = in_cells(np.array(BESIDE_ENDS), grid)
+    everything = in_cells(np.concatenate([*drives.values()]), grid)
+    corners = footprint / grid.resolution
+    view = view_of_body(grid, BodyPicture(corners, everything, ends))
+    handles: dict[str, Any] = {}
+    for axes, (name, poses) in zip(panels, drives.items(), strict=True):
+        draw_obstacles(axes, grid)
+        path = in_cells(poses, grid)
+        draw_body(axes, corners, path, ends)
+        driven = metres_along(poses)
+        index = min(int(np.searchsorted(driven, metres)), len(poses) - 1)
+        body = placed(corners, path[index])
+        axes.fill(*body.T, color=BODY_COLOUR, alpha=0.75, zorder=6)
+        axes.set(xlim=view.x, ylim=view.y, xticks=[], yticks=[], aspect="equal")
+        shape = bodies.shape_of(poses, start, goal)
+        title = f"{name}\n{driven[-1]:.1f} m, {shape.turning:.0f} degrees per 10 m"
+        axes.set_title(title, loc="left", fontsize=10)
+        drawn, labels = axes.get_legend_handles_labels()
+        handles |= dict(zip(labels, drawn, strict=True))
+    legend = {label: handles[label] for label in LEGEND_OF_BODIES}
+    figure.legend(
+        legend.values(),
+        legend.keys(),
+        loc="outside lower center",
+        ncols=6,
+        frameon=False,
+    )
+    # These colours cover all that are drawn, also the few points of a short stretch.
+    few_colours = frame_of(figure).quantize(64, Image.Quantize.MAXCOVERAGE)
+    return few_colours.convert("RGB")
+
+
+def blocks() -> GridMap:
+    """Return the map of the path beside Smac's: 18 x 18 m with blocks of 1.5 m."""
+    cells = generate_map("random_10", CELLS_OF_MAP, np.random.default_rng(0))
+    block = np.ones((CELL_OF_MAP, CELL_OF_MAP), np.bool_)
+    return GridMap(np.kron(cells, block), bodies.CELL)
 
 
 def save_command_line(path: Path) -> None:
