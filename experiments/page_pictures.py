@@ -59,7 +59,7 @@ OBSERVED: Final = (
     (ROBOT, COLOURS[1], "robot"),
 )
 ARROWS: Final = "→↗↑↖←↙↓↘"
-CAR: Final = "--model car --start 30 97 --goal 495 280 --yaws 0 1.57"
+CAR: Final = "--model car --start 430 97 --goal 495 200 --yaws 0 1.57"
 HALL_WIDTH: Final = 360  # cells
 HALL_HEIGHT: Final = 180
 HALL_ENDS: Final = ((2.5, 2.5, math.pi), ((15.5, 6.5, 0.5),))  # start, and goals
