@@ -127,8 +127,6 @@ class Places:
     @classmethod
     def summed(cls, parts: Sequence[Places]) -> Places:
         """Return the sums over one or more parts with the same side, as of drives."""
-        if len(parts) == 1:  # as of the only robot, after each drive
-            return parts[0]
         columns = {
             name: np.concatenate([getattr(part, name) for part in parts])
             for name in ("square", *SUMS)
