@@ -6,7 +6,7 @@ import numpy as np
 
 from ddqn_planner.experience import Experience
 from ddqn_planner.grid import GridMap
-from ddqn_planner.planning import Planner
+from ddqn_planner.planning import Planner, departure
 from ddqn_planner.planning.exact_paths import exact_path
 from ddqn_planner.planning.paths import rest_of_path
 
@@ -34,7 +34,9 @@ def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
     if planner.pose_planner is not None:
         _plan_poses(planner)
         yield
-        yield  # there is no other code
+        # There is no other code, but tables that make later requests quicker.
+        departure.write_ahead(planner.pose_planner.body)
+        yield
         return
     planner.plan(grid, start, goal, simplified=True)
     if learns:  # that turns take time

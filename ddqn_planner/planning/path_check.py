@@ -62,7 +62,7 @@ def invalid_poses(
     if body is not None:
         path = in_cells(poses[first:end], grid)
         is_invalid = _touches_at(path, body, closed)  # (M,)
-        may_escape = robot is not None and clearing_radius > 0 and is_invalid[:1].any()
+        may_escape = robot is not None and clearing_radius > 0 and is_invalid.any()
         escape = None
         if may_escape:
             escape = escape_of(path, closed, body, clearing_radius)

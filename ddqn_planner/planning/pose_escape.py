@@ -20,6 +20,7 @@ from ddqn_planner.planning.pose_paths import (
 MARGIN: Final = 0.3  # cells by which a learned body is larger than its points, at most
 # (5, 2): a point itself, and its neighbours at this distance.
 AROUND: Final = MARGIN * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
+STANDING: Final = np.zeros((1, 3))  # a pose at which points are where they are placed
 
 
 class Escape(NamedTuple):
@@ -47,11 +48,31 @@ def escape_of(
     """
     cells = occupied.view(np.uint8)
     points = np.concatenate(body)
+    last_touching = 0  # the number of a pose
     for number in range(1, len(path)):
-        if not touches(path[number : number + 1], points, cells):
-            without_start = _without_start(path[0], occupied, points, radius)
-            return Escape(number, without_start)
-    return None
+        if touches(path[number : number + 1], points, cells):
+            last_touching = number
+        elif not touches(STANDING, _with_margin(path[number], points), cells):
+            break  # the learned body touches nothing, either
+    first_free = last_touching + 1
+    if first_free == len(path):
+        return None
+    return Escape(first_free, _without_start(path[0], occupied, points, radius))
+
+
+def _with_margin(pose: NDArray[np.float64], points: Float64) -> Float64:
+    """Return the points of a body at a pose, and points beside them: (5 M, 2).
+
+    The pose (3,) and the points (M, 2) of the body are in cells. The points returned
+    are from the centre of cell (0, 0).
+    """
+    x, y, yaw = pose.tolist()
+    cos = math.cos(yaw)
+    sin = math.sin(yaw)
+    turned_points = points @ np.array([[cos, sin], [-sin, cos]])
+    placed_points = np.add(turned_points, (x, y))
+    with_margin: Float64 = (placed_points + AROUND[:, None]).reshape(-1, 2)
+    return with_margin
 
 
 def _without_start(
@@ -62,15 +83,10 @@ def _without_start(
     Cells farther than a radius from the robot's origin count in any case. The pose
     (3,), the points (M, 2) of the body and the radius are in cells.
     """
-    x, y, yaw = pose.tolist()
-    cos = math.cos(yaw)
-    sin = math.sin(yaw)
-    turned_points = points @ np.array([[cos, sin], [-sin, cos]])
-    # (M, 2): from the corner of cell (0, 0), so that rounding down gives the cell.
-    placed_points = np.add(turned_points, (x + 0.5, y + 0.5))
-    # (5 M, 2): also a little beside, as the learned body is a little larger.
-    with_margin = (placed_points + AROUND[:, None]).reshape(-1, 2)
-    cells = np.floor(with_margin).astype(np.int64)
+    x, y, _ = pose.tolist()
+    with_margin = _with_margin(pose, points)  # as the learned body is a little larger
+    # From the corner of cell (0, 0), so that rounding down gives the cell.
+    cells = np.floor(with_margin + 0.5).astype(np.int64)
     height, width = occupied.shape
     is_on_map = ((cells >= 0) & (cells < (width, height))).all(axis=1)
     distance = np.hypot(cells[:, 0] - x, cells[:, 1] - y)
@@ -112,11 +128,10 @@ def poses_of_escape(poses: Float64, grid: GridMap, body: BodyPoints) -> int:
     """Return how many poses of a drivable path come before its first free pose.
 
     The poses (N, 3) are in metres and radians, and the points of the body in cells. The
-    result is 0 if the first pose is free.
+    result is 0 if all poses are free.
     """
-    path = in_cells(poses, grid)
-    points = np.concatenate(body)
-    if not touches(path[:1], points, grid.uninflated.view(np.uint8)):
+    if is_free(poses, grid, body):
         return 0
+    path = in_cells(poses, grid)
     escape = escape_of(path, grid.uninflated, body, math.inf)
     return 0 if escape is None else escape.poses

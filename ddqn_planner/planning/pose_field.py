@@ -11,7 +11,8 @@ from numpy.typing import DTypeLike, NDArray
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.layers import has_costs
-from ddqn_planner.planning import pose_space, wavefront
+from ddqn_planner.planning import departure, pose_space, wavefront
+from ddqn_planner.planning.departure import Departure
 from ddqn_planner.planning.field_cache import Field
 from ddqn_planner.planning.pose_paths import SAME, PosePath, cells_of
 from ddqn_planner.planning.pose_space import Aim, Search, height_at
@@ -32,6 +33,7 @@ HEAP = 2**18  # entries that a heap has room for, at least
 # field is quicker.
 KEPT_SHARE = 1 / 2
 UNGUIDED = 2**14  # states that are visited before a look at the map pays
+BEFORE_DEPARTURE = 2**15  # likewise, before a table for the start's heading pays
 FINEST_SHIFT = 1  # of the smallest tiles that the look uses
 # Where cells have costs: the first look is at tiles of 16 cells a side, and each look
 # at so many tiles for each state that was visited.
@@ -50,6 +52,7 @@ NOWHERE = Aim(
     middle_height=np.empty((0, 0), np.float32),
     start_height=0.0,
     least_multiplier=1.0,
+    departure=departure.UNKNOWN,
 )
 NO_MULTIPLIERS = np.empty((0, 0), np.float32)
 # What sums of float32 lose is less.
@@ -174,7 +177,9 @@ class PoseField(Field[Search]):
                     self._leads_on = self._may_reach_goal()
                     if not self._leads_on:
                         return math.inf
-                if self._should_look_at_map():
+                if self._should_learn_departure():
+                    self._learn_departure()
+                elif self._should_look_at_map():
                     # Finer tiles give better lower bounds: a new round begins.
                     self._begin_round(self._next_look())
                 else:
@@ -195,8 +200,32 @@ class PoseField(Field[Search]):
         self.visits = 0
         self._leads_on = False
         self._begin_round(
-            self._aim_toward(start)._replace(start_number=number, weight=weight)
+            self._aim_toward(start)._replace(
+                start_number=number, weight=weight, departure=self._departure(start)
+            )
         )
+
+    def _departure(self, start: State) -> Departure:
+        """Return the lower bounds of what a departure from a start costs, if known."""
+        x, y, heading = start
+        body = self.world.body
+        if not departure.is_written(heading, body):
+            return departure.UNKNOWN
+        row = heading // body.directions
+        tables = body.departures
+        return Departure(x, y, tables.cost[row], tables.excess[row])
+
+    def _should_learn_departure(self) -> bool:
+        """Return whether a table of what the departure costs pays now."""
+        is_unknown = self.known.aim.departure.excess.size == 0
+        return is_unknown and self.visits >= BEFORE_DEPARTURE
+
+    def _learn_departure(self) -> None:
+        """Begin a new round with lower bounds of what the departure costs."""
+        aim = self.known.aim
+        start = pose_space.state_of(aim.start_number, self.world)
+        departure.write_departure(start[2], self.world.body)
+        self._begin_round(aim._replace(departure=self._departure(start)))
 
     def _aim_toward(self, start: State) -> Aim:
         """Return the lower bounds that hold toward a start (x, y, heading)."""

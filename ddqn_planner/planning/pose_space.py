@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place, inlined, specialised
 from ddqn_planner.grid.layers import has_costs, multiplier_at
+from ddqn_planner.planning.departure import Departure, departure_cost
 from ddqn_planner.planning.pose_world import (
     BORDER,
     IMPASSABLE,
@@ -60,6 +61,7 @@ class Aim(NamedTuple):
     middle_height: NDArray[np.float32]
     start_height: float  # of the start's cell
     least_multiplier: float  # of the cells of the map, or less
+    departure: Departure  # from the start, which may lie in another cell
 
 
 class Search(NamedTuple):
@@ -142,8 +144,15 @@ def remaining_cost(x: int, y: int, aim: Any) -> float:
     It is the straight distance between the centres of both cells. If the aim has lower
     bounds from the corners of tiles to the start, a greater one may count: that of a
     corner of the cell's tile, minus the distance from the cell to this corner. Where
-    cells have costs, it is the difference between the heights of both cells.
+    cells have costs, it is the difference between the heights of both cells. The cost
+    without obstacles from the start's heading may be greater than any of these.
     """
+    return max(_cost_of_way(x, y, aim), departure_cost(x, y, aim.departure))
+
+
+@inlined
+def _cost_of_way(x: int, y: int, aim: Any) -> float:
+    """Return a lower bound of the cost between two cells, see `remaining_cost`."""
     if aim.middle_height.size > 0:
         climb: float = height_at(x, y, aim) - aim.start_height
         return climb

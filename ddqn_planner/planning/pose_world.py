@@ -13,6 +13,7 @@ from ddqn_planner.grid.boxes import Box
 from ddqn_planner.grid.layers import Layers, forbids, has_costs, multiplier_at
 from ddqn_planner.grid.map_changes import changed_cells
 from ddqn_planner.grid.moves import ACTION_OF_STEP, STAND
+from ddqn_planner.planning.departure import Departures, make_departures
 from ddqn_planner.robot.directions import CUSP, DirectedMotions, with_directions
 from ddqn_planner.robot.motions import Motions, dense_poses
 
@@ -81,6 +82,7 @@ class Body(NamedTuple):
     # file may count less than the length.
     cost_per_cell: float
     directions: int  # of travel, for each heading of the robot, see `DirectedMotions`
+    departures: Departures  # lower bounds of costs; written as they are needed
     has_origin_inside: bool  # whether all cells that the origin passes must be free
 
 
@@ -203,6 +205,7 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
         reach=reach,
         cost_per_cell=_cost_per_cell(motions),
         directions=directed.directions,
+        departures=make_departures(headings // directed.directions),
         has_origin_inside=bool(masks.core[:, middle, middle].all()),
     )
 

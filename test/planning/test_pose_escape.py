@@ -115,7 +115,7 @@ def cost_with_escape(robot: Robot, grid: GridMap, start: State, goal: State) -> 
     seed=st.integers(0, 2**32 - 1),
 )
 @example(motion="ackermann", seed=1)
-@example(motion="differential", seed=2)
+@example(motion="differential", seed=214)
 def test_a_way_out_touches_what_the_start_covers_and_the_rest_nothing(
     motion: str, seed: int
 ) -> None:

@@ -1,0 +1,182 @@
+"""Lower bounds of costs from a start that know the heading in which a robot leaves."""
+
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ddqn_planner.compiled import in_place, inlined
+from ddqn_planner.planning.queues import Heap, make_heap, pop_from_heap, push_to_heap
+
+REACH: Final = 40  # cells to each side of the start, for which a table has bounds
+SIDE: Final = 2 * REACH + 1
+ROUNDING: Final = 1e-3  # cells: what sums of float32 lose in a table is less
+STATES_AHEAD: Final = (
+    2 * 16**2
+)  # of each cell, for all tables that `write_ahead` writes
+# A square around the start has so many parts, each with a direction to its middle.
+QUARTER: Final = 16
+PARTS: Final = 4 * QUARTER
+
+
+class Departure(NamedTuple):
+    """Lower bounds of the cost from a start, as on a map without obstacles, in cells.
+
+    So a search knows that a robot which faces away from its goal has to turn first.
+    """
+
+    x: int  # of the start
+    y: int
+    # (SIDE, SIDE): to each cell around the start; (0, 0) if nothing is known.
+    cost: NDArray[np.float32]
+    # (PARTS,): the cost to a cell farther away is at least the way along the direction
+    # of its part, plus this.
+    excess: NDArray[np.float64]
+
+
+UNKNOWN: Final = Departure(0, 0, np.empty((0, 0), np.float32), np.empty(0, np.float64))
+
+
+class Departures(NamedTuple):
+    """The tables of a robot's H headings, each written once it is needed."""
+
+    cost: NDArray[np.float32]  # (H, SIDE, SIDE), see `Departure`
+    excess: NDArray[np.float64]  # (H, PARTS): likewise; NaN if not yet written
+
+
+def make_departures(headings: int) -> Departures:
+    """Return the tables of a robot's headings, of which none is written."""
+    return Departures(
+        np.empty((headings, SIDE, SIDE), np.float32),
+        np.full((headings, PARTS), np.nan),
+    )
+
+
+def _directions_of_parts() -> NDArray[np.float64]:
+    """Return a direction of length 1 for each part, (PARTS, 2); see `_part_of`."""
+    turn = (np.arange(PARTS) + 0.5) / QUARTER - 1  # -1 to 3
+    is_right = turn <= 1
+    y = np.where(is_right, turn, 2 - turn)
+    x = np.where(is_right, 1, -1) * (1 - np.abs(y))
+    directions: NDArray[np.float64] = np.column_stack([x, y])
+    directions /= np.hypot(x, y)[:, None]
+    return directions
+
+
+DIRECTIONS: Final = _directions_of_parts()
+
+
+@inlined
+def _part_of(dx: int, dy: int) -> int:
+    """Return in which part of the square around a start a cell lies, not the start."""
+    y = dy / (abs(dx) + abs(dy))
+    turn = y if dx >= 0 else 2 - y
+    return min(int((turn + 1) * QUARTER), PARTS - 1)
+
+
+@inlined
+def departure_cost(x: int, y: int, departure: Any) -> float:
+    """Return a lower bound of the cost from a departure's start to cell (x, y)."""
+    if departure.excess.size == 0:
+        return 0.0
+    dx = x - departure.x
+    dy = y - departure.y
+    if abs(dx) <= REACH and abs(dy) <= REACH:
+        return float(departure.cost[dy + REACH, dx + REACH])
+    part = _part_of(dx, dy)
+    along = DIRECTIONS[part, 0] * dx + DIRECTIONS[part, 1] * dy
+    return float(along + departure.excess[part])
+
+
+def is_written(heading: int, body: Any) -> bool:
+    """Return whether the table of a directed heading of a `Body` is written."""
+    return not np.isnan(body.departures.excess[heading // body.directions, 0])
+
+
+def write_ahead(body: Any) -> None:
+    """Write tables of a `Body` before a request needs them: all for 16 headings.
+
+    Each takes longer where there are more headings, so for these only some are written.
+    """
+    headings = body.angle.size
+    tables = min(STATES_AHEAD // headings, headings // body.directions)
+    for heading in range(0, tables * body.directions, body.directions):
+        if not is_written(heading, body):
+            write_departure(heading, body)
+
+
+def write_departure(heading: int, body: Any) -> None:
+    """Write the table of a directed heading to the departures of a `Body`."""
+    row = heading // body.directions
+    cost_inside = _costs_inside(row * body.directions, body)  # (SIDE, SIDE)
+    y, x = np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1]
+    cells = np.column_stack([x.ravel(), y.ravel()])  # (SIDE * SIDE, 2)
+    along = cells @ DIRECTIONS.T  # (SIDE * SIDE, PARTS)
+    # The last state of a path before it leaves the square lies on the rim. From there
+    # on the path costs no less than its way along any direction.
+    longest = np.abs(body.offset).max()
+    is_on_rim = np.abs(cells).max(axis=1) > REACH - longest
+    from_rim = cost_inside.reshape(-1, 1)[is_on_rim] - along[is_on_rim]
+    excess = from_rim.min(axis=0) - ROUNDING  # (PARTS,)
+    cost_outside = (along + excess).max(axis=1).reshape(SIDE, SIDE)
+    body.departures.cost[row] = np.minimum(cost_inside - ROUNDING, cost_outside)
+    body.departures.excess[row] = excess  # at last: it tells that the table is written
+
+
+def _costs_inside(heading: int, body: Any) -> NDArray[np.float32]:
+    """Return the least cost of paths from a start that stay in the square around it.
+
+    The start is the middle, in the directed heading or in those of the other directions
+    of travel. The result is (SIDE, SIDE), in cells, for any heading at the end.
+    """
+    cost = np.full((SIDE, SIDE, body.angle.size), np.inf, np.float32)
+    # Each state is queued once from each state before it, at most.
+    most_queued = cost.size * int(np.diff(body.first_ending).max())
+    least_cost = np.full((SIDE, SIDE), np.inf, np.float32)
+    _spread(heading, least_cost, cost, make_heap(most_queued), body)
+    return least_cost
+
+
+@in_place
+def _spread(
+    heading: int,
+    least_cost: NDArray[np.float32],
+    cost: NDArray[np.float32],
+    heap: Heap,
+    body: Any,
+) -> None:
+    """Write the least costs from a start by Dijkstra, where there are no obstacles.
+
+    `least_cost` (SIDE, SIDE) and `cost` (SIDE, SIDE, H), for each heading at the end,
+    are infinite at first, and the heap is empty; see `_costs_inside`.
+    """
+    cells_left = least_cost.size  # whose least cost is not known
+    headings = cost.shape[2]
+    for directed in range(heading, heading + body.directions):
+        cost[REACH, REACH, directed] = 0
+        push_to_heap(0, (REACH * SIDE + REACH) * headings + directed, heap)
+    while heap.size[0] > 0 and cells_left > 0:
+        key = heap.keys[0]
+        state = pop_from_heap(heap)
+        cell = state // headings
+        start = state - cell * headings
+        y = cell // SIDE
+        x = cell - y * SIDE
+        if key > cost[y, x, start]:  # it was queued again at a smaller cost
+            continue
+        if least_cost[y, x] == np.inf:
+            least_cost[y, x] = key
+            cells_left -= 1
+        for primitive in range(
+            body.first_starting[start], body.first_starting[start + 1]
+        ):
+            end_x = x + body.offset[primitive, 0]
+            end_y = y + body.offset[primitive, 1]
+            if not (0 <= end_x < SIDE and 0 <= end_y < SIDE):
+                continue
+            end = body.end[primitive]
+            cost_of_end = np.float32(key + body.cost[primitive])
+            if cost_of_end < cost[end_y, end_x, end]:
+                cost[end_y, end_x, end] = cost_of_end
+                number = (end_y * SIDE + end_x) * headings + end
+                push_to_heap(cost_of_end, number, heap)
