@@ -290,7 +290,9 @@ def _roll_out(task: _Task, field: QField) -> Plan | None:
     request = task.request
     task.clock.end_field()  # the time from here on is that of the rollout
     start = task.escape_path[-1] if task.escape_path else request.start
-    outcome = field.greedy_path(start, request.simplified, request.grid.turn_cost)
+    outcome = field.greedy_path(start, request.simplified)
+    if not isinstance(outcome, PlanStatus) and request.grid.turn_cost > 0:
+        outcome = _path_with_turns(outcome, field, request)
     if not isinstance(outcome, PlanStatus):
         return _finished(task, outcome, PlanMethod.GREEDY)
     # The field has looked at the whole map: no path leads from a free start to these
@@ -300,6 +302,36 @@ def _roll_out(task: _Task, field: QField) -> Plan | None:
         return Plan(outcome, move_rule=request.move_rule, field_ms=task.clock.field_ms)
     task.failure = outcome
     return None
+
+
+def _path_with_turns(path: Path, field: QField, request: PlanRequest) -> Path:
+    """Return the path that costs less with its turns: greedy, or of few turns.
+
+    The search for few turns knows only the turns between moves to adjacent cells. Made
+    straight, a path among small obstacles may turn less although its cells turn more.
+
+    Parameters
+    ----------
+    path : (N, 2)
+        The greedy path.
+    field : QField
+    request : PlanRequest
+        Its map has a cost of turning.
+    """
+    grid = request.grid
+    start_x, start_y = path[0].tolist()
+    path_of_few_turns = field.path_of_few_turns((start_x, start_y), grid.turn_cost)
+    if path_of_few_turns is None:
+        return path
+    greedy_cost = cost_along(
+        straightened(path, grid, request.move_rule), grid, request.move_rule
+    )
+    cost_of_few_turns = cost_along(
+        straightened(path_of_few_turns, grid, request.move_rule),
+        grid,
+        request.move_rule,
+    )
+    return path if greedy_cost < cost_of_few_turns else path_of_few_turns
 
 
 def _finished(task: _Task, path: Path, method: PlanMethod) -> Plan:

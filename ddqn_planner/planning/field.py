@@ -145,15 +145,20 @@ class QField(Field[Known]):
             return Plan(outcome, move_rule=self.move_rule)
         return Plan(PlanStatus.SUCCEEDED, outcome, move_rule=self.move_rule)
 
-    def greedy_path(
-        self, start: Cell, straight: bool = False, turn_cost: float = 0.0
-    ) -> Path | PlanStatus:
+    def path_of_few_turns(self, start: Cell, turn_cost: float) -> Path | None:
+        """Return the cells (N, 2) of a path that counts turns; None here.
+
+        See `DistanceField.path_of_few_turns`.
+        """
+        return None
+
+    def greedy_path(self, start: Cell, straight: bool = False) -> Path | PlanStatus:
         """Return the cells (N, 2) of greedy steps from a free cell (x, y) to the goal.
 
         Without a path, return why: ROLLOUT_TRAPPED if a step enters a cell again, as
         the steps would then repeat, or if a cell has no legal step. A start that is no
-        cell of the map is a ValueError. `straight` and `turn_cost` are not used here,
-        see `DistanceField.greedy_path`.
+        cell of the map is a ValueError. `straight` is not used here, see
+        `DistanceField.greedy_path`.
         """
         policy = self.policy  # (H, W): an action, or -1
         cell = cell_inside(start, policy.shape, "the start")
@@ -293,17 +298,13 @@ class DistanceField(QField):
         known = self._known  # None while another thread computes it
         return known is not None and _is_final(known, self._number(*start))
 
-    def greedy_path(
-        self, start: Cell, straight: bool = False, turn_cost: float = 0.0
-    ) -> Path | PlanStatus:
+    def greedy_path(self, start: Cell, straight: bool = False) -> Path | PlanStatus:
         """Return the cells (N, 2) of greedy steps from a start, (x, y), to a goal.
 
         The field grows as far as the start. The result is NO_PATH only if no path leads
         to a goal. Of steps on paths of the same cost, those are taken that stay nearest
         to the straight line from the start to the goal if `straight`, else the first
-        one in the order of actions. Where turning costs something, `turn_cost` per
-        radian, the path costs the least with its turns; the field then grows over all
-        of the map.
+        one in the order of actions.
         """
         start = cell_inside(start, self.grid.occupancy.shape, "the start")
         number = self._number(*start)
@@ -314,14 +315,6 @@ class DistanceField(QField):
             known = self.known
             if known.mark[number] != wavefront.CLOSED:
                 return PlanStatus.NO_PATH
-            if turn_cost > 0:
-                self.grow()
-                known = self.known
-                path_of_few_turns = turns.path_of_few_turns(
-                    known.distance, number, turn_cost, step_costs(self.costs)
-                )
-                if path_of_few_turns is not None:
-                    return path_of_few_turns
             # No move costs less than 1, but sums of costs are rounded.
             most_cells = 2 + int(1.01 * known.distance[number])
             path = np.empty((min(most_cells, known.distance.size), 2), np.int32)
@@ -334,6 +327,30 @@ class DistanceField(QField):
                 step_costs(self.costs),
             )
         return path[:length]
+
+    def path_of_few_turns(self, start: Cell, turn_cost: float) -> Path | None:
+        """Return the path of cells (N, 2) that costs the least with its turns.
+
+        The result is None without a path, or if the search takes too long. The field
+        grows over all of the map.
+
+        Parameters
+        ----------
+        start : (x, y)
+        turn_cost : float
+            Of turning, per radian. Moves to adjacent cells turn by multiples of 45
+            degrees.
+        """
+        start = cell_inside(start, self.grid.occupancy.shape, "the start")
+        number = self._number(*start)
+        with self._lock:
+            self.grow()
+            known = self.known
+            if known.mark[number] != wavefront.CLOSED:
+                return None
+            return turns.path_of_few_turns(
+                known.distance, number, turn_cost, step_costs(self.costs)
+            )
 
     def take_over(
         self,

@@ -11,8 +11,9 @@ from scipy.sparse.csgraph import dijkstra
 from ddqn_planner import GridMap, Planner
 from ddqn_planner.grid import MOVES, Cell
 from ddqn_planner.grid.layers import move_costs
+from ddqn_planner.grid.moves import turning_along
 from ddqn_planner.planning import turns
-from ddqn_planner.planning.segments import cost_along
+from ddqn_planner.planning.segments import cost_along, straightened
 
 
 def least_costs(grid: GridMap, goal: Cell, turn_cost: float) -> NDArray[np.float64]:
@@ -49,14 +50,37 @@ def test_path_with_turns_is_the_best(seed: int) -> None:
     turning = grid.with_layers(turn_cost=turn_cost)
     least = least_costs(grid, (7, 7), turn_cost)
     planner = Planner.load("any_map")
+    field = planner.q_field(turning, (7, 7), "robot_safe")
     for x, y in random.integers((20, 15), size=(12, 2)).tolist():
-        plan = planner.plan(turning, (x, y), (7, 7), "robot_safe")
-        if plan.cells:
-            cost = cost_along(plan.path, turning, "robot_safe")
+        path = field.path_of_few_turns((x, y), turn_cost)
+        if path is not None:
+            cost = cost_along(path, grid, "robot_safe")
+            cost += turn_cost * turning_along(path)
             assert cost == pytest.approx(least[y, x], rel=1e-5)
-            assert not plan.cost or plan.cost == pytest.approx(0.2 * cost)
         else:
             assert np.isinf(least[y, x]) or occupancy[y, x]
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("simplified", [True, False])
+def test_counting_turns_costs_no_more_than_leaving_them_out(
+    seed: int, simplified: bool
+) -> None:
+    random = np.random.default_rng(seed)
+    grid = GridMap(random.random((60, 60)) < 0.05, resolution=0.05)
+    timed = grid.with_times(np.ones((60, 60), np.float32), 0.1)
+    turning = timed.with_layers(turn_cost=random.uniform(2, 90))
+    planner = Planner.load("any_map")
+    for _ in range(5):
+        start, goal = random.permutation(np.argwhere(~grid.occupancy))[:2, ::-1]
+        planned = planner.plan(turning, start, goal, simplified=simplified)
+        greedy = planner.plan(timed, start, goal, simplified=simplified)
+        straight_cost = cost_along(
+            straightened(greedy.path, turning, "robot_safe"), turning, "robot_safe"
+        )
+        assert planned.cost is not None
+        corners = straightened(planned.path, turning, "robot_safe")
+        assert cost_along(corners, turning, "robot_safe") <= straight_cost * (1 + 1e-9)
 
 
 def test_a_search_that_gives_up_leaves_the_cheapest_path(
