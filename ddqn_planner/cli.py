@@ -91,3 +91,7 @@ def _run_command(arguments: Sequence[str]) -> int:
     command = import_module(f"ddqn_planner.commands.{name.replace('-', '_')}")
     code: int = command.run(parsers[name], options)
     return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
