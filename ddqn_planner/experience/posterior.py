@@ -194,23 +194,34 @@ class Posterior:
 
         noise = self._sums(place, places.weight) / np.maximum(visits, LEAST_WEIGHT)
         self.excess = np.sqrt(np.maximum(noise - NOISE, 0))
-        # What was seen at a place tells of those around it, too: a path that passes
-        # beside the place where robots stood has the same wait.
-        passages = self._sums(place, places.passages)
-        waited = self._sums(place, places.waited)
-        known = visits / (1 / VARIANCE + visits)  # the share that was seen
-        around = np.column_stack([known, passages, waited])
-        for _ in range(LINKS_AROUND):
-            around = around + self._tie * (self._links @ around)
-        known_around, passages_around, waited_around = around.T / SUM_AROUND
-        self.unknown = np.sqrt(1 - np.clip(known_around, known, 1))
-        wait = waited_around / (passages_around + ASSUMED_PASSAGES)  # seconds
+        wait = self._update_surroundings(place, places, visits)
         self.slowness = np.exp(self.mean) + self.nominal_speed / self.side * wait
 
         # A change of the fastest moves makes all fields anew.
         self.fastest_log = OPEN_STEP * min(0, round(open_log / OPEN_STEP))
         self.painted = self._paint(np.log(self.slowness) - self.fastest_log)
         self.uncertainty = self.to_cells(self.unknown, occupied=1)
+
+    def _update_surroundings(
+        self, place: Int64, places: Places, visits: Float64
+    ) -> Float64:
+        """Compute how unknown each place is; return the mean seconds of a wait: (P,).
+
+        What was seen at a place tells of those around it, too: a path that passes
+        beside the place where robots stood has the same wait. For the parameters see
+        `update`; `place` is the number of each of `places` on this map, and `visits`
+        (P,) the inverse variance of what was seen.
+        """
+        passages = self._sums(place, places.passages)
+        seconds_waited = self._sums(place, places.waited)
+        share_seen = visits / (1 / VARIANCE + visits)
+        surroundings = np.column_stack([share_seen, passages, seconds_waited])
+        for _ in range(LINKS_AROUND):
+            surroundings = surroundings + self._tie * (self._links @ surroundings)
+        share_nearby, passages_nearby, seconds_nearby = surroundings.T / SUM_AROUND
+        self.unknown = np.sqrt(1 - np.clip(share_nearby, share_seen, 1))
+        mean_wait: Float64 = seconds_nearby / (passages_nearby + ASSUMED_PASSAGES)
+        return mean_wait
 
     def _regression(self, visits: Float64, log: Float64, prior: Float64) -> Float64:
         """Return by how much features of this map raise the log slowness: (FEATURES,).

@@ -319,19 +319,18 @@ def _path_with_turns(path: Path, field: QField, request: PlanRequest) -> Path:
         Its map has a cost of turning.
     """
     grid = request.grid
+    rule = request.move_rule
     start_x, start_y = path[0].tolist()
     path_of_few_turns = field.path_of_few_turns((start_x, start_y), grid.turn_cost)
     if path_of_few_turns is None:
         return path
-    greedy_cost = cost_along(
-        straightened(path, grid, request.move_rule), grid, request.move_rule
-    )
-    cost_of_few_turns = cost_along(
-        straightened(path_of_few_turns, grid, request.move_rule),
-        grid,
-        request.move_rule,
-    )
-    return path if greedy_cost < cost_of_few_turns else path_of_few_turns
+    if not request.simplified:
+        return path_of_few_turns
+    straight_path = straightened(path, grid, rule)
+    straight_path_of_few_turns = straightened(path_of_few_turns, grid, rule)
+    cost = cost_along(straight_path, grid, rule)
+    cost_of_few_turns = cost_along(straight_path_of_few_turns, grid, rule)
+    return path if cost < cost_of_few_turns else path_of_few_turns
 
 
 def _finished(task: _Task, path: Path, method: PlanMethod) -> Plan:

@@ -237,9 +237,9 @@ def cost_of_poses(poses: Float64, grid: GridMap, rates: Rates) -> float:
     """
     path = in_cells(poses, grid)
     path[:, 2] = np.unwrap(path[:, 2])
-    spin_of_others = TURN / grid.resolution
-    of_others = Rates(1.0, 1.0, BEHIND, BEHIND, BEHIND, spin_of_others)
-    rate = Rates(*np.where(np.isfinite(rates), rates, of_others).tolist())
+    usual_spin = TURN / grid.resolution
+    usual_rates = Rates(1.0, 1.0, BEHIND, BEHIND, BEHIND, usual_spin)
+    rate = Rates(*np.where(np.isfinite(rates), rates, usual_rates).tolist())
     steps: Float64 = np.diff(path[:, :2], axis=0)
     dx = steps[:, 0]
     dy = steps[:, 1]

@@ -100,13 +100,12 @@ def straightened(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> Path:
 def cost_along(path: Cells, grid: GridMap, move_rule: MoveRule | str) -> float:
     """Return what a path of segments costs with its turns, legal or not.
 
-    Each cell counts by the share of the segment that lies in it. Turns are those of the
-    path made straight: a robot does not turn at each corner of a path of cells.
+    Each cell counts by the share of the segment that lies in it.
     """
     layers = grid.layers(move_rule)
     cost = float(_segment_costs(path, layers, must_be_legal=False).sum())
     if grid.turn_cost > 0:
-        cost += grid.turn_cost * turning_along(straightened(path, grid, move_rule))
+        cost += grid.turn_cost * turning_along(path)
     return cost
 
 
