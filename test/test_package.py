@@ -84,6 +84,7 @@ def test_a_release_gives_its_version_to_all(tmp_path: Path) -> None:
     for name in ("package.xml", "CITATION.cff"):
         shutil.copy(ROOT / name, copy)
     changes = (ROOT / "CHANGELOG.md").read_text()
+    changes = re.sub(r"(?s)## \[Unreleased\]\n.*?(?=## \[)", "", changes)
     newest = f"## [{VERSION}]"
     changes = changes.replace(newest, f"## [Unreleased]\n\n- It flies.\n\n{newest}", 1)
     (copy / "CHANGELOG.md").write_text(changes)
