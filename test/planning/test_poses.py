@@ -782,11 +782,11 @@ def test_a_robot_that_stands_drives_around_a_box_though_all_else_was_searched() 
 
 
 def test_a_search_under_way_does_not_see_the_map_of_a_later_request() -> None:
-    walled = GridMap(np.zeros((76, 120)), CELL).with_patch(np.ones((64, 2)), 50, 0)
-    closed = walled.with_patch(np.ones((12, 2)), 50, 64)
+    walled = GridMap(np.zeros((152, 240)), CELL).with_patch(np.ones((140, 2)), 100, 0)
+    closed = walled.with_patch(np.ones((12, 2)), 100, 140)
     start, goal, start_of_other, goal_of_other = (
         pose_of(walled, state)
-        for state in ((45, 5, 0), (115, 5, 0), (10, 10, 0), (20, 10, 0))
+        for state in ((90, 5, 0), (230, 5, 0), (10, 10, 0), (20, 10, 0))
     )
     body = planner("differential")
     request = PoseRequest(walled, start, (goal,), bound=1.0, finished=False)
