@@ -84,6 +84,16 @@ class Visits(NamedTuple):
         )
 
 
+class Steps(NamedTuple):
+    """N steps of one length along a path, one after another; all fields are (N,)."""
+
+    x: Float64  # of the middle of each step, metres
+    y: Float64
+    driven: Float64  # seconds that the robot drove
+    waited: Float64  # seconds that it waited there
+    turned: Float64  # seconds that it turned there
+
+
 class Limits(NamedTuple):
     """What of a drive is believed, and what counts as a wait."""
 
@@ -125,23 +135,29 @@ def visits_of(
         _steps_along(spots, moves, turn_seconds, length, limits)
         for spots, moves in paths
     ]
-    steps = np.concatenate([np.zeros((0, 5)), *steps_of_paths])
+    # (5, N): the fields of `Steps` of all paths.
+    columns = np.concatenate([np.zeros((5, 0)), *steps_of_paths], axis=1)
     # A correction of the pose that is too small for a jump may look like a fast move.
-    seconds = steps[:, 2]
-    is_possible = length <= limits.max_speed * seconds
-    is_possible &= length >= limits.min_speed * seconds
-    steps = steps[is_possible]  # (N, 5), see `_steps_along`
+    driven = Steps(*columns).driven
+    is_possible = length <= limits.max_speed * driven
+    is_possible &= length >= limits.min_speed * driven
+    steps = Steps(*columns[:, is_possible])
     # A visit begins where a step lies in another place than the step before it.
-    place = np.floor(steps[:, :2] / side)  # (N, 2): x and y of each place, in sides
-    sums, step_count = _sums_of_runs(steps, place)  # (V, 5) and (V,)
-    position = sums[:, :2] / step_count[:, None]
-    driven, waited, turned = sums[:, 2:].T
+    place = np.floor(np.column_stack([steps.x, steps.y]) / side)  # (N, 2), in sides
+    sums, step_count = _sums_of_runs(np.column_stack(steps), place)  # (V, 5) and (V,)
+    visited = Steps(*sums.T)
+    position = np.column_stack([visited.x, visited.y]) / step_count[:, None]
     ends = np.concatenate([poses.position[:1], poses.position[-1:]])
     from_ends = position[:, None] - ends  # (V, 2, 2) metres
     from_nearest_end = lengths(from_ends).min(axis=1, initial=np.inf)
-    metres = length * step_count
     return Visits(
-        position, metres, driven, waited, turned, from_nearest_end > END, turns
+        position=position,
+        metres=length * step_count,
+        seconds=visited.driven,
+        waited=visited.waited,
+        turned=visited.turned,
+        is_on_way=from_nearest_end > END,
+        turns=turns,
     )
 
 
@@ -167,17 +183,11 @@ def _moves_over(spots: Poses) -> Moves:
 
 def _steps_along(
     spots: Poses, moves: Moves, turn_seconds: float, length: float, limits: Limits
-) -> Float64:
+) -> Steps:
     """Divide the path over S spots into N steps of one `length`, in metres.
 
     A shorter rest at the end is left out. `moves` are those from spot to spot, and
     `turn_seconds` those of turning by one radian.
-
-    Returns
-    -------
-    (N, 5) float64
-        The x and y of the middle of each step in metres, and the seconds in which the
-        robot drove it, waited there and turned there.
     """
     turned = seconds_of_turns(moves, turn_seconds, limits.speed)  # (S - 1,)
     elapsed = moves.seconds - turned
@@ -189,18 +199,24 @@ def _steps_along(
     driven = np.where(is_pause, LEFT_OUT, elapsed - stood)
     # The next segment of the path has the wait.
     waited = np.append(0, np.where(is_pause, 0, stood))[:-1]
-    # (S,) each: from the beginning of the path to each spot.
-    metres_to_spot = sums_up_to(moves.metres)
-    seconds_to_spot = [sums_up_to(seconds) for seconds in (driven, waited, turned)]
-    # (N + 1,): from the beginning of the path to each point between two steps. The
-    # first point is the beginning of the path.
+    metres_to_spot = sums_up_to(moves.metres)  # (S,): from the beginning of the path
+    # (N + 1,): likewise to each point between two steps. The first point is the
+    # beginning of the path.
     metres_to_point = np.arange(0, metres_to_spot[-1], length)
-    columns = [*spots.position.T, *seconds_to_spot]
-    points = np.column_stack(
-        [np.interp(metres_to_point, metres_to_spot, column) for column in columns]
-    )  # (N + 1, 5)
-    middles = (points[1:, :2] + points[:-1, :2]) / 2
-    return np.hstack([middles, np.diff(points[:, 2:], axis=0)])
+
+    def at_points(at_spots: Float64) -> Float64:
+        """Return what is at each of the points, from what is at each of the spots."""
+        return np.interp(metres_to_point, metres_to_spot, at_spots)
+
+    x = at_points(spots.position[:, 0])
+    y = at_points(spots.position[:, 1])
+    return Steps(
+        x=(x[1:] + x[:-1]) / 2,
+        y=(y[1:] + y[:-1]) / 2,
+        driven=np.diff(at_points(sums_up_to(driven))),
+        waited=np.diff(at_points(sums_up_to(waited))),
+        turned=np.diff(at_points(sums_up_to(turned))),
+    )
 
 
 def averaged(poses: Poses, window: float) -> Poses:

@@ -21,7 +21,6 @@ DIGITS = 4  # of a corner's metres, of which messages have about seven in all
 class FootprintSource:
     """Reads ``published_footprint`` in the robot's frame, and tells of its changes."""
 
-    # Costmaps publish the footprint several times per second, where the robot is.
     def __init__(
         self,
         node: BaseNode,
@@ -57,6 +56,7 @@ class FootprintSource:
 
     def _on_message(self, message: PolygonStamped) -> None:
         """Tell of a footprint that has changed, or report why it is refused."""
+        # Costmaps publish the footprint several times per second, where the robot is.
         if not self._is_needed():
             return
         # TF's first messages may come after the first footprints.

@@ -11,9 +11,8 @@ from ddqn_planner.planning.queues import Heap, make_heap, pop_from_heap, push_to
 REACH: Final = 40  # cells to each side of the start, for which a table has bounds
 SIDE: Final = 2 * REACH + 1
 ROUNDING: Final = 1e-3  # cells: what sums of float32 lose in a table is less
-STATES_AHEAD: Final = (
-    2 * 16**2
-)  # of each cell, for all tables that `write_ahead` writes
+# Directed headings of all tables that `write_ahead` writes: 16 tables of 32 of them.
+STATES_AHEAD: Final = 2 * 16**2
 # A square around the start has so many parts, each with a direction to its middle.
 QUARTER: Final = 16
 PARTS: Final = 4 * QUARTER
@@ -111,14 +110,14 @@ def write_departure(heading: int, body: Any) -> None:
     cost_inside = _costs_inside(row * body.directions, body)  # (SIDE, SIDE)
     y, x = np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1]
     cells = np.column_stack([x.ravel(), y.ravel()])  # (SIDE * SIDE, 2)
-    along = cells @ DIRECTIONS.T  # (SIDE * SIDE, PARTS)
+    way_along = cells @ DIRECTIONS.T  # (SIDE * SIDE, PARTS)
     # The last state of a path before it leaves the square lies on the rim. From there
     # on the path costs no less than its way along any direction.
     longest = np.abs(body.offset).max()
     is_on_rim = np.abs(cells).max(axis=1) > REACH - longest
-    from_rim = cost_inside.reshape(-1, 1)[is_on_rim] - along[is_on_rim]
+    from_rim = cost_inside.reshape(-1, 1)[is_on_rim] - way_along[is_on_rim]
     excess = from_rim.min(axis=0) - ROUNDING  # (PARTS,)
-    cost_outside = (along + excess).max(axis=1).reshape(SIDE, SIDE)
+    cost_outside = (way_along + excess).max(axis=1).reshape(SIDE, SIDE)
     body.departures.cost[row] = np.minimum(cost_inside - ROUNDING, cost_outside)
     body.departures.excess[row] = excess  # at last: it tells that the table is written
 

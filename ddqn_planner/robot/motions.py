@@ -394,10 +394,7 @@ def _shifts(heading: int, angles: Float64, radius: float) -> list[Poses]:
         The least radius of the arcs, in cells.
     """
     yaw = float(angles[heading])
-    distance = MAX_SHIFT + math.ceil(radius)
-    coordinates = np.arange(-distance, distance + 1)
-    x, y = np.meshgrid(coordinates, coordinates, indexing="ij")
-    cells = np.column_stack([x.ravel(), y.ravel()])  # (N, 2)
+    cells = _cells_around(MAX_SHIFT + math.ceil(radius))  # (N, 2)
     ahead = cells @ [math.cos(yaw), math.sin(yaw)]  # (N,)
     left = cells @ [-math.sin(yaw), math.cos(yaw)]
     turn = 2 * np.arctan2(left, ahead)  # of the first arc, back by the second
@@ -408,12 +405,26 @@ def _shifts(heading: int, angles: Float64, radius: float) -> list[Poses]:
         lowest, highest = SHARES_OF_TURN
         is_shift = (ahead > 0) & (lowest <= share) & (share <= highest)
         nearest = int(np.where(is_shift & is_wide, ahead, np.inf).argmin())
-        first_turn = float(turn[nearest])
-        arc_radius = float(ahead[nearest]) / (2 * math.sin(abs(first_turn)))
-        first = _arc(np.zeros(2), yaw, first_turn, arc_radius)
-        last = _arc(first[-1, :2], float(first[-1, 2]), -first_turn, arc_radius)
-        shifts.append(np.concatenate([first, last[1:]]))
+        shifts.append(_two_arcs(yaw, float(turn[nearest]), float(ahead[nearest])))
     return shifts
+
+
+def _cells_around(distance: int) -> NDArray[np.int64]:
+    """Return the cells of a square around cell (0, 0), `distance` to each side."""
+    coordinates = np.arange(-distance, distance + 1)
+    x, y = np.meshgrid(coordinates, coordinates, indexing="ij")
+    return np.column_stack([x.ravel(), y.ravel()])
+
+
+def _two_arcs(yaw: float, turn: float, length: float) -> Poses:
+    """Return poses (N, 3) on two arcs, the first by a turn and the second back by it.
+
+    They end `length` cells ahead, along the first `yaw`; angles are in radians.
+    """
+    radius = length / (2 * math.sin(abs(turn)))
+    first = _arc(np.zeros(2), yaw, turn, radius)
+    last = _arc(first[-1, :2], float(first[-1, 2]), -turn, radius)
+    return np.concatenate([first, last[1:]])
 
 
 def _arc(start: Float64, start_yaw: float, turn: float, radius: float) -> Poses:
@@ -465,9 +476,7 @@ def _nearest_end(directions: Float64, min_length: float) -> _Corner:
     # All cells in a square around the origin, which contains the nearest end: sides
     # that are whole numbers of steps end in the centre of a cell.
     max_distance = math.ceil(2 * (min_length + LONGEST_STEP))
-    coordinates = np.arange(-max_distance, max_distance + 1)
-    x, y = np.meshgrid(coordinates, coordinates, indexing="ij")
-    cells = np.column_stack([x.ravel(), y.ravel()])  # (N, 2)
+    cells = _cells_around(max_distance)  # (N, 2)
     # The lengths of the two sides that lead to each cell: directions @ lengths = cells.
     lengths = np.linalg.solve(directions, cells.T)  # (2, N)
     is_possible = (lengths >= min_length - 1e-9).all(axis=0)  # (N,)
