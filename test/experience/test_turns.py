@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ddqn_planner import Experience, GridMap
-from ddqn_planner.experience.turns import turning_of
+from ddqn_planner.experience.turns import Moves, seconds_of_turns, turning_of
 
 Float64 = NDArray[np.float64]
 
@@ -90,3 +90,17 @@ def test_copies_and_files_know_the_turns() -> None:
     other.merge(loaded)
     other.merge(loaded)
     assert other.turn_seconds == experience.turn_seconds
+
+
+@pytest.mark.parametrize(("extra", "turned"), [(5.0, 3.0), (3.0, 3.0), (1.0, 1.0)])
+def test_a_turn_takes_what_turning_takes_and_no_more_than_the_robot_lost(
+    extra: float, turned: float
+) -> None:
+    seconds = np.full(20, 0.2)
+    seconds[9] += extra
+    turning = np.zeros(20)
+    turning[9] = 1.5  # radians
+    moves = Moves(seconds, metres=np.full(20, 0.1), turning=turning)
+    turned_seconds = seconds_of_turns(moves, seconds_per_radian=2.0, speed=0.5)
+    assert turned_seconds[9] == pytest.approx(turned)
+    assert turned_seconds.sum() == pytest.approx(turned)
