@@ -11,7 +11,6 @@ from ddqn_planner.nodes.outcome import PathQuery, Request
 from ddqn_planner.planning import Plan, PlanMethod, PlanStatus, unknown_space
 from ddqn_planner.planning.exact_paths import NO_PATH, ExactPath
 from ddqn_planner.planning.plan import PosePlan, PoseRequest
-from ddqn_planner.planning.pose_paths import ESCAPE_IN_WORDS
 
 THE_START = "the start"  # in errors
 THE_GOAL = "the goal"  # in errors, where there is one goal
@@ -178,8 +177,8 @@ def reason_of_path(request: Request, plan: Plan, path: ExactPath) -> str:
         metres = math.dist(plan.goal, goal_cells[0]) * grid.resolution
         reason += f"; the goal {problem} and moved {metres:.3g} m"
     if isinstance(plan, PosePlan):
-        if plan.escape:
-            reason += f"; {ESCAPE_IN_WORDS}"
+        _, separator, remarks = plan.reason.partition("; ")
+        reason += separator + remarks
     elif grid.is_obstacle(plan.path[0]):
         radius = f"{_clearing_radius(request):.3g} m"
         reason += (
@@ -191,11 +190,12 @@ def reason_of_path(request: Request, plan: Plan, path: ExactPath) -> str:
 def _method_in_words(plan: Plan) -> str:
     """Return in words by which method the path of a plan was found."""
     if isinstance(plan, PosePlan):
-        if math.isinf(plan.bound):  # no field leads from the start: nothing is proved
-            return (
-                "kept, as there is none from the cell and heading nearest to the start"
-            )
-        return f"by greedy steps, of at most {plan.bound:.3g} times the least cost"
+        if not math.isinf(plan.bound):
+            return f"by greedy steps, of at most {plan.bound:.3g} times the least cost"
+        if plan.extra_cost is None:
+            return "of which nothing is proved"
+        # No field leads from the start.
+        return "kept, as there is none from the cell and heading nearest to the start"
     if plan.method is PlanMethod.GREEDY:
         return "by greedy steps"
     return "searched for in the order of the Q field: the greedy steps were trapped"

@@ -36,9 +36,15 @@ from ddqn_planner.planning.pose_curves import (
     YAWS,
     Course,
     Int64,
+    cost_of_curve,
     count_free,
     write_costs,
     write_masks,
+)
+from ddqn_planner.planning.pose_joints import (
+    chain_between,
+    with_exact_goal,
+    with_exact_start,
 )
 from ddqn_planner.planning.pose_paths import (
     BodyPoints,
@@ -46,6 +52,7 @@ from ddqn_planner.planning.pose_paths import (
     PosePath,
     cells_of,
     in_cells,
+    is_free,
     touches,
 )
 from ddqn_planner.planning.pose_world import BORDER, World
@@ -58,6 +65,8 @@ from ddqn_planner.robot.motions import Motions, turn_between
 SLACKS: Final = (1.05, 1.0)
 # Cells that an exact end may cost more than the end in the centre of a cell.
 END_COST: Final = 3.0
+# Besides, an exact goal may cost so many cusps, and the radius of the sharpest bend.
+CUSPS_OF_JOINT: Final = 2
 MAX_FAR: Final = BORDER - 8.0  # cells: masks of a larger body do not fit in the border
 
 
@@ -115,7 +124,13 @@ class Finish:
         return mask
 
     def finished(
-        self, path: PosePath, start: Any, goal: Any, grid: GridMap, world: World
+        self,
+        path: PosePath,
+        start: Any,
+        goal: Any,
+        grid: GridMap,
+        world: World,
+        may_turn_back: bool = True,
     ) -> PosePath:
         """Return a path with exact ends that costs no more than a path of primitives.
 
@@ -128,22 +143,24 @@ class Finish:
         grid : GridMap
         world : World
             The body on it.
+        may_turn_back : bool
+            Whether joints may lead from the start and to the goal, see `pose_joints`.
         """
+        if len(path.poses) == 1 and may_turn_back:
+            return self._in_one_cell(path, start, goal, grid, world)
         if len(path.poses) < 2 or not len(self._words) or self._far > MAX_FAR:
             return path
         course = self.course(world)
         tracks = self._tracks(path, start, goal, grid, course)
-        chain = self._chain(tracks, path.costs - path.costs[0], course)
+        costs = path.costs - path.costs[0]
+        length = float(lengths_of(tracks[PLANNED].poses)[-1])
+        cost_of_cell = float(costs[-1]) / max(length, 1.0)
+        chain = self._chain(tracks, costs, cost_of_cell, course)
         if chain is None:
             return path
-        finished = _path_of(chain, path, grid)
-        # The ends themselves, without the rounding of their way to cells and back.
-        if chain.first_track == FROM_START:
-            finished.poses[0] = start
-        if chain.last_track == TO_GOAL:
-            finished.poses[-1] = goal
-        finished.poses[:, 2] = turn_between(0, finished.poses[:, 2])
-        return finished
+        if may_turn_back:
+            chain = self._with_joints(chain, tracks, cost_of_cell, course)
+        return _path_of(chain, path, np.array([start, goal], np.float64), grid)
 
     def joined(
         self, path: PosePath, start: Any, grid: GridMap, world: World
@@ -158,7 +175,7 @@ class Finish:
         count = int(np.searchsorted(lengths[:-1], NODES_OF_END * NODE_SPACING)) + 1
         head = path.part(0, count)
         joint = head.poses[-1]
-        new_head = self.finished(head, start, joint, grid, world)
+        new_head = self.finished(head, start, joint, grid, world, may_turn_back=False)
         if new_head is head:
             return path
         rest = path.part(count - 1, len(path.poses))
@@ -217,16 +234,77 @@ class Finish:
         write_costs(poses[first:], len(poses) - first, course, costs[first:])
         return Track(poses, costs)
 
+    def _with_joints(
+        self, chain: Chain, tracks: list[Track], cost_of_cell: float, course: Course
+    ) -> Chain:
+        """Return a chain with joints to its exact ends, where it lacks them.
+
+        At the start, a joint costs no more than another exact end: a robot that asks
+        for a path while it drives is not told to turn back for some centimetres.
+        """
+        _, from_start, to_goal = tracks
+        if chain.first_track != FROM_START and math.isfinite(from_start.costs[0]):
+            start = from_start.poses[0]
+            chain = with_exact_start(chain, start, END_COST * cost_of_cell, course)
+        if chain.last_track != TO_GOAL and math.isfinite(to_goal.costs[-1]):
+            goal = to_goal.poses[-1]
+            joint_cost = self.cost_of_joint(cost_of_cell)
+            chain = with_exact_goal(chain, goal, joint_cost, course)
+        return chain
+
+    def cost_of_joint(self, cost_of_cell: float) -> float:
+        """Return what a joint to an exact goal may cost where cells cost so much."""
+        cells = END_COST
+        if math.isfinite(self._radius):
+            cells += self._radius
+        if math.isfinite(self._rates.spin):
+            cells += 2 * math.pi * self._rates.spin
+        return cells * cost_of_cell + CUSPS_OF_JOINT * self._rates.cusp
+
+    def _in_one_cell(
+        self, path: PosePath, start: Any, goal: Any, grid: GridMap, world: World
+    ) -> PosePath:
+        """Return a path from a start to a goal in one cell and one heading.
+
+        `path` is one pose in the middle of the cell. It stays if the body has no room
+        at an end, or if no joint leads from end to end.
+        """
+        exact_ends = np.array([start, goal], np.float64)
+        ends = in_cells(exact_ends, grid)  # (2, 3)
+        ends[1, 2] = ends[0, 2] + turn_between(ends[0, 2], ends[1, 2])
+        if np.abs(ends[1] - ends[0]).max() < SAME_END:
+            is_room = is_free(exact_ends[:1], grid, self._points)
+            return path._replace(poses=exact_ends[:1]) if is_room else path
+        if not len(self._words) or self._far > MAX_FAR:
+            return path
+        course = self.course(world)
+        is_inside_free = not touches(
+            ends, self._points.inside, grid.uninflated.view(np.uint8)
+        )
+        if not is_inside_free or not all(count_free(end[None], course) for end in ends):
+            return path
+        # Of a line of one cell.
+        course.pieces[:] = 0
+        course.pieces[0, 1] = 1
+        cost_of_cell = cost_of_curve(ends[0], 0, course)
+        most_cost = self.cost_of_joint(cost_of_cell)
+        chain = chain_between(ends[0], ends[1], most_cost, course)
+        return path if chain is None else _path_of(chain, path, exact_ends, grid)
+
     def _chain(
-        self, tracks: list[Track], costs: Float64, course: Course
+        self,
+        tracks: list[Track],
+        costs: Float64,
+        cost_of_cell: float,
+        course: Course,
     ) -> Chain | None:
         """Return the best chain that costs no more than the path; None without one.
 
-        `costs` (N,) are those of the path up to each pose, with cusps.
+        `costs` (N,) are those of the path up to each pose, with cusps, and
+        `cost_of_cell` is their mean.
         """
-        planned = tracks[PLANNED]
         cost = float(costs[-1])
-        end_cost = END_COST * cost / max(float(lengths_of(planned.poses)[-1]), 1.0)
+        end_cost = END_COST * cost_of_cell
         for slack in SLACKS:
             chain = best_chain(tracks, costs, Limits(slack, end_cost), course)
             exact_ends = int(chain.first_track == FROM_START) + int(
@@ -267,11 +345,23 @@ def _moved_poses(poses: Float64, number: int, end: Float64) -> Float64:
     return moved
 
 
-def _path_of(chain: Chain, path: PosePath, grid: GridMap) -> PosePath:
-    """Return a chain as a path in the place of the planned path."""
-    yaw = turn_between(0, chain.poses[:, 2] + grid.origin[2])
+def _path_of(
+    chain: Chain, path: PosePath, exact_ends: Float64, grid: GridMap
+) -> PosePath:
+    """Return a chain as a path in the place of the planned path.
+
+    `exact_ends` (2, 3) are the start and the goal in the map's frame.
+    """
+    yaw = chain.poses[:, 2] + grid.origin[2]
+    poses = np.column_stack([grid.centres(chain.poses[:, :2]), yaw])
+    # The ends themselves, without the rounding of their way to cells and back.
+    if chain.first_track == FROM_START:
+        poses[0] = exact_ends[0]
+    if chain.last_track == TO_GOAL:
+        poses[-1] = exact_ends[1]
+    poses[:, 2] = turn_between(0, poses[:, 2])
     return PosePath(
-        poses=np.column_stack([grid.centres(chain.poses[:, :2]), yaw]),
+        poses=poses,
         cells=cells_of(chain.poses),
         costs=chain.costs,
         least_costs=path.least_costs[0] - chain.planned_costs,

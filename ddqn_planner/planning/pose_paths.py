@@ -10,7 +10,7 @@ from ddqn_planner.compiled import in_place
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.layers import multipliers_of
 from ddqn_planner.grid.moves import ACTION_OF_STEP
-from ddqn_planner.planning.plan import PlanStatus, PosePlan
+from ddqn_planner.planning.plan import SAME_POSE, PlanStatus, PosePlan
 from ddqn_planner.planning.pose_world import body_costs
 from ddqn_planner.robot.directions import (
     ON_THE_SPOT,
@@ -32,6 +32,11 @@ SAME: Final = 1 + 1e-6  # what is rounded in sums of float32 is less
 ESCAPE_IN_WORDS: Final = (
     "the start is occupied: cells that the robot's body covers there do not count until"
     " it has left them"
+)
+
+NO_DRIVE: Final = (
+    "start and goal lie in one cell and one heading, and no curve that is free leads"
+    " from one to the other: the path is one pose"
 )
 
 
@@ -139,6 +144,28 @@ def points_of(corners: Float64, resolution: float) -> BodyPoints:
         outline=outline(corners_in_cells, OUTLINE_SPACING),
         inside=lattice[inside(lattice, corners_in_cells)],
     )
+
+
+def ends_in_words(path: PosePath, start: Any, goal: Any) -> str:
+    """Return what to add to a plan's reason if an end of its path is not exact.
+
+    `start` and `goal` are (x, y, yaw) in metres and radians, as the path's poses.
+    """
+    off = np.abs(path.poses[[0, -1]] - (start, goal))  # (2, 3)
+    off[:, 2] = np.abs(turn_between(0, off[:, 2]))
+    is_start_off, is_goal_off = (off.max(axis=1) > SAME_POSE).tolist()
+    if path.escape:
+        is_start_off = False
+    if len(path.poses) == 1 and (is_start_off or is_goal_off):
+        return f"; {NO_DRIVE}"
+    places = []
+    if is_start_off:
+        places.append("begins beside the start")
+    if is_goal_off:
+        places.append("ends beside the goal")
+    if not places:
+        return ""
+    return f"; the path {' and '.join(places)}: no curve that is free leads there"
 
 
 def in_cells(poses: Float64, grid: GridMap) -> Float64:

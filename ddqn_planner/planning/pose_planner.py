@@ -195,34 +195,58 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         if bound == math.inf:
             return PosePlan(PlanStatus.NO_PATH, field_ms=clock.field_ms)
         path = field.rollout(start.state, request.bound, is_proved)
+        remark = ""
         if request.finished:
-            path = self._finished(path, request, start.world)
-            path = path._replace(is_finished=True)
-            field.path = path
+            goal = self._end_of(path, request)
+            path = self._finished(path, goal, request, start.world)
+            remark = paths.ends_in_words(path, request.start, goal)
+            if len(path.poses) > 1:
+                field.path = path
         plan = path.plan(0, grid)
+        plan = replace(plan, reason=plan.reason + remark)
         return replace(plan, field_ms=clock.field_ms, rollout_ms=clock.rollout_ms)
 
-    def _finished(
-        self, path: paths.PosePath, request: PoseRequest, world: World
-    ) -> paths.PosePath:
-        """Return a path that begins and ends exactly where the request says, with room.
+    def _end_of(
+        self, path: paths.PosePath, request: PoseRequest
+    ) -> NDArray[np.float64]:
+        """Return the exact pose (3,) to which a path of primitives should lead.
 
-        A path that ends beside the goal, within its tolerance, ends there. A path out
-        of obstacles stays as it is up to its first free pose.
+        It is the goal in whose cell the path ends, or else the path's last pose: it
+        ends beside the goal, within its tolerance.
         """
-        grid = request.grid
         goals = np.array(request.goals, np.float64)  # (G, 3)
         last_pose = path.poses[-1]
         if request.has_any_heading:
-            goals[:, 2] = last_pose[2]
+            goals[:, 2] = last_pose[2] if len(path.poses) > 1 else request.start[2]
         elif request.either_direction:
             reversed_goals = goals + np.array([0, 0, math.pi])
             goals = np.concatenate([goals, reversed_goals])
-        number = paths.nearest_pose(goals, last_pose, grid, SAME_END)
-        goal = goals[number] if number >= 0 else last_pose
-        if not path.escape:
-            return self._finish.finished(path, request.start, goal, grid, world)
-        return self._finish.finished_after(path.escape, path, goal, grid, world)
+        number = paths.nearest_pose(goals, last_pose, request.grid, SAME_END)
+        if number >= 0:
+            goal: NDArray[np.float64] = goals[number]
+            return goal
+        # A start within the tolerance is not left.
+        return last_pose if len(path.poses) > 1 else np.array(request.start)
+
+    def _finished(
+        self,
+        path: paths.PosePath,
+        goal: NDArray[np.float64],
+        request: PoseRequest,
+        world: World,
+    ) -> paths.PosePath:
+        """Return a path that begins and ends exactly where the request says, with room.
+
+        `goal` (3,) is the exact end. A path out of obstacles stays as it is up to its
+        first free pose.
+        """
+        grid = request.grid
+        start = request.start
+        if path.escape:
+            finished = self._finish.finished_after(path.escape, path, goal, grid, world)
+        else:
+            finished = self._finish.finished(path, start, goal, grid, world)
+        return finished._replace(is_finished=True)
 
     def _reason(self, request: PoseRequest, plan: PosePlan) -> PausingGenerator[str]:
         """Return why there is no path, in words.

@@ -1,0 +1,110 @@
+"""Exact ends where no single curve leads: in tight places, and within one cell."""
+
+import math
+
+import numpy as np
+import pytest
+from bodies import Oracle, occupied_cells
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from planning.test_pose_finish import MOTIONS, ends_off, plan
+from planning.test_poses import BODIES, CELL, planner
+
+from ddqn_planner import GridMap
+from ddqn_planner.planning.path_finder import last_step
+from ddqn_planner.planning.plan import Pose, PoseRequest
+from ddqn_planner.planning.pose_paths import cost_of_poses
+from ddqn_planner.robot.driving_costs import rates_of
+
+SIDE = 60  # cells
+HALL = GridMap(np.zeros((SIDE, SIDE), np.bool_), CELL)
+
+
+def collisions(poses: np.ndarray, grid: GridMap, motion: str) -> int:
+    return Oracle(occupied_cells(grid), BODIES[motion]).collisions(poses)
+
+
+@settings(max_examples=8)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_car_ends_exactly_in_a_bay_a_little_wider_than_itself(seed: int) -> None:
+    """It has some 15 cm on each side, and must arrive up to 10 degrees askew."""
+    random = np.random.default_rng(seed)
+    occupancy = np.zeros((SIDE, SIDE), np.bool_)
+    occupancy[20:41, 40:] = True
+    occupancy[27:34, 40:54] = False  # 70 cm wide and 1.4 m deep
+    grid = GridMap(occupancy, CELL)
+    goal = (
+        4.6 + random.uniform(-0.1, 0.1),
+        3.05 + random.uniform(-0.03, 0.03),
+        random.uniform(-0.17, 0.17),
+    )
+    start = (2.0, random.uniform(2.0, 4.0), random.uniform(-1, 1))
+    body = planner("ackermann")
+    found = plan(body, grid, start, goal, finished=True)
+    assert ends_off(found, start, goal) == (0.0, 0.0)
+    assert collisions(found.poses, grid, "ackermann") == 0
+    cost = cost_of_poses(found.poses, grid, rates_of(body.motions))
+    assert found.cost == pytest.approx(cost, rel=0.01)
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+@pytest.mark.parametrize(
+    "off", [(0.0, 0.03, 0.0), (0.04, 0.0, 0.0), (0.0, 0.0, 0.15), (-0.04, 0.04, -0.15)]
+)
+def test_a_goal_in_the_cell_of_the_start_is_reached(
+    motion: str, off: tuple[float, float, float]
+) -> None:
+    start = (3.05, 3.05, 0.02)
+    goal = tuple(np.add(start, off).tolist())
+    body = planner(motion)
+    found = plan(body, HALL, start, goal, finished=True)
+    assert ends_off(found, start, goal) == (0.0, 0.0)
+    assert collisions(found.poses, HALL, motion) == 0
+    assert found.reason == found.status.value
+    cost = cost_of_poses(found.poses, HALL, rates_of(body.motions))
+    assert found.cost == pytest.approx(cost, rel=0.01)
+    steps = np.hypot(*np.diff(found.poses[:, :2], axis=0).T)
+    assert steps.max() <= 0.51 * CELL
+    if motion == "ackermann":
+        assert steps.min() > 1e-6
+
+
+def test_a_start_that_is_the_goal_is_the_path() -> None:
+    pose = (3.02, 3.04, 0.1)
+    for motion in MOTIONS:
+        found = plan(planner(motion), HALL, pose, pose, finished=True)
+        assert found.poses.tolist() == [list(pose)]
+        assert found.bound == 1
+
+
+def test_a_car_without_room_to_move_aside_stays_and_says_why() -> None:
+    occupancy = np.ones((SIDE, SIDE), np.bool_)
+    occupancy[28:33, 28:35] = False  # 0.5 x 0.7 m: the car has 10 cm on each side
+    grid = GridMap(occupancy, CELL)
+    start: Pose = (3.05, 3.05, 0.0)
+    goal: Pose = (3.05, 3.08, 0.0)
+    found = plan(planner("ackermann"), grid, start, goal, finished=True)
+    assert len(found.poses) == 1
+    assert "start and goal lie in one cell" in found.reason
+
+
+def test_a_goal_without_a_heading_in_the_cell_of_the_start_asks_for_no_turn() -> None:
+    start = (3.05, 3.05, 0.1)
+    body = planner("differential")
+    request = PoseRequest(HALL, start, (start,), tolerance=(0.0, math.pi))
+    found = last_step(body.steps(request))
+    assert found.poses.tolist() == [list(start)]
+
+
+def test_ends_beside_start_and_goal_are_said() -> None:
+    """The corridor has room for the body along it, not askew."""
+    occupancy = np.ones((SIDE, SIDE), np.bool_)
+    occupancy[28:33, 5:55] = False
+    grid = GridMap(occupancy, CELL)
+    start = (1.5, 3.05, 0.35)
+    goal = (4.5, 3.05, -0.35)
+    found = plan(planner("ackermann"), grid, start, goal, finished=True)
+    assert found.reason.endswith(
+        "; the path begins beside the start and ends beside the goal: no curve that is"
+        " free leads there"
+    )
