@@ -62,8 +62,8 @@ def _plan_poses(planner: Planner) -> None:
     """Plan for a body, so that all code of a pose planner is compiled.
 
     A wall divides the map into two rooms. The body plans from one room to the other
-    with the wall, without it, and past an obstacle in its place; then the rest of the
-    last path is computed.
+    with the wall, without it, and past an obstacle in its place, and within one cell;
+    then the rest of the last path is computed.
     """
     assert planner.pose_planner is not None
     resolution = planner.pose_planner.motions.resolution
@@ -75,6 +75,9 @@ def _plan_poses(planner: Planner) -> None:
     start = (0.5 * side * resolution, 0.5 * side * resolution, 0.0)
     goal = (1.5 * side * resolution, 0.5 * side * resolution, 0.0)
     planner.plan_poses(grid, start, goal)
+    # A goal in the cell of the start is reached by a joint.
+    x, y, yaw = start
+    planner.plan_poses(grid, start, (x, y + 0.1 * resolution, yaw))
     # Lower bounds where cells have costs need other code.
     costs = np.ones(walled.shape, np.int8)
     planner.plan_poses(GridMap(walled, resolution, cost=costs), start, goal)
