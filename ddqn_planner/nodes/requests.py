@@ -384,6 +384,8 @@ class Requests:
             start = await self._start_in_map(inputs)
             request = replace(request, start=pose_of(start.message))
             plan = await self._plan(planner, request)
+            if not len(plan.path):
+                return outcome  # the next request says why
         # Reasons of paths name neither the start, here the goal, nor the robot_radius.
         reason = reason_of(request, plan, goal, goal, 0.0)
         return replace(outcome, request=request, plan=plan, reason=reason)

@@ -3,6 +3,8 @@
 import math
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path as FilePath
 from types import SimpleNamespace
 from typing import Any
@@ -84,6 +86,29 @@ def robot(running: Robot) -> Robot:
     return running
 
 
+@contextmanager
+def node_here(
+    model: FilePath, *parameters: str
+) -> Iterator[tuple[PlannerNode, SingleThreadedExecutor]]:
+    """A planner node in this process."""
+    settings = [f"model:={model}", *parameters]
+    rclpy.init(args=["--ros-args", *(it for one in settings for it in ("-p", one))])
+    node = PlannerNode()
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        yield node, executor
+    finally:
+        node.destroy_node()
+        try_shutdown()
+
+
+def result_of(executor: SingleThreadedExecutor, task: Any) -> Any:
+    future = executor.create_task(task)
+    executor.spin_until_future_complete(future, 60)
+    return future.result()
+
+
 def at(robot: Robot, cell: Cell, yaw: float) -> PoseStamped:
     return pose(robot.grid, cell, yaw, offset=0.01)
 
@@ -103,6 +128,19 @@ def check(path: Path, grid: GridMap, goal: Cell, yaw: float) -> np.ndarray:
     assert np.hypot(*np.diff(poses[:, :2], axis=0).T).max() <= CELL / 2 + 1e-6
     assert has_room(path, grid, BODY)
     return poses
+
+
+def at_pose(x: float, y: float, yaw: float) -> PoseStamped:
+    stamped = PoseStamped(header=Header(frame_id="map"))
+    stamped.pose.position.x = x
+    stamped.pose.position.y = y
+    stamped.pose.orientation.z = math.sin(yaw / 2)
+    stamped.pose.orientation.w = math.cos(yaw / 2)
+    return stamped
+
+
+def length_of(poses: np.ndarray) -> float:
+    return float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
 
 
 def has_room(path: Path, grid: GridMap, size: tuple[float, float, float]) -> bool:
@@ -320,32 +358,23 @@ def test_actions_lead_through_poses_and_paths_are_checked(
     model: FilePath, rooms: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The node is asked as its actions ask it, which need nav2_msgs."""
-    rclpy.init(args=["--ros-args", "-p", f"model:={model}"])
-    node, executor, grid = (
-        PlannerNode(),
-        SingleThreadedExecutor(),
-        GridMap(rooms > 0, CELL, ORIGIN),
-    )
+    grid = GridMap(rooms > 0, CELL, ORIGIN)
     start, middle, goal = (
         pose(grid, cell, yaw, 0.01)
         for cell, yaw in ((START, 0.5), (BESIDE, 2.0), (BEYOND, 1.0))
     )
 
-    def run(task: Any) -> Any:
-        future = executor.create_task(task)
-        executor.spin_until_future_complete(future, 60)
-        return future.result()
+    with node_here(model) as (node, executor):
+        run = partial(result_of, executor)
 
-    def is_valid(path: Path) -> bool:
-        answer = run(
-            node.navigation.on_is_path_valid(
-                SimpleNamespace(path=path), SimpleNamespace()
+        def is_valid(path: Path) -> bool:
+            answer = run(
+                node.navigation.on_is_path_valid(
+                    SimpleNamespace(path=path), SimpleNamespace()
+                )
             )
-        )
-        return bool(answer.is_valid)
+            return bool(answer.is_valid)
 
-    try:
-        executor.add_node(node)
         node.map_source.take(map_message(rooms, grid, next(NUMBERS)))
         path, outcome = run(
             node.navigation.plan(PathQuery(start, [middle, goal], ""), lambda: None)
@@ -404,9 +433,48 @@ def test_actions_lead_through_poses_and_paths_are_checked(
         )
         assert outcome.planner is node.model_source.planner
         assert outcome.planner is not former
-    finally:
-        node.destroy_node()
-        try_shutdown()
+
+
+def test_a_better_path_begins_where_the_moved_robot_is(
+    model: FilePath, rooms: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The robot drives on while the node proves what its first path costs."""
+    grid = GridMap(rooms > 0, CELL, ORIGIN)
+    parameters = {
+        "start_source": "odometry",
+        "transform_tolerance": "1000.0",
+        "path_bound": ".inf",
+        "switch_threshold": "0.0",
+        "replan_period": "1000.0",
+    }
+    settings = [f"{name}:={value}" for name, value in parameters.items()]
+    with node_here(model, *settings) as (node, executor):
+        paths: list[np.ndarray] = []
+        node.create_subscription(
+            Path, "plan", lambda path: paths.append(array_of(path)), LATCHED
+        )
+        result_of(executor, node.model_source.wait_until_loaded())
+        planner: Any = node.model_source.planner
+        robot = [at_pose(*grid.cell_to_world(START), 0.5)]
+
+        def steps(request: PoseRequest) -> Any:
+            if request.is_bound_proved and len(robot) == 1:
+                x, y, yaw = paths[0][12].tolist()
+                robot.append(at_pose(x, y + 0.01, yaw))
+                node.poses.receive(robot[1])
+            return Planner.steps(planner, request)
+
+        monkeypatch.setattr(planner, "steps", steps)
+        node.map_source.take(map_message(rooms, grid, next(NUMBERS)))
+        node.poses.receive(robot[0])
+        node._on_goals(pose(grid, BEYOND, 2.1, 0.01))
+        while len(paths) < 2:
+            executor.spin_once(60)
+    first, better = paths
+    x, y, yaw = array_of(Path(poses=robot[1:]))[0]
+    assert math.dist(better[0, :2], (x, y)) < CELL
+    assert math.cos(better[0, 2] - yaw) > math.cos(0.25)
+    assert length_of(better) < length_of(first[12:])
 
 
 def test_the_heading_of_a_single_goal_alone_may_turn(model: FilePath) -> None:
