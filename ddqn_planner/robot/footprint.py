@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Iterator
 from typing import Any, Final
 
 import numpy as np
@@ -24,6 +25,7 @@ MIN_COSINE: Final = 2 / 3
 SMALLEST_COSINE: Final = 1e-3  # of a concave corner, so that it can be divided by
 MAX_DEPTH: Final = 4  # of open brackets, and the text around them
 MARGIN: Final = 0.1  # cells by which the swept cells are those of a larger body
+POINTS_AT_ONCE: Final = 2**14  # of a body at several poses: more leave the cache
 MAX_REACH: Final = 180  # cells that a primitive may sweep to each side
 # By which a reach is longer, at most, as motions end in the centres of cells.
 ROUNDED_CELLS: Final = 10
@@ -481,20 +483,19 @@ def _mark_touched(mask: NDArray[np.bool_], edge: Points, poses: Poses) -> None:
     poses : (N, 3) float64
         x and y in cells from the middle of the mask, yaw in radians.
     """
-    # The cells near a point are those that contain a corner of a square around it.
-    square = MARGIN * np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)])
-    middle = len(mask) // 2
-    x: float
-    y: float
-    yaw: float
-    for x, y, yaw in poses:
-        turned_edge = edge @ _rotation(yaw).T
-        points = turned_edge + np.array([x, y])  # (M, 2)
-        corners: NDArray[np.float64] = points[:, None] + square  # (M, 4, 2)
-        cells = np.rint(corners).astype(np.int64) + middle
-        column = cells[..., 0]
-        row = cells[..., 1]
-        mask[row, column] = True
+    side = len(mask)
+    middle = side // 2 * (side + 1)  # the number of the robot's cell, row by row
+    cells = mask.reshape(-1)
+    for batch in _batches(poses, len(edge)):
+        turned_edge = edge @ _rotations(batch).swapaxes(1, 2)
+        points = turned_edge + batch[:, None, :2]  # (B, M, 2)
+        # The cells near a point are those that contain a corner of a square around it.
+        low = np.rint(points - MARGIN)
+        high = np.rint(points + MARGIN)
+        for row in (low[..., 1], high[..., 1]):
+            for column in (low[..., 0], high[..., 0]):
+                number = (row * side + column).astype(np.int64)
+                cells[middle + number] = True
 
 
 def _mark_covered(mask: NDArray[np.bool_], body: Points, poses: Poses) -> None:
@@ -513,13 +514,23 @@ def _mark_covered(mask: NDArray[np.bool_], body: Points, poses: Poses) -> None:
     coordinates = np.arange(-middle, middle + 1.0)
     # (S * S, 2): the centres of all cells of the mask, from its middle.
     centres = np.stack(np.meshgrid(coordinates, coordinates), axis=-1).reshape(-1, 2)
-    x: float
-    y: float
-    yaw: float
-    for x, y, yaw in poses:
-        from_robot = centres - np.array([x, y])
-        in_robot_frame = from_robot @ _rotation(yaw)  # turned back
-        mask |= inside(in_robot_frame, body).reshape(mask.shape)
+    for batch in _batches(poses, len(centres)):
+        from_robot = centres - batch[:, None, :2]  # (B, S * S, 2)
+        in_robot_frame = from_robot @ _rotations(batch)  # turned back
+        is_inside = inside(in_robot_frame.reshape(-1, 2), body)
+        mask |= is_inside.reshape(-1, *mask.shape).any(axis=0)
+
+
+def _batches(poses: Poses, points: int) -> Iterator[Poses]:
+    """Yield poses (N, 3) in parts for which some points each fit into a cache."""
+    size = max(POINTS_AT_ONCE // points, 1)
+    for first in range(0, len(poses), size):
+        yield poses[first : first + size]
+
+
+def _rotations(poses: Poses) -> NDArray[np.float64]:
+    """Return the matrices (N, 2, 2) that turn a column vector by the yaws of poses."""
+    return np.array([_rotation(yaw) for yaw in poses[:, 2].tolist()])
 
 
 def _rotation(yaw: float) -> NDArray[np.float64]:

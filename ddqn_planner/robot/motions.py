@@ -7,7 +7,6 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -514,16 +513,17 @@ def dense_poses(poses: Poses, spacing: float, lever: float) -> Poses:
     From one pose to the next, a point of the body moves by `spacing` at most, if it
     lies at most `lever` from the robot's origin. Both have the unit of the poses' x, y.
     """
-    parts = [poses[:1]]
-    for pose, next_pose in pairwise(poses):
-        change = next_pose - pose
-        dx, dy, turn = change.tolist()
-        movement = math.hypot(dx, dy) + lever * abs(turn)
-        # A movement that is greater than n spacings by rounding alone takes n steps.
-        steps = max(math.ceil(movement / spacing - 1e-9), 1)
-        shares = np.linspace(0, 1, steps + 1)[1:]  # of the change, without 0
-        parts.append(pose + shares[:, None] * change)
-    return np.concatenate(parts)
+    changes = np.diff(poses, axis=0)  # (N - 1, 3)
+    movement = np.hypot(changes[:, 0], changes[:, 1]) + lever * np.abs(changes[:, 2])
+    # A movement that is greater than n spacings by rounding alone takes n steps.
+    steps = np.maximum(np.ceil(movement / spacing - 1e-9), 1).astype(np.int64)
+    change = np.repeat(np.arange(len(steps)), steps)  # (M - 1,): of each step
+    first_steps = np.cumsum(steps) - steps
+    number = np.arange(len(change)) - first_steps[change] + 1  # 1 to `steps`
+    shares = number * (1 / steps)[change]  # of the change
+    shares[number == steps[change]] = 1
+    between = poses[change] + shares[:, None] * changes[change]
+    return np.concatenate([poses[:1], between])
 
 
 # Lattice files
