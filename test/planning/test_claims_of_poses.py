@@ -190,8 +190,9 @@ def test_the_rest_of_a_cheapest_path_costs_the_least(
     planner: Planner, seed: int
 ) -> None:
     body = fresh(planner)
-    cost = np.random.default_rng(seed).integers(0, 60, (4, 6))
-    grid = obstacles(seed).with_layers(cost=np.kron(cost, np.ones((10, 10), np.int8)))
+    cost = np.random.default_rng(seed).integers(0, 60, (4, 6)).astype(np.int8)
+    blocks = np.kron(cost, np.ones((10, 10), np.int8))
+    grid = obstacles(seed).with_layers(cost=blocks)
     start, goal = (pose_of(body, grid, state) for state in (START_STATE, GOAL_STATE))
     least = true_costs(body, grid, GOAL_STATE)
     path = plan_of_primitives(body, grid, start, goal, bound=1.0)
