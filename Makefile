@@ -65,6 +65,9 @@ $(VENV)/compiled: $(VENV)/full $(wildcard ddqn_planner/*.py ddqn_planner/*/*.py)
 		$(BIN)/ddqn-planner warm-up differential_robot && wait $$first
 	touch $@
 
+# Else each of some 200 processes compiles the modules that it imports.
+test test-fast coverage experiments-test: export PYTHONDONTWRITEBYTECODE :=
+
 test: $(VENV)/compiled
 	$(PYTEST)
 
