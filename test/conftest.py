@@ -1,3 +1,4 @@
+import gc
 import os
 import shutil
 import sys
@@ -68,6 +69,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return rank, slow is not None, -seconds
 
     items.sort(key=order)
+
+
+def pytest_collection_finish() -> None:
+    """Let garbage collections skip what the imported modules hold: 0.3 s each."""
+    gc.freeze()
 
 
 @pytest.hookimpl(optionalhook=True)

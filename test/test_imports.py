@@ -125,7 +125,7 @@ def test_compiling_is_announced_once_and_a_load_from_the_cache_is_not(
 def test_each_process_finds_the_code_that_another_has_kept() -> None:
     code = "from ddqn_planner.training.compiled_learner import evaluate as function;"
     code += "print(function.dispatcher().py_func.__qualname__)"
-    assert len({run(code, PYTHONHASHSEED=seed).stdout for seed in "12345"}) == 1
+    assert len({run(code, PYTHONHASHSEED=seed).stdout for seed in "123"}) == 1
 
 
 def test_without_a_cache_code_is_compiled_all_the_same() -> None:

@@ -137,7 +137,7 @@ def test_missing_matplotlib_is_named(
 
 @pytest.fixture(scope="module", autouse=True)
 def swept_once() -> Iterator[None]:
-    """Each load of a body computes what it sweeps, for half a second: here only one."""
+    """Each load of a body computes what it sweeps: here only one."""
     known: dict[bytes, Any] = {}
 
     def swept_cells(corners: Any, motions: Any) -> Any:

@@ -32,7 +32,8 @@ from ddqn_planner.model import load_model
 from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.nodes.trainer_node import PARAMETERS
 
-ENDLESS = {"steps": 10**9, "filters": 4, "learning_starts": 100}
+# Not at full speed, at which it takes a core from the other tests.
+ENDLESS = {"steps": 10**9, "filters": 4, "learning_starts": 100, "pace": 5000.0}
 START, GOAL = (0, 0), (5, 5)
 NAMESPACE = "/training"  # of the trainer that most tests share
 DEFAULTS = {name: it.default for name, it in PARAMETERS.items() if not it.read_only}
