@@ -24,6 +24,7 @@ from ddqn_planner.nodes.parameters import PLANNER_PARAMETERS
 from ddqn_planner.nodes.quality import LATCHED
 
 AN_INTEGER_FOR_A_DOUBLE = Parameter("map_timeout", value=0).to_parameter_msg()
+NO_MODELS = Parameter("models").to_parameter_msg()
 TOPICS = st.sampled_from(["initialpose", "goal_pose", "goal_poses", "odom"])
 fuzz = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -102,8 +103,13 @@ NAMES = [*PLANNER_PARAMETERS, "use_sim_time"]
 def in_type_of(current: Any, value: Any) -> Any:
     """Return a value that was accepted, as the node keeps it.
 
-    It takes an integer for a double, and a double without a fraction for an integer.
+    It takes an integer for a double, and a double without a fraction for an integer. A
+    list may be one text or no value; empty and repeated texts are left out.
     """
+    if isinstance(current, list):
+        texts = [value] if isinstance(value, str) else value or []
+        stripped = [text.strip() for text in texts]
+        return [*dict.fromkeys(filter(None, stripped))] or [""]
     if type(current) in (int, float) and type(value) in (int, float):
         return type(current)(value)
     return value
@@ -112,6 +118,7 @@ def in_type_of(current: Any, value: Any) -> Any:
 @fuzz
 @given(parameters=some_parameters(NAMES), together=st.booleans())
 @example(parameters=[AN_INTEGER_FOR_A_DOUBLE], together=False)
+@example(parameters=[NO_MODELS], together=False)
 def test_any_parameters_are_answered(
     robot: Robot, parameters: list[Any], together: bool
 ) -> None:
