@@ -40,20 +40,24 @@ NOT_SOURCE = (
 ANY_WORKER = {"test_cli.py", "test_demo.py", "test_plan_command.py"}
 # The files that take longest come first: so the workers end at the same time.
 LONGEST_FILES = (
+    "test_lifecycle.py",
     "test_poses.py",
+    "test_driving.py",
     "test_update.py",
+    "test_planner_robot.py",
+    "test_imports.py",
+    "test_robot_model.py",
+    "test_environment.py",
+    "test_trainer_node.py",
     "test_field.py",
     "test_package.py",
-    "test_imports.py",
-    "test_trainer_node.py",
-    "test_trainer.py",
-    "test_claims_of_poses.py",
-    "test_lifecycle.py",
-    "test_paths.py",
-    "test_driving.py",
-    "test_evidence.py",
-    "test_planner_robot.py",
-    "test_planner.py",
+    "test_planner_node.py",
+    "test_colcon.py",
+    "test_motions.py",
+    "test_robot.py",
+    "test_planner_fuzz.py",
+    "test_any_map.py",
+    "test_training_record.py",
 )
 
 
