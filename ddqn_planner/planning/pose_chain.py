@@ -15,6 +15,7 @@ from ddqn_planner.planning.pose_curves import (
     Course,
     Int64,
     cost_of_curve,
+    half_turn,
     is_curve_free,
     is_in_reverse,
     least_cost_of_curve,
@@ -28,7 +29,11 @@ from ddqn_planner.planning.queues import (
     pop_from_heap,
     push_to_heap,
 )
-from ddqn_planner.robot.directions import cusps_before, directions_of_travel
+from ddqn_planner.robot.directions import (
+    ON_THE_SPOT,
+    cusps_before,
+    directions_of_travel,
+)
 
 # So many steps apart are the poses of a curve that are checked first, before its cost
 # is computed, and then.
@@ -38,19 +43,25 @@ STRIDES: Final = (8, 1)
 NODE_SPACING: Final = 8.0
 # A curve leads from a node to the next one, and to those that are farther and farther:
 # each time by this factor.
-JUMP: Final = 1.35
+JUMP: Final = 1.2
 # The weight of a chain is its cost and so many cells for each radian of a turn, for
-# each curve and each stretch of the path, and for each change between ahead and
-# reverse, if this does not cost more: so that a path turns less, and less often.
-TURN_WEIGHT: Final = 8.0
+# each curve and each stretch of the path, for each change between turns to the left
+# and to the right, and for each change between ahead and reverse, if this does not
+# cost more: so that a path turns less, and less often.
+TURN_WEIGHT: Final = 32.0
 CURVE_WEIGHT: Final = 1.0
-CUSP_WEIGHT: Final = 12.0
+FLIP_WEIGHT: Final = 32.0
+CUSP_WEIGHT: Final = 80.0
+LEAST_RATE: Final = 1 - 1e-3  # of a cell's length, see `is_too_cheap`; rounded
 NODES_OF_END: Final = 12  # at which the path is tried moved to an exact end
 KEPT: Final = -1  # no word: a stretch of the path
 # Which path a node lies on: the planned one, or this moved to the exact start or goal.
 PLANNED, FROM_START, TO_GOAL = 0, 1, 2
 NO_NODE: Final = -1
 FORWARD, REVERSE = 0, 1  # the directions in which a robot drives
+RIGHT, LEFT = 0, 1  # the sides to which it turns
+NO_SIDE: Final = -1  # that of a line
+NO_TURN: Final = 0.01  # radians: a curve that turns less is a line
 
 
 class Track(NamedTuple):
@@ -83,6 +94,25 @@ class Limits(NamedTuple):
     end_cost: float  # besides, of a curve to or from an exact end
 
 
+class Leg(NamedTuple):
+    """A curve, or a stretch of the path, from a node to another."""
+
+    node: int  # to which it leads
+    word: int  # or KEPT
+    direction: int  # FORWARD or REVERSE
+    first_side: int  # of its first turn, or NO_SIDE
+    last_side: int  # of its last turn, or NO_SIDE
+    weight: float
+
+
+class Sides(NamedTuple):
+    """To which sides the stretches of a path turn, from each of G groups on."""
+
+    first: Int64  # (G,): of the first turn, or NO_SIDE
+    last: Int64  # (G,): of the last turn, or NO_SIDE
+    flips: Int64  # (G,): changes between both sides
+
+
 class Nodes(NamedTuple):
     """N poses at which a curve may begin or end, in G groups along the path."""
 
@@ -92,14 +122,18 @@ class Nodes(NamedTuple):
     next_node: Int64  # (N,): of the same path, or NO_NODE
     next_weight: Float64  # (N,): of the stretch to it
     next_direction: Int64  # (N,): in which the robot drives there
+    next_first_side: Int64  # (N,): see `Leg`
+    next_last_side: Int64  # (N,)
     first: Int64  # (G + 1,): where the nodes of each group begin
     cost_before: Float64  # (G,): of the planned path, with cusps
     may_reverse: NDArray[np.bool_]  # (G,): whether the path has a step in reverse there
-    # What is found for a robot that arrives in each direction: the least weight of a
-    # chain to the goal, its next node, and the word to it.
-    value: Float64  # (N, 2)
-    chosen_node: Int64  # (N, 2)
-    chosen_word: Int64  # (N, 2)
+    # What is found for a robot that arrives in each direction and turned last to each
+    # side: the least weight of a chain to the goal, its next node, the word to it, and
+    # the side to which the robot has turned last there.
+    value: Float64  # (N, 2, 2)
+    chosen_node: Int64  # (N, 2, 2)
+    chosen_word: Int64  # (N, 2, 2)
+    chosen_side: Int64  # (N, 2, 2)
 
 
 class Candidates(NamedTuple):
@@ -107,8 +141,10 @@ class Candidates(NamedTuple):
 
     node: Int64  # (M,): to which each leads
     word: Int64  # (M,)
-    weight: Float64  # (M,): of the chain by way of each, up to the goal
-    queue: Heap  # of their numbers
+    first_side: Int64  # (M,): see `Leg`
+    last_side: Int64  # (M,)
+    weight: Float64  # (M,)
+    queue: Heap  # of their numbers, by the weight of the chain up to the goal
 
 
 # Which curves
@@ -125,11 +161,16 @@ def choose(nodes: Any, jumps: Int64, limits: Any, candidates: Any, course: Any) 
     groups = len(nodes.first) - 1
     for group in range(groups - 2, -1, -1):
         for node in range(nodes.first[group], nodes.first[group + 1]):
-            next_node = nodes.next_node[node]
-            if next_node != NO_NODE:
-                direction = nodes.next_direction[node]
-                weight = nodes.next_weight[node] + nodes.value[next_node, direction]
-                _take(nodes, node, next_node, KEPT, direction, weight, course)
+            if nodes.next_node[node] != NO_NODE:
+                stretch = Leg(
+                    nodes.next_node[node],
+                    KEPT,
+                    nodes.next_direction[node],
+                    nodes.next_first_side[node],
+                    nodes.next_last_side[node],
+                    nodes.next_weight[node],
+                )
+                _take(nodes, node, stretch, course)
             for jump in jumps:
                 next_group = group + jump
                 if next_group < groups:
@@ -140,50 +181,73 @@ def choose(nodes: Any, jumps: Int64, limits: Any, candidates: Any, course: Any) 
 
 
 @in_place
-def _take(
-    nodes: Any,
-    node: int,
-    next_node: int,
-    word: int,
-    direction: int,
-    weight: float,
-    course: Any,
-) -> None:
-    """Take a curve or a stretch from a node if it weighs less than what was taken.
+def _weight_by_way(nodes: Any, leg: Any, side: int) -> float:
+    """Return the weight of the chain to the goal that begins with a leg.
 
-    `direction` is that in which the robot drives it, and `weight` that of the chain by
-    way of it, up to the goal.
+    The robot turned last to a side.
     """
+    weight: float = leg.weight
+    last_side = side
+    if leg.first_side != NO_SIDE:
+        last_side = leg.last_side
+        if leg.first_side != side:
+            weight += FLIP_WEIGHT
+    value: float = nodes.value[leg.node, leg.direction, last_side]
+    return weight + value
+
+
+@in_place
+def _gain(nodes: Any, node: int, leg: Any) -> float:
+    """Return by how much a leg makes the chain from a node lighter, at most."""
+    gain = -np.inf
+    for side in range(2):
+        weight = _weight_by_way(nodes, leg, side)
+        gain = max(gain, nodes.value[node, leg.direction, side] - weight)
+    return gain
+
+
+@in_place
+def _take(nodes: Any, node: int, leg: Any, course: Any) -> None:
+    """Take a leg from a node where this weighs less than what was taken."""
     cusp_weight = max(CUSP_WEIGHT, course.rates.cusp)
-    for arrival in range(2):
-        weight_with_cusp = weight + (cusp_weight if arrival != direction else 0.0)
-        if weight_with_cusp < nodes.value[node, arrival]:
-            nodes.value[node, arrival] = weight_with_cusp
-            nodes.chosen_node[node, arrival] = next_node
-            nodes.chosen_word[node, arrival] = word
+    for side in range(2):
+        weight = _weight_by_way(nodes, leg, side)
+        last_side = side if leg.last_side == NO_SIDE else leg.last_side
+        for arrival in range(2):
+            cusps = cusp_weight if arrival != leg.direction else 0.0
+            if weight + cusps < nodes.value[node, arrival, side]:
+                nodes.value[node, arrival, side] = weight + cusps
+                nodes.chosen_node[node, arrival, side] = leg.node
+                nodes.chosen_word[node, arrival, side] = leg.word
+                nodes.chosen_side[node, arrival, side] = last_side
 
 
 @in_place
 def _take_free(nodes: Any, node: int, candidates: Any, course: Any) -> None:
-    """Take the lightest curves from a node with room for the body, one a direction.
+    """Take the lightest curves from a node with room for the body.
 
     The list of candidates is empty then.
     """
     while candidates.queue.size[0] > 0:
         number = pop_from_heap(candidates.queue)
-        next_node = candidates.node[number]
         word = candidates.word[number]
-        direction = REVERSE if is_in_reverse(word) else FORWARD
-        weight = candidates.weight[number]
-        if weight >= nodes.value[node, direction]:
+        curve = Leg(
+            candidates.node[number],
+            word,
+            REVERSE if is_in_reverse(word) else FORWARD,
+            candidates.first_side[number],
+            candidates.last_side[number],
+            candidates.weight[number],
+        )
+        if _gain(nodes, node, curve) <= 0:
             continue
         begin = nodes.pose[node]
-        write_pieces(begin, nodes.pose[next_node], word, course.radius, course.pieces)
+        write_pieces(begin, nodes.pose[curve.node], word, course.radius, course.pieces)
         is_free = True
         for stride in STRIDES:
             is_free = is_free and is_curve_free(begin, word, stride, course)
         if is_free:
-            _take(nodes, node, next_node, word, direction, weight, course)
+            _take(nodes, node, curve, course)
 
 
 @in_place
@@ -210,44 +274,81 @@ def _list_curves(
         for word in course.words:
             if is_in_reverse(word) and not may_reverse:
                 continue
-            weight = _weight_of_chain(
-                nodes, node, next_node, word, greatest_cost, course
-            )
-            if weight < np.inf:
-                number = candidates.queue.size[0]
-                candidates.node[number] = next_node
-                candidates.word[number] = word
-                candidates.weight[number] = weight
-                push_to_heap(weight, number, candidates.queue)
+            curve = _curve_to(nodes, node, next_node, word, greatest_cost, course)
+            if curve.weight == np.inf:
+                continue
+            number = candidates.queue.size[0]
+            candidates.node[number] = next_node
+            candidates.word[number] = word
+            candidates.first_side[number] = curve.first_side
+            candidates.last_side[number] = curve.last_side
+            candidates.weight[number] = curve.weight
+            weight = _weight_by_way(nodes, curve, RIGHT)
+            weight = min(weight, _weight_by_way(nodes, curve, LEFT))
+            push_to_heap(weight, number, candidates.queue)
 
 
 @in_place
-def _weight_of_chain(
+def _curve_to(
     nodes: Any, node: int, next_node: int, word: int, greatest_cost: float, course: Any
-) -> float:
-    """Return the weight of the chain from a node to the goal by way of a curve.
+) -> Any:
+    """Return the curve from a node to another one as a `Leg`, and write its pieces.
 
-    It is infinite if it is no less than that of the chain that was taken, if the curve
-    costs more than `greatest_cost`, or if the body has no room at some of its poses.
+    Its weight is infinite if it makes no chain lighter, if it costs more than
+    `greatest_cost`, or if the body has no room at some of its poses.
     """
     begin = nodes.pose[node]
     end = nodes.pose[next_node]
-    length = write_pieces(begin, end, word, course.radius, course.pieces)
-    if length == np.inf:
-        return np.inf
     direction = REVERSE if is_in_reverse(word) else FORWARD
-    turn = 0.0
-    for piece in range(len(course.pieces)):
-        turn += abs(course.pieces[piece, 0])
-    besides = TURN_WEIGHT * turn + CURVE_WEIGHT + nodes.value[next_node, direction]
-    limit = min(greatest_cost, nodes.value[node, direction] - besides)
-    # The quick looks first.
+    nothing = Leg(next_node, word, direction, NO_SIDE, NO_SIDE, np.inf)
+    # The quickest look: no curve costs less than a line, or turns less than the yaw.
+    dx = end[0] - begin[0]
+    dy = end[1] - begin[1]
+    weight = CURVE_WEIGHT + TURN_WEIGHT * abs(half_turn(end[2] - begin[2]))
+    line = Leg(next_node, word, direction, NO_SIDE, NO_SIDE, weight)
+    limit = min(greatest_cost, _gain(nodes, node, line))
+    if limit < 0 or LEAST_RATE**2 * (dx * dx + dy * dy) > limit * limit:
+        return nothing
+    if write_pieces(begin, end, word, course.radius, course.pieces) == np.inf:
+        return nothing
+    curve = _curve_without_cost(next_node, word, course.pieces)
+    limit = min(greatest_cost, _gain(nodes, node, curve))
     if least_cost_of_curve(word, course) > limit:
-        return np.inf
+        return nothing
     if not is_curve_free(begin, word, FIRST_STRIDE, course):
-        return np.inf
+        return nothing
     cost = cost_of_curve(begin, word, course)
-    return cost + besides if cost <= limit else np.inf
+    if cost > limit:
+        return nothing
+    return Leg(
+        next_node,
+        word,
+        direction,
+        curve.first_side,
+        curve.last_side,
+        curve.weight + cost,
+    )
+
+
+@in_place
+def _curve_without_cost(node: int, word: int, pieces: Float64) -> Any:
+    """Return the curve of three pieces to a node, as a `Leg` that weighs its turns."""
+    weight = CURVE_WEIGHT
+    first_side = NO_SIDE
+    last_side = NO_SIDE
+    for piece in range(len(pieces)):
+        turn = pieces[piece, 0]
+        weight += TURN_WEIGHT * abs(turn)
+        if abs(turn) < NO_TURN:
+            continue
+        side = LEFT if turn > 0 else RIGHT
+        if first_side == NO_SIDE:
+            first_side = side
+        elif last_side != side:
+            weight += FLIP_WEIGHT
+        last_side = side
+    direction = REVERSE if is_in_reverse(word) else FORWARD
+    return Leg(node, word, direction, first_side, last_side, weight)
 
 
 # From Python
@@ -280,6 +381,8 @@ def best_chain(
     candidates = Candidates(
         node=np.empty(most_curves, np.int64),
         word=np.empty(most_curves, np.int64),
+        first_side=np.empty(most_curves, np.int64),
+        last_side=np.empty(most_curves, np.int64),
         weight=np.empty(most_curves),
         queue=make_heap(most_curves),
     )
@@ -304,11 +407,13 @@ def _nodes_of(tracks: list[Track], planned_costs: Float64) -> Nodes:
     group, path = np.nonzero(has_node.T)
     node_number = np.full((len(tracks), len(indices) + 1), NO_NODE)
     node_number[path, group] = np.arange(len(path))
-    weights = _weights_of_stretches(planned.poses[:, 2], indices, costs)  # (T, G)
+    yaw = planned.poses[:, 2]
+    sides = _sides_of_stretches(yaw, indices)
+    weights = _weights_of_stretches(yaw, indices, costs, sides.flips)  # (T, G)
     is_after = np.append(is_behind, is_behind[-1])[indices]  # (G,)
     is_before = is_behind[np.maximum(indices - 1, 0)]
     poses = np.array([track.poses[indices] for track in tracks])  # (T, G, 3)
-    shape = len(path), 2
+    shape = len(path), 2, 2
     return Nodes(
         pose=poses[path, group],
         path=path,
@@ -316,16 +421,44 @@ def _nodes_of(tracks: list[Track], planned_costs: Float64) -> Nodes:
         next_node=node_number[path, group + 1],
         next_weight=weights[path, group],
         next_direction=np.where(is_after, REVERSE, FORWARD)[group],
+        next_first_side=sides.first[group],
+        next_last_side=sides.last[group],
         first=np.append(0, np.cumsum(has_node.sum(axis=0))),
         cost_before=planned_costs[indices],
         may_reverse=is_before | is_after,
         value=np.full(shape, np.inf),
         chosen_node=np.full(shape, NO_NODE),
         chosen_word=np.full(shape, KEPT),
+        chosen_side=np.full(shape, NO_SIDE),
     )
 
 
-def _weights_of_stretches(yaw: Float64, indices: Int64, costs: Float64) -> Float64:
+def _sides_of_stretches(yaw: Float64, indices: Int64) -> Sides:
+    """Return to which sides a path turns from each group of nodes to the next.
+
+    For yaw (N,) and indices (G,), see `_weights_of_stretches`.
+    """
+    turns = np.diff(yaw)
+    turning_steps = np.flatnonzero(np.abs(turns) > ON_THE_SPOT)  # (K,)
+    side = np.where(turns[turning_steps] > 0, LEFT, RIGHT)
+    is_flip = np.diff(side, prepend=side[:1]) != 0
+    flips_before = np.cumsum(is_flip)  # (K,)
+    # Of each stretch, the numbers of its first and last steps that turn.
+    first = np.searchsorted(turning_steps, indices)
+    last = np.append(first[1:], 0) - 1
+    turning = np.flatnonzero(last >= first)  # stretches
+    first_side = np.full(len(indices), NO_SIDE)
+    last_side = np.full(len(indices), NO_SIDE)
+    flips = np.zeros(len(indices), np.int64)
+    first_side[turning] = side[first[turning]]
+    last_side[turning] = side[last[turning]]
+    flips[turning] = flips_before[last[turning]] - flips_before[first[turning]]
+    return Sides(first_side, last_side, flips)
+
+
+def _weights_of_stretches(
+    yaw: Float64, indices: Int64, costs: Float64, flips: Int64
+) -> Float64:
     """Return the weight of the stretch from each group of nodes to the next: (T, G).
 
     It is 0 where there is no such stretch.
@@ -338,13 +471,16 @@ def _weights_of_stretches(yaw: Float64, indices: Int64, costs: Float64) -> Float
         Of the pose of each group.
     costs : (T, G)
         Of each track up to there, or infinite.
+    flips : (G,)
+        Of each stretch.
     """
     turns = np.abs(np.diff(yaw, prepend=yaw[0]))  # (N,): before each pose
     turn = np.diff(np.cumsum(turns)[indices])  # (G - 1,)
     known_costs = np.where(np.isfinite(costs), costs, np.nan)
     cost = np.diff(known_costs, axis=1)  # (T, G - 1)
     weights = np.zeros(costs.shape)
-    weights[:, :-1] = np.nan_to_num(cost + TURN_WEIGHT * turn + CURVE_WEIGHT)
+    besides = TURN_WEIGHT * turn + FLIP_WEIGHT * flips[:-1] + CURVE_WEIGHT
+    weights[:, :-1] = np.nan_to_num(cost + besides)
     return weights
 
 
@@ -386,7 +522,7 @@ def _best_start(nodes: Nodes, price: float) -> int:
     starts = np.arange(nodes.first[1])
     starts = starts[nodes.path[starts] != TO_GOAL]
     prices = np.where(nodes.path[starts] == PLANNED, price, 0.0)
-    values = nodes.value[starts].min(axis=1)
+    values = nodes.value[starts].min(axis=(1, 2))
     return int(starts[np.argmin(values + prices)])
 
 
@@ -409,14 +545,15 @@ def _follow(
     `planned_costs` (N,) are those of the planned path up to each pose, with cusps.
     """
     node = first
-    direction = int(np.argmin(nodes.value[first]))
+    direction, side = divmod(int(np.argmin(nodes.value[first])), 2)
     cost = 0.0
     poses = [nodes.pose[first][None]]
     costs = [np.zeros(1)]
     replaced_costs = [np.zeros(1)]
-    while nodes.chosen_node[node, direction] != NO_NODE:
-        next_node = int(nodes.chosen_node[node, direction])
-        word = int(nodes.chosen_word[node, direction])
+    while nodes.chosen_node[node, direction, side] != NO_NODE:
+        next_node = int(nodes.chosen_node[node, direction, side])
+        word = int(nodes.chosen_word[node, direction, side])
+        side = int(nodes.chosen_side[node, direction, side])
         begin = int(nodes.pose_index[node])
         end = int(nodes.pose_index[next_node])
         if word == KEPT:

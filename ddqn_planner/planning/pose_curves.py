@@ -200,7 +200,7 @@ def _whole_turn(angle: float) -> float:
 
 
 @in_place
-def _half_turn(angle: float) -> float:
+def half_turn(angle: float) -> float:
     """Return an angle from -pi to pi."""
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
@@ -216,9 +216,9 @@ def _write_line_between_turns(
     if word == SPIN_BEHIND:
         yaw += math.pi
     distance = math.sqrt(dx * dx + dy * dy)
-    pieces[0] = (_half_turn(yaw - begin[2]), 0.0)
+    pieces[0] = (half_turn(yaw - begin[2]), 0.0)
     pieces[1] = (0.0, distance)
-    pieces[2] = (_half_turn(end[2] - yaw), 0.0)
+    pieces[2] = (half_turn(end[2] - yaw), 0.0)
     return distance
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bodies import Oracle, occupied_cells
+from bodies import Oracle, occupied_cells, shape_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from planning.test_poses import BODIES, CELL, planner, robot
@@ -95,6 +95,23 @@ def test_a_finished_path_is_free_and_no_worse(
         if motion == "ackermann":
             assert not ((turn > 1e-6) & (length <= 1e-6)).any()
         assert length.max() <= 0.51
+
+
+def test_a_car_s_path_through_an_empty_hall_bends_in_one_s_at_most() -> None:
+    """As a shortest path between two poses that are far apart does."""
+    random = np.random.default_rng(2)
+    hall = GridMap(np.zeros((240, 240), np.bool_), 0.05)
+    body = Planner.load("car").pose_planner
+    assert body is not None
+    for _ in range(8):
+        yaws = random.uniform(-math.pi, math.pi, 2).tolist()
+        y, goal_y = random.uniform(4, 8, 2).tolist()
+        start, goal = (3.5, y, yaws[0]), (8.5, goal_y, yaws[1])
+        path = plan(body, hall, start, goal, finished=True)
+        shape = shape_of(path.poses, start, goal)
+        metres = path.driven * hall.resolution
+        assert round(shape.flips * metres / 10) <= 1
+        assert shape.cusps == 0
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
