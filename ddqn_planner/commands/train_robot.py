@@ -13,7 +13,11 @@ from ddqn_planner.grid.arguments import as_whole
 from ddqn_planner.model import save_model
 from ddqn_planner.model.model_file import check_model_path
 from ddqn_planner.robot.body_certificate import BodyCertificate
-from ddqn_planner.robot.driving_costs import CUSP_METRES, DrivingCosts
+from ddqn_planner.robot.driving_costs import (
+    CUSP_METRES,
+    SPIN_METRES,
+    DrivingCosts,
+)
 from ddqn_planner.robot.motions import BEHIND, HEADINGS
 from ddqn_planner.training.robot import (
     MOST_STEPS,
@@ -56,7 +60,7 @@ OPTIONS = (
         "bend-cost",
         float,
         None,
-        "of a metre in a bend, in metres driven straight ahead: by default 1.05, or "
+        "of a metre in a bend, in metres driven straight ahead: by default 1.15, or "
         "what the lattice says",
     ),
     Option("reverse-cost", float, BEHIND, "of a metre in reverse or sideways"),
@@ -65,6 +69,9 @@ OPTIONS = (
         float,
         CUSP_METRES,
         "of a change between ahead and reverse, in metres",
+    ),
+    Option(
+        "spin-cost", float, SPIN_METRES, "of a turn by a radian on the spot, in metres"
     ),
     Option("out", Path, "my_robot.safetensors", "the model's file"),
     Option("seed", int, 0, "seed of the training"),
@@ -93,7 +100,12 @@ def run(parser: ArgumentParser, arguments: Sequence[str]) -> int:
             options.headings,
             options.lattice,
             options.allow_reverse,
-            DrivingCosts(options.bend_cost, options.reverse_cost, options.cusp_cost),
+            DrivingCosts(
+                options.bend_cost,
+                options.reverse_cost,
+                options.cusp_cost,
+                options.spin_cost,
+            ),
         )
     )
     trainer = RobotTrainer(options.footprint, motions, options.seed, options.padding)

@@ -1,4 +1,4 @@
-"""What it costs a robot to drive: in bends, in reverse, and where it changes direction.
+"""What it costs a robot to drive: in bends, in reverse, on the spot, and at cusps.
 
 All costs are those of so many cells driven straight ahead.
 """
@@ -11,12 +11,19 @@ import numpy as np
 
 from ddqn_planner.grid.arguments import as_number
 from ddqn_planner.robot.directions import AHEAD, ON_THE_SPOT
-from ddqn_planner.robot.motions import BEHIND, MIN_COST, Motions, Poses
+from ddqn_planner.robot.motions import BEHIND, MIN_COST, TURN, Motions, Poses
 
-BEND: Final = 1.05  # cost of a metre in a bend: without it, paths of least cost slalom
-CUSP_METRES: Final = 1.0  # 2 s at 0.5 m/s
+# Metres driven straight ahead that cost as much as a metre in a bend: without it, paths
+# of least cost slalom.
+BEND: Final = 1.15
+# As a radian on the spot: 1.5 s at 0.5 m/s.
+SPIN_METRES: Final = 0.75
+# As a cusp: 4 s at 0.5 m/s, in which a car stops, turns its wheels from one side to the
+# other, and drives off.
+CUSP_METRES: Final = 2.0
 MAX_FACTOR: Final = 100.0
 MAX_CUSP: Final = 1000.0  # metres
+MAX_SPIN: Final = TURN * MAX_FACTOR  # metres for a radian
 
 
 class DrivingCosts(NamedTuple):
@@ -27,6 +34,7 @@ class DrivingCosts(NamedTuple):
     bend: float | None = None
     reverse: float = BEHIND  # of a metre in reverse or sideways, in metres
     cusp: float = CUSP_METRES  # of a change between ahead and reverse, in metres
+    spin: float = SPIN_METRES  # of a radian on the spot, in metres
 
 
 class Rates(NamedTuple):
@@ -67,6 +75,8 @@ def with_costs(motions: Motions, costs: DrivingCosts, is_lattice: bool) -> Motio
     )
     cusp_range = f"metres driven ahead, 0 to {MAX_CUSP:g}"
     cusp = as_number("the cost of a cusp", costs.cusp, 0, MAX_CUSP, cusp_range)
+    spin_range = f"metres driven ahead, {TURN:g} to {MAX_SPIN:g}"
+    spin = as_number("the cost of turns", costs.spin, TURN, MAX_SPIN, spin_range)
     kinds = [primitive.kind for primitive in _rates_of_primitives(motions)]
     factors = {
         "ahead": 1.0,
@@ -74,7 +84,7 @@ def with_costs(motions: Motions, costs: DrivingCosts, is_lattice: bool) -> Motio
         "behind": reverse / BEHIND,
         "bend_behind": bend * reverse / BEHIND,
         "aside": reverse / BEHIND,
-        "spin": 1.0,
+        "spin": spin / TURN,
     }
     factor = np.array([factors[kind] for kind in kinds])  # (P,)
     cusp_in_cells = cusp / motions.resolution

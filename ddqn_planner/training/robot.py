@@ -13,7 +13,12 @@ from ddqn_planner.grid.arguments import as_seed, as_whole
 from ddqn_planner.model import ModelMetadata, RobotNetwork
 from ddqn_planner.planning import Planner
 from ddqn_planner.robot.body_certificate import BodyCertificate
-from ddqn_planner.robot.driving_costs import CUSP_METRES, DrivingCosts, with_costs
+from ddqn_planner.robot.driving_costs import (
+    CUSP_METRES,
+    SPIN_METRES,
+    DrivingCosts,
+    with_costs,
+)
 from ddqn_planner.robot.footprint import read_footprint
 from ddqn_planner.robot.motions import (
     BEHIND,
@@ -422,6 +427,7 @@ def train_robot(  # noqa: PLR0913
     bend_cost: float | None = None,
     reverse_cost: float = BEHIND,
     cusp_cost: float = CUSP_METRES,
+    spin_cost: float = SPIN_METRES,
     seed: int = 0,
     steps: int = ROBOT.steps,
 ) -> Planner:
@@ -450,12 +456,14 @@ def train_robot(  # noqa: PLR0913
         Metres by which the body counts as larger: room for a controller.
     bend_cost : float, optional
         Of a metre in a bend, in metres driven straight ahead: 1 or more, by default
-        1.05. A lattice's bends cost what its file says, unless a number is given.
+        1.15. A lattice's bends cost what its file says, unless a number is given.
     reverse_cost : float
         Of a metre in reverse or sideways, likewise.
     cusp_cost : float
         Of a change between ahead and reverse, in metres: as far as the robot drives in
         the time that the change takes. With 0, a request takes less time.
+    spin_cost : float
+        Of a turn by one radian on the spot, in metres: 0.5 or more.
     seed : int
         Of all random draws: 0 to 2^63 - 1.
     steps : int
@@ -475,7 +483,7 @@ def train_robot(  # noqa: PLR0913
     >>> planner.plan_poses(grid, start=(1, 1, 0), goal=(5, 3, 0)).status.name
     'SUCCEEDED'
     """
-    costs = DrivingCosts(bend_cost, reverse_cost, cusp_cost)
+    costs = DrivingCosts(bend_cost, reverse_cost, cusp_cost, spin_cost)
     options = MotionOptions(
         motion, turning_radius, resolution, headings, lattice, costs=costs
     )

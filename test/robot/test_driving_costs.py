@@ -26,23 +26,23 @@ def motions_of(motion: str, **costs: Any) -> Motions:
 def test_each_kind_of_drive_costs_what_is_given(motion: str) -> None:
     plain = rates_of(make_motions(motion, 0.5, CELL))
     assert (plain.ahead, plain.bend_ahead, plain.behind) == pytest.approx((1, 1, 2))
-    rates = rates_of(motions_of(motion, bend=1.2, reverse=3, cusp=0.7))
+    rates = rates_of(motions_of(motion, bend=1.2, reverse=3, cusp=0.7, spin=0.6))
     assert rates.ahead == pytest.approx(1)
     assert rates.bend_ahead == pytest.approx(1.2)
     assert (rates.behind, rates.bend_behind) == pytest.approx((3, 3.6))
-    assert rates.spin == plain.spin
+    assert rates.spin == pytest.approx(1.2 * plain.spin)  # 0.6 and 0.5 m a radian
     assert rates.cusp == pytest.approx(7)  # cells of 0.1 m
     assert rates.aside == pytest.approx(3 if motion == "omnidirectional" else np.inf)
 
 
-def test_by_default_bends_and_cusps_cost_something_and_those_of_lattices_do_not() -> (
+def test_by_default_bends_and_cusps_cost_something_and_bends_of_lattices_do_not() -> (
     None
 ):
     made = make_motions("ackermann", 0.5, CELL)
-    assert rates_of(motions_of("ackermann")).bend_ahead == pytest.approx(1.05)
+    assert rates_of(motions_of("ackermann")).bend_ahead == pytest.approx(1.15)
     of_lattice = with_costs(made, DrivingCosts(), is_lattice=True)
     assert np.array_equal(of_lattice.cost, made.cost)
-    assert rates_of(of_lattice).cusp == pytest.approx(10)
+    assert rates_of(of_lattice).cusp == pytest.approx(20)
     given = with_costs(made, DrivingCosts(bend=1.3), is_lattice=True)
     assert rates_of(given).bend_ahead == pytest.approx(1.3)
 
@@ -54,6 +54,7 @@ def test_by_default_bends_and_cusps_cost_something_and_those_of_lattices_do_not(
         ({"reverse": 0}, "the cost of reverse is 0; .*1 to 100"),
         ({"cusp": -1}, "the cost of a cusp is -1; .*metres"),
         ({"cusp": float("nan")}, "the cost of a cusp is nan"),
+        ({"spin": 0.4}, "the cost of turns is 0.4; .*0.5 to 50"),
         ({"bend": "much"}, "the cost of bends is 'much'"),
     ],
 )
