@@ -88,8 +88,16 @@ class FootprintSource:
         if frame == robot_frame:
             return poses[:, :2]
         if not frame or not self._frames.available:
+            remedy = REMEDY if frame else ""
             problem = f"its frame is {frame!r}"
-            raise ValueError(f"{problem}; publish it in {robot_frame!r}{REMEDY}")
+            raise ValueError(f"{problem}; publish it in {robot_frame!r}{remedy}")
+        farthest = float(np.abs(poses).max(initial=0.0))
+        spacing = float(np.spacing(np.float32(farthest)))  # of the numbers in messages
+        if spacing > TOLERANCE / 2:
+            raise ValueError(
+                f"it is {farthest:.0f} m from the origin of its frame {frame!r}, where"
+                f" messages round to {spacing:.2g} m; publish it in {robot_frame!r}"
+            )
         try:
             transform = self._frames.transform_at(message.header, robot_frame)
         except ValueError:

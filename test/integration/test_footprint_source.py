@@ -101,6 +101,7 @@ def test_a_footprint_is_told_once_wherever_the_robot_is(
     for wrong, reason in (
         (message(FOOTPRINT, ""), "its frame is ''; publish it in 'base_link'"),
         (message(FOOTPRINT, "map", second=8), "no transform leads there"),
+        (message(FOOTPRINT + 5e5, "map"), "where messages round to 0.031 m; publish"),
         (message(FOOTPRINT[:2], "base_link"), "fewer than three"),
         (message(FOOTPRINT * np.nan, "base_link"), "no numbers from"),
         (message(FOOTPRINT[[0, 2, 1, 3]], "base_link"), "sides of the footprint"),
