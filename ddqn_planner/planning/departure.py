@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place, inlined
 from ddqn_planner.planning.queues import Heap, make_heap, pop_from_heap, push_to_heap
+from ddqn_planner.robot.motions import Motions
 
 REACH: Final = 40  # cells to each side of the start, for which a table has bounds
 SIDE: Final = 2 * REACH + 1
@@ -16,6 +17,8 @@ STATES_AHEAD: Final = 2 * 16**2
 # A square around the start has so many parts, each with a direction to its middle.
 QUARTER: Final = 16
 PARTS: Final = 4 * QUARTER
+PER_CELL: Final = 2  # steps of `Departure.turn` per cell
+MOST_STEPS: Final = 255
 
 
 class Departure(NamedTuple):
@@ -31,23 +34,31 @@ class Departure(NamedTuple):
     # (PARTS,): the cost to a cell farther away is at least the way along the direction
     # of its part, plus this.
     excess: NDArray[np.float64]
+    # (SIDE, SIDE, H): what it costs more to arrive in a directed heading than in the
+    # best one, in steps of a half cell.
+    turn: NDArray[np.uint8]
 
 
-UNKNOWN: Final = Departure(0, 0, np.empty((0, 0), np.float32), np.empty(0, np.float64))
+NO_COST: Final = np.empty((0, 0), np.float32)
+NO_EXCESS: Final = np.empty(0, np.float64)
+NO_TURN: Final = np.empty((0, 0, 0), np.uint8)
+UNKNOWN: Final = Departure(0, 0, NO_COST, NO_EXCESS, NO_TURN)
 
 
 class Departures(NamedTuple):
-    """The tables of a robot's H headings, each written once it is needed."""
+    """The tables of a robot's R headings, each written once it is needed."""
 
-    cost: NDArray[np.float32]  # (H, SIDE, SIDE), see `Departure`
-    excess: NDArray[np.float64]  # (H, PARTS): likewise; NaN if not yet written
+    cost: NDArray[np.float32]  # (R, SIDE, SIDE), see `Departure`
+    excess: NDArray[np.float64]  # (R, PARTS): likewise; NaN if not yet written
+    turn: NDArray[np.uint8]  # (R, SIDE, SIDE, H): likewise
 
 
-def make_departures(headings: int) -> Departures:
+def make_departures(headings: int, directions: int) -> Departures:
     """Return the tables of a robot's headings, of which none is written."""
     return Departures(
         np.empty((headings, SIDE, SIDE), np.float32),
         np.full((headings, PARTS), np.nan),
+        np.empty((headings, SIDE, SIDE, headings * directions), np.uint8),
     )
 
 
@@ -66,8 +77,8 @@ DIRECTIONS: Final = _directions_of_parts()
 
 
 @inlined
-def _part_of(dx: int, dy: int) -> int:
-    """Return in which part of the square around a start a cell lies, not the start."""
+def part_of(dx: Any, dy: Any) -> int:
+    """Return in which part of the square around a start a point lies, not the start."""
     y = dy / (abs(dx) + abs(dy))
     turn = y if dx >= 0 else 2 - y
     return min(int((turn + 1) * QUARTER), PARTS - 1)
@@ -82,9 +93,40 @@ def departure_cost(x: int, y: int, departure: Any) -> float:
     dy = y - departure.y
     if abs(dx) <= REACH and abs(dy) <= REACH:
         return float(departure.cost[dy + REACH, dx + REACH])
-    part = _part_of(dx, dy)
+    part = part_of(dx, dy)
     along = DIRECTIONS[part, 0] * dx + DIRECTIONS[part, 1] * dy
     return float(along + departure.excess[part])
+
+
+@inlined
+def turn_at_arrival(dx: int, dy: int, heading: int, departure: Any) -> float:
+    """Return what it costs more to arrive in a heading than in the best one.
+
+    The cell lies (dx, dy) from the start, within the table.
+    """
+    return float(departure.turn[dy + REACH, dx + REACH, heading]) / PER_CELL
+
+
+def turns_at_arrival(motions: Motions) -> NDArray[np.float32]:
+    """Return what it costs more to arrive in a heading than in the best one.
+
+    The result is (PARTS, H), for a long way in the direction of each part, on a map
+    without obstacles. `motions` have H headings.
+    """
+    way_along = DIRECTIONS @ motions.offset.T  # (PARTS, P)
+    order = np.argsort(motions.end, kind="stable")
+    ends, first = np.unique(motions.end[order], return_index=True)  # (E,) each
+    # What each primitive costs more than its way along the direction.
+    excess = (motions.cost - way_along)[:, order]  # (PARTS, P)
+    starts = motions.start[order]
+    costs = np.zeros((PARTS, motions.headings))
+    # Any turn takes no more primitives than there are headings.
+    for _ in range(motions.headings):
+        costs_by_primitive = costs[:, starts] + excess
+        costs[:, ends] = np.minimum.reduceat(costs_by_primitive, first, axis=1)
+    least = costs.min(axis=1, keepdims=True)
+    turn: NDArray[np.float32] = (costs - least).astype(np.float32)
+    return turn
 
 
 def is_written(heading: int, body: Any) -> bool:
@@ -107,7 +149,8 @@ def write_ahead(body: Any) -> None:
 def write_departure(heading: int, body: Any) -> None:
     """Write the table of a directed heading to the departures of a `Body`."""
     row = heading // body.directions
-    cost_inside = _costs_inside(row * body.directions, body)  # (SIDE, SIDE)
+    costs = _costs_inside(row * body.directions, body)  # (SIDE, SIDE, H)
+    cost_inside = costs.min(axis=2)
     y, x = np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1]
     cells = np.column_stack([x.ravel(), y.ravel()])  # (SIDE * SIDE, 2)
     way_along = cells @ DIRECTIONS.T  # (SIDE * SIDE, PARTS)
@@ -118,7 +161,10 @@ def write_departure(heading: int, body: Any) -> None:
     from_rim = cost_inside.reshape(-1, 1)[is_on_rim] - way_along[is_on_rim]
     excess = from_rim.min(axis=0) - ROUNDING  # (PARTS,)
     cost_outside = (way_along + excess).max(axis=1).reshape(SIDE, SIDE)
-    body.departures.cost[row] = np.minimum(cost_inside - ROUNDING, cost_outside)
+    least_cost = np.minimum(cost_inside - ROUNDING, cost_outside)
+    steps = (costs - least_cost[:, :, None]) * PER_CELL
+    body.departures.cost[row] = least_cost
+    body.departures.turn[row] = np.minimum(steps, MOST_STEPS)
     body.departures.excess[row] = excess  # at last: it tells that the table is written
 
 
@@ -126,35 +172,27 @@ def _costs_inside(heading: int, body: Any) -> NDArray[np.float32]:
     """Return the least cost of paths from a start that stay in the square around it.
 
     The start is the middle, in the directed heading or in those of the other directions
-    of travel. The result is (SIDE, SIDE), in cells, for any heading at the end.
+    of travel. The result is (SIDE, SIDE, H), in cells, by the heading at the end.
     """
     cost = np.full((SIDE, SIDE, body.angle.size), np.inf, np.float32)
     # Each state is queued once from each state before it, at most.
     most_queued = cost.size * int(np.diff(body.first_ending).max())
-    least_cost = np.full((SIDE, SIDE), np.inf, np.float32)
-    _spread(heading, least_cost, cost, make_heap(most_queued), body)
-    return least_cost
+    _spread(heading, cost, make_heap(most_queued), body)
+    return cost
 
 
 @in_place
-def _spread(
-    heading: int,
-    least_cost: NDArray[np.float32],
-    cost: NDArray[np.float32],
-    heap: Heap,
-    body: Any,
-) -> None:
+def _spread(heading: int, cost: NDArray[np.float32], heap: Heap, body: Any) -> None:
     """Write the least costs from a start by Dijkstra, where there are no obstacles.
 
-    `least_cost` (SIDE, SIDE) and `cost` (SIDE, SIDE, H), for each heading at the end,
-    are infinite at first, and the heap is empty; see `_costs_inside`.
+    `cost` (SIDE, SIDE, H) is infinite at first, and the heap is empty; see
+    `_costs_inside`.
     """
-    cells_left = least_cost.size  # whose least cost is not known
     headings = cost.shape[2]
     for directed in range(heading, heading + body.directions):
         cost[REACH, REACH, directed] = 0
         push_to_heap(0, (REACH * SIDE + REACH) * headings + directed, heap)
-    while heap.size[0] > 0 and cells_left > 0:
+    while heap.size[0] > 0:
         key = heap.keys[0]
         state = pop_from_heap(heap)
         cell = state // headings
@@ -163,9 +201,6 @@ def _spread(
         x = cell - y * SIDE
         if key > cost[y, x, start]:  # it was queued again at a smaller cost
             continue
-        if least_cost[y, x] == np.inf:
-            least_cost[y, x] = key
-            cells_left -= 1
         for primitive in range(
             body.first_starting[start], body.first_starting[start + 1]
         ):

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 import mmap
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.layers import has_costs
-from ddqn_planner.planning import departure, pose_space, wavefront
+from ddqn_planner.planning import departure, pose_guide, pose_space, wavefront
 from ddqn_planner.planning.departure import Departure
 from ddqn_planner.planning.field_cache import Field
+from ddqn_planner.planning.pose_guide import NO_GUIDE, Guide
 from ddqn_planner.planning.pose_paths import SAME, PosePath, cells_of
 from ddqn_planner.planning.pose_space import Aim, Search, height_at
 from ddqn_planner.planning.pose_world import (
@@ -53,6 +54,7 @@ NOWHERE = Aim(
     start_height=0.0,
     least_multiplier=1.0,
     departure=departure.UNKNOWN,
+    guide=NO_GUIDE,
 )
 NO_MULTIPLIERS = np.empty((0, 0), np.float32)
 # What sums of float32 lose is less.
@@ -64,6 +66,8 @@ ANY_PATH = 1e6
 GREEDY_EXPONENT = 1.5
 # Likewise where a first path is enough: it costs some 0.5 % more.
 EAGER_EXPONENT = 2.5
+# The weight of estimates of costs: mostly neither too low nor too high.
+WEIGHT_OF_GUIDE = 1.4
 
 
 def _untouched(count: int, dtype: DTypeLike) -> NDArray[Any]:
@@ -74,6 +78,13 @@ def _untouched(count: int, dtype: DTypeLike) -> NDArray[Any]:
     memory = mmap.mmap(-1, size, flags=flags)
     memory.madvise(mmap.MADV_NOHUGEPAGE)
     return np.frombuffer(memory, dtype)
+
+
+class _GoalTiles(NamedTuple):
+    """The tiles in which goals lie."""
+
+    is_goal: NDArray[np.bool_]  # by row and column
+    box: NDArray[np.int64]  # (4,): the least column and row, and the greatest
 
 
 class PoseField(Field[Search]):
@@ -168,7 +179,9 @@ class PoseField(Field[Search]):
         finite_bound = min(bound, ANY_PATH)
         with self._lock:
             exponent = GREEDY_EXPONENT if is_bound_proved else EAGER_EXPONENT
-            self._aim_at(start, weight=finite_bound**exponent)
+            weight = finite_bound**exponent
+            has_guide = self._has_costs() and not is_bound_proved and weight > 1
+            self._aim_at(start, weight, has_guide)
             visits_left = limit
             while not self._is_enough(finite_bound, is_bound_proved):
                 if visits_left <= 0:
@@ -188,10 +201,11 @@ class PoseField(Field[Search]):
             has_path = _cost_from_start(self.known) < math.inf
             return min(self._proved_bound(), ANY_PATH) if has_path else math.inf
 
-    def _aim_at(self, start: State, weight: float) -> None:
+    def _aim_at(self, start: State, weight: float, has_guide: bool) -> None:
         """Begin the first round of A* toward a start, unless the field aims at it.
 
         The start is (x, y, heading), and the weight that of the round's lower bound.
+        With a guide, estimates count instead, where there may be a path.
         """
         aim = self.known.aim
         number = int(pose_space.number_of_state(*start, self.world))
@@ -199,21 +213,44 @@ class PoseField(Field[Search]):
             return
         self.visits = 0
         self._leads_on = False
-        self._begin_round(
-            self._aim_toward(start)._replace(
-                start_number=number, weight=weight, departure=self._departure(start)
-            )
+        aim = self._aim_toward(start)._replace(
+            start_number=number,
+            weight=weight,
+            departure=self._departure(start),
+            guide=NO_GUIDE,
         )
+        self._begin_round(self._with_guide(aim) if has_guide else aim)
+
+    def _with_guide(self, aim: Aim) -> Aim:
+        """Return an aim with estimates, if these lead from the start to a goal."""
+        shape = self.world.nearness.shape  # (R, C): of tiles
+        cost = _untouched(math.prod(shape), np.float32).reshape(shape)
+        guide = Guide(cost, self.world.body.turn)
+        aim_with_guide = aim._replace(guide=guide, weight=WEIGHT_OF_GUIDE)
+        search = self.known._replace(aim=aim_with_guide)
+        goals = self._goal_tiles(SHIFT, shape)
+        heap = make_heap(9 + 4 * cost.size)  # mostly no tile is queued again
+        pose_guide.write_guide(search, heap, goals.is_goal, goals.box)
+        return aim_with_guide if cost[goals.is_goal].any() else aim
+
+    def _goal_tiles(self, shift: int, shape: tuple[int, ...]) -> _GoalTiles:
+        """Return in which tiles of 2**shift cells a side the goals lie."""
+        tiles = self.goals[:, :2] >> shift  # (G, 2): the tile of each goal
+        x = tiles[:, 0]
+        y = tiles[:, 1]
+        is_goal = np.zeros(shape, np.bool_)
+        is_goal[y, x] = True
+        return _GoalTiles(is_goal, np.array([x.min(), y.min(), x.max(), y.max()]))
 
     def _departure(self, start: State) -> Departure:
         """Return the lower bounds of what a departure from a start costs, if known."""
         x, y, heading = start
         body = self.world.body
         if not departure.is_written(heading, body):
-            return departure.UNKNOWN
+            return departure.UNKNOWN._replace(x=x, y=y)
         row = heading // body.directions
         tables = body.departures
-        return Departure(x, y, tables.cost[row], tables.excess[row])
+        return Departure(x, y, tables.cost[row], tables.excess[row], tables.turn[row])
 
     def _should_learn_departure(self) -> bool:
         """Return whether a table of what the departure costs pays now."""
@@ -225,7 +262,8 @@ class PoseField(Field[Search]):
         aim = self.known.aim
         start = pose_space.state_of(aim.start_number, self.world)
         departure.write_departure(start[2], self.world.body)
-        self._begin_round(aim._replace(departure=self._departure(start)))
+        aim = aim._replace(departure=self._departure(start))
+        self._begin_round(self._with_guide(aim) if self._is_guided() else aim)
 
     def _aim_toward(self, start: State) -> Aim:
         """Return the lower bounds that hold toward a start (x, y, heading)."""
@@ -288,8 +326,15 @@ class PoseField(Field[Search]):
         """Return whether the lower bounds are toward the start itself."""
         return self.known.aim.start_height == 0
 
+    def _is_guided(self) -> bool:
+        """Return whether estimates order the states of this round."""
+        return self.known.aim.guide.cost.size > 0
+
     def _next_shift(self) -> int:
         """Return the shift of the tiles at which the next look is."""
+        is_first_look = self.known.aim.corner_bound.size == 0
+        if is_first_look and self._is_guided():
+            return SHIFT  # what the guide has found out of these tiles is known
         return self.known.aim.shift - 1 if self._is_rooted() else COARSEST_SHIFT
 
     def _next_look(self) -> Aim:
@@ -311,6 +356,8 @@ class PoseField(Field[Search]):
         first look pays.
         """
         shift = self._next_shift()  # the next look is at tiles of 2**shift cells a side
+        if self._is_guided() and self.visits < UNGUIDED:
+            return False
         if self._has_costs():
             tiles = (self.world.height >> shift) * (self.world.width >> shift)
             return shift >= FINEST_SHIFT and tiles <= TILES_PER_VISIT * self.visits
@@ -349,8 +396,18 @@ class PoseField(Field[Search]):
             # Either the round is over, and A* itself follows; or the heap is full: then
             # the same round begins again, with a larger heap.
             is_over = progress.reason == DONE
-            self._begin_round(aim._replace(weight=1.0) if is_over else aim)
+            self._begin_round(self._next_aim() if is_over else aim)
         return progress.visits
+
+    def _next_aim(self) -> Aim:
+        """Return the aim of the round after this one: A* itself, by lower bounds.
+
+        A guide proves nothing: if there was no look at the map yet, now there is one.
+        """
+        aim = self.known.aim
+        if self._is_guided() and aim.corner_bound.size == 0:
+            aim = self._next_look()
+        return aim._replace(weight=1.0, guide=NO_GUIDE)
 
     def _proved_bound(self) -> float:
         """Return the proved ratio of the cost of the known path to the least cost.
@@ -412,17 +469,12 @@ class PoseField(Field[Search]):
                 middle_height=np.empty((rows, columns), np.float32),
                 least_multiplier=max(least, 1.0),
             )
-        goal_tiles = self.goals[:, :2] >> shift  # (G, 2): the tile of each goal
-        goal_x = goal_tiles[:, 0]
-        goal_y = goal_tiles[:, 1]
-        is_goal = np.zeros(corner_bound.shape, np.bool_)
-        is_goal[goal_y, goal_x] = True
-        box = np.array([goal_x.min(), goal_y.min(), goal_x.max(), goal_y.max()])
+        goals = self._goal_tiles(shift, corner_bound.shape)
         # Room for the 4 corners of the start's tile, and for 8 neighbours that each
         # corner queues.
         heap = make_heap(4 + 8 * corner_bound.size)
         search = self.known._replace(aim=aim_with_look, heap=heap)
-        pose_space.write_corner_bounds(search, multipliers, passability, is_goal, box)
+        pose_space.write_corner_bounds(search, multipliers, passability, *goals)
         return aim_with_look
 
     def _multipliers_of_tiles(self, shift: int) -> NDArray[np.float32]:

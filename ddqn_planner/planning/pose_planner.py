@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,7 @@ from ddqn_planner.planning.pose_escape import is_drivable, poses_of_escape
 from ddqn_planner.planning.pose_field import PoseField, may_escape
 from ddqn_planner.planning.pose_finish import Finish
 from ddqn_planner.planning.pose_world import (
+    Body,
     State,
     World,
     body_of,
@@ -56,6 +58,10 @@ SAME_END = 1.0, 0.5
 BESIDE_PATH = 1.0, math.pi / 8
 
 
+# Planners with one network share a body, and so the tables of departures.
+_bodies: WeakKeyDictionary[RobotNetwork, Body] = WeakKeyDictionary()
+
+
 class _Start(NamedTuple):
     """The state in which a path begins, and the body on the map from there on."""
 
@@ -72,7 +78,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         self._network = network
         self.motions = network.motions
         self.footprint = network.footprint
-        self.body = body_of(network.motions, network.swept())
+        self.body = body_of_network(network)
         self.points = paths.points_of(self.footprint, self.motions.resolution)
         # A start so near to a pose of a path, in cells and radians, lies on that path.
         self._on_path = 0.5, math.pi / self.motions.headings
@@ -707,6 +713,15 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         world = world_of(grid, self.body, older_world, changed)
         self._map = grid, world
         return world
+
+
+def body_of_network(network: RobotNetwork) -> Body:
+    """Return the body of a network, the same for all planners."""
+    body = _bodies.get(network)
+    if body is None:
+        body = body_of(network.motions, network.swept())
+        _bodies[network] = body
+    return body
 
 
 def _reason_of_places(places: Sequence[str], grid: GridMap, has_start: bool) -> str:

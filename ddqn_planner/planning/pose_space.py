@@ -9,21 +9,17 @@ from numpy.typing import NDArray
 from ddqn_planner.compiled import in_place, inlined, specialised
 from ddqn_planner.grid.layers import has_costs, multiplier_at
 from ddqn_planner.planning.departure import Departure, departure_cost
+from ddqn_planner.planning.pose_guide import Guide, estimated_cost
 from ddqn_planner.planning.pose_world import (
-    BORDER,
-    IMPASSABLE,
-    LAST_BIT,
-    ONE,
-    PASSABLE,
     SHIFT,
     TILE,
-    UNSEEN,
-    WORD,
     State,
     World,
     cost_of_primitive,
     has_room,
     is_inside,
+    is_occupied,
+    is_passable,
     stands_on_obstacle,
 )
 from ddqn_planner.planning.queues import (
@@ -62,6 +58,7 @@ class Aim(NamedTuple):
     start_height: float  # of the start's cell
     least_multiplier: float  # of the cells of the map, or less
     departure: Departure  # from the start, which may lie in another cell
+    guide: Guide  # estimates that order a first search, instead of lower bounds
 
 
 class Search(NamedTuple):
@@ -151,6 +148,20 @@ def remaining_cost(x: int, y: int, aim: Any) -> float:
 
 
 @inlined
+def key_of(x: int, y: int, heading: int, cost: float, search: Any) -> Any:
+    """Return the key of a state in the queue, by the cost from there to a goal.
+
+    With weighted A*, estimates count if the aim has some.
+    """
+    aim = search.aim
+    if aim.weight > 1 and aim.guide.cost.size > 0:
+        rest = estimated_cost(x, y, heading, aim, search.world)
+    else:
+        rest = remaining_cost(x, y, aim)
+    return cost + aim.weight * rest
+
+
+@inlined
 def _cost_of_way(x: int, y: int, aim: Any) -> float:
     """Return a lower bound of the cost between two cells, see `remaining_cost`."""
     if aim.middle_height.size > 0:
@@ -228,11 +239,11 @@ def queue_open_states(search: Search, tiles: NDArray[np.int64]) -> float:
         for number in range(first, first_in_tile(tile + 1, search.world)):
             if OPEN <= search.mark[number] <= WAITING:
                 search.mark[number] = OPEN
-                x, y, _ = state_of(number, search.world)
+                x, y, heading = state_of(number, search.world)
                 cost = search.distance[number]
-                remaining = remaining_cost(x, y, aim)
-                push_to_heap(cost + aim.weight * remaining, number, search.heap)
-                lower_bound = min(lower_bound, cost + remaining)
+                key = key_of(x, y, heading, cost, search)
+                push_to_heap(key, number, search.heap)
+                lower_bound = min(lower_bound, cost + remaining_cost(x, y, aim))
     return lower_bound
 
 
@@ -287,7 +298,7 @@ def _expand_pose(number: int, distance: Any, mark: Any, heap: Any, search: Any) 
             continue
         mark[previous] = OPEN
         search.touched[tile_of(previous, world)] = True
-        key = cost + aim.weight * remaining_cost(begin_x, begin_y, aim)
+        key = key_of(begin_x, begin_y, body.start[primitive], cost, search)
         push_to_heap(key, previous, heap)
 
 
@@ -557,8 +568,8 @@ def take_back(search: Search, tiles: NDArray[np.int64], limit: Any) -> None:
             if new_cost < np.inf:
                 mark[number] = OPEN
                 distance[number] = new_cost
-                x, y, _ = state_of(number, world)
-                key = new_cost + search.aim.weight * remaining_cost(x, y, search.aim)
+                x, y, heading = state_of(number, world)
+                key = key_of(x, y, heading, new_cost, search)
                 push_to_heap(key, number, search.heap)
 
 
@@ -575,79 +586,6 @@ STRAIGHT, DIAGONAL = 5, 7
 HEIGHT_SHARE: Final = 0.99
 FURTHER: Final = 1.2  # times the path to the nearest goal, beyond which none is sought
 LONGER: Final = math.sqrt(1 + (DIAGONAL / STRAIGHT - 1) ** 2)
-
-
-@inlined
-def may_pass(x: int, y: int, world: Any) -> bool:
-    """Return whether the origin of the body may lie in cell (x, y).
-
-    It may if the body has room to stand there with some heading, or has room for a
-    primitive that leads the origin through the cell.
-    """
-    body = world.body
-    # The core of some primitives is what all of them sweep around each cell that the
-    # origin passes: with an occupied cell in the core, none of them leads through.
-    if not has_room(x, y, body.common_core_mask, world):
-        return False
-    # The masks of heading h have the numbers of those of heading 0, plus h.
-    for heading in range(body.angle.size):
-        if has_room(x, y, body.standing_mask + heading, world):
-            return True
-        if not has_room(x, y, body.core_mask + heading, world):
-            continue
-        # The primitives that start with this heading.
-        first = body.first_starting[heading]
-        for primitive in range(first, body.first_starting[heading + 1]):
-            if _may_lead_through(x, y, primitive, world):
-                return True
-    return False
-
-
-@inlined
-def _may_lead_through(x: int, y: int, primitive: int, world: Any) -> bool:
-    """Return whether the body has room for a primitive whose origin passes (x, y).
-
-    The primitive may begin in several cells: (x, y) may be any cell that it passes.
-    """
-    body = world.body
-    # The rows of `passed_cells` of this primitive: cells from the one where it begins.
-    for place in range(body.first_passed[primitive], body.first_passed[primitive + 1]):
-        begin_x = x - body.passed_cells[place, 0]
-        begin_y = y - body.passed_cells[place, 1]
-        is_begin_inside = is_inside(begin_x, begin_y, world)
-        if is_begin_inside and has_room(begin_x, begin_y, primitive, world):
-            return True
-    return False
-
-
-@inlined
-def is_passable(
-    row: int, column: int, shift: int, passability: Any, world: Any
-) -> bool:
-    """Return whether the origin of the body may pass any cell of a tile.
-
-    Parameters
-    ----------
-    row, column : int
-        Of the tile, counted in tiles.
-    shift : int
-        A tile has 2**shift cells along a side.
-    passability : (rows, columns) uint8
-        UNSEEN, PASSABLE or IMPASSABLE for each tile. An unseen tile is looked at, and
-        what is found is written.
-    world : World
-        The body on the map.
-    """
-    if passability[row, column] == UNSEEN:
-        # Impassable, as long as no cell was found that may be passed. After the first
-        # such cell, no other cell is judged.
-        passability[row, column] = IMPASSABLE
-        for y in range(row << shift, min((row + 1) << shift, world.height)):
-            for x in range(column << shift, min((column + 1) << shift, world.width)):
-                has_no_cell = passability[row, column] == IMPASSABLE
-                if has_no_cell and may_pass(x, y, world):
-                    passability[row, column] = PASSABLE
-    return bool(passability[row, column] == PASSABLE)
 
 
 @inlined
@@ -700,10 +638,7 @@ def write_least_multipliers(multipliers: NDArray[np.float32], world: World) -> N
     one_float32 = np.float32(1)  # has the type in which primitives count multipliers
     for y in range(world.height):
         for x in range(world.width):
-            column = np.uint64(x + BORDER)
-            bits = world.occupied_bits[y + BORDER, column // WORD]
-            is_occupied = (bits >> (column & LAST_BIT)) & ONE
-            if is_occupied and world.body.has_origin_inside:
+            if is_occupied(x, y, world) and world.body.has_origin_inside:
                 continue
             multiplier = multiplier_at(x, y, one_float32, world.layers)
             if multiplier < multipliers[y >> 1, x >> 1]:

@@ -13,7 +13,11 @@ from ddqn_planner.grid.boxes import Box
 from ddqn_planner.grid.layers import Layers, forbids, has_costs, multiplier_at
 from ddqn_planner.grid.map_changes import changed_cells
 from ddqn_planner.grid.moves import ACTION_OF_STEP, STAND
-from ddqn_planner.planning.departure import Departures, make_departures
+from ddqn_planner.planning.departure import (
+    Departures,
+    make_departures,
+    turns_at_arrival,
+)
 from ddqn_planner.robot.directions import CUSP, DirectedMotions, with_directions
 from ddqn_planner.robot.motions import Motions, dense_poses
 
@@ -83,6 +87,7 @@ class Body(NamedTuple):
     cost_per_cell: float
     directions: int  # of travel, for each heading of the robot, see `DirectedMotions`
     departures: Departures  # lower bounds of costs; written as they are needed
+    turn: NDArray[np.float32]  # (PARTS, H): see `departure.turns_at_arrival`
     has_origin_inside: bool  # whether all cells that the origin passes must be free
 
 
@@ -100,6 +105,9 @@ class World(NamedTuple):
     nearness: NDArray[np.uint8]
     # Likewise: PASSABLE if the origin may pass a cell of the tile, else IMPASSABLE.
     passability: NDArray[np.uint8]
+    # Likewise: the mean multiplier of the free cells of the tile, 0 until a kernel
+    # looks.
+    multipliers: NDArray[np.float32]
     height: int
     width: int
     layers: Layers
@@ -205,7 +213,10 @@ def body_of(motions: Motions, swept: NDArray[np.bool_]) -> Body:
         reach=reach,
         cost_per_cell=_cost_per_cell(motions),
         directions=directed.directions,
-        departures=make_departures(headings // directed.directions),
+        departures=make_departures(
+            headings // directed.directions, directed.directions
+        ),
+        turn=turns_at_arrival(motions),
         has_origin_inside=bool(masks.core[:, middle, middle].all()),
     )
 
@@ -376,10 +387,13 @@ def world_of(
     nearness[near_rows, near_columns] = UNSEEN
     passability = older.passability.copy()
     passability[near_rows, near_columns] = UNSEEN
+    multipliers = older.multipliers.copy()
+    multipliers[near_rows, near_columns] = 0
     return older._replace(
         occupied_bits=occupied_bits,
         nearness=nearness,
         passability=passability,
+        multipliers=multipliers,
         layers=_layers_for_body(grid),
     )
 
@@ -454,6 +468,7 @@ def _new_world(grid: GridMap, body: Body) -> World:
         escape_bits=np.empty((0, 0), np.uint64),
         nearness=np.full(tiles, UNSEEN, np.uint8),
         passability=np.full(tiles, UNSEEN, np.uint8),
+        multipliers=np.zeros(tiles, np.float32),
         height=grid.height,
         width=grid.width,
         layers=_layers_for_body(grid),
@@ -532,6 +547,14 @@ def touches(x: int, y: int, mask: int, occupied_bits: Any, body: Any) -> bool:
 def is_inside(x: int, y: int, world: Any) -> bool:
     """Return whether a cell lies inside the map."""
     return bool(0 <= x < world.width and 0 <= y < world.height)
+
+
+@inlined
+def is_occupied(x: int, y: int, world: Any) -> bool:
+    """Return whether a cell of the map is occupied."""
+    column = np.uint64(x + BORDER)
+    bits = world.occupied_bits[y + BORDER, column // WORD]
+    return bool((bits >> (column & LAST_BIT)) & ONE)
 
 
 @inlined
@@ -640,6 +663,79 @@ def has_room(x: int, y: int, mask: int, world: Any) -> bool:
             return False
     is_primitive = mask < world.body.standing_mask  # the masks of primitives come first
     return not (is_primitive and leaves_map(x, y, mask, world))
+
+
+@inlined
+def may_pass(x: int, y: int, world: Any) -> bool:
+    """Return whether the origin of the body may lie in cell (x, y).
+
+    It may if the body has room to stand there with some heading, or has room for a
+    primitive that leads the origin through the cell.
+    """
+    body = world.body
+    # The core of some primitives is what all of them sweep around each cell that the
+    # origin passes: with an occupied cell in the core, none of them leads through.
+    if not has_room(x, y, body.common_core_mask, world):
+        return False
+    # The masks of heading h have the numbers of those of heading 0, plus h.
+    for heading in range(body.angle.size):
+        if has_room(x, y, body.standing_mask + heading, world):
+            return True
+        if not has_room(x, y, body.core_mask + heading, world):
+            continue
+        # The primitives that start with this heading.
+        first = body.first_starting[heading]
+        for primitive in range(first, body.first_starting[heading + 1]):
+            if _may_lead_through(x, y, primitive, world):
+                return True
+    return False
+
+
+@inlined
+def _may_lead_through(x: int, y: int, primitive: int, world: Any) -> bool:
+    """Return whether the body has room for a primitive whose origin passes (x, y).
+
+    The primitive may begin in several cells: (x, y) may be any cell that it passes.
+    """
+    body = world.body
+    # The rows of `passed_cells` of this primitive: cells from the one where it begins.
+    for place in range(body.first_passed[primitive], body.first_passed[primitive + 1]):
+        begin_x = x - body.passed_cells[place, 0]
+        begin_y = y - body.passed_cells[place, 1]
+        is_begin_inside = is_inside(begin_x, begin_y, world)
+        if is_begin_inside and has_room(begin_x, begin_y, primitive, world):
+            return True
+    return False
+
+
+@inlined
+def is_passable(
+    row: int, column: int, shift: int, passability: Any, world: Any
+) -> bool:
+    """Return whether the origin of the body may pass any cell of a tile.
+
+    Parameters
+    ----------
+    row, column : int
+        Of the tile, counted in tiles.
+    shift : int
+        A tile has 2**shift cells along a side.
+    passability : (rows, columns) uint8
+        UNSEEN, PASSABLE or IMPASSABLE for each tile. An unseen tile is looked at, and
+        what is found is written.
+    world : World
+        The body on the map.
+    """
+    if passability[row, column] == UNSEEN:
+        # Impassable, as long as no cell was found that may be passed. After the first
+        # such cell, no other cell is judged.
+        passability[row, column] = IMPASSABLE
+        for y in range(row << shift, min((row + 1) << shift, world.height)):
+            for x in range(column << shift, min((column + 1) << shift, world.width)):
+                has_no_cell = passability[row, column] == IMPASSABLE
+                if has_no_cell and may_pass(x, y, world):
+                    passability[row, column] = PASSABLE
+    return bool(passability[row, column] == PASSABLE)
 
 
 @in_place

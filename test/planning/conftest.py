@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from ddqn_planner.model import RobotNetwork
 from ddqn_planner.planning import pose_planner
 from ddqn_planner.planning.departure import make_departures
 from ddqn_planner.planning.pose_world import Body, body_of
@@ -23,8 +24,13 @@ def body_of_same_robot(motions: Motions, swept: NDArray[np.bool_]) -> Body:
     if key not in TABLES:
         TABLES[key] = body_of(motions, swept)
     body = TABLES[key]
-    departures = make_departures(len(body.departures.cost))
+    departures = make_departures(len(body.departures.cost), body.directions)
     return body._replace(departures=departures)
+
+
+def body_of_its_own(network: RobotNetwork) -> Body:
+    """Return a network's body with departures that no other planner has filled."""
+    return body_of_same_robot(network.motions, network.swept())
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -34,5 +40,5 @@ def few_tables() -> Iterator[None]:
     Many tests begin with a planner that knows no field.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pose_planner, "body_of", body_of_same_robot)
+        patch.setattr(pose_planner, "body_of_network", body_of_its_own)
         yield

@@ -41,7 +41,7 @@ def test_a_car_ends_exactly_in_a_bay_a_little_wider_than_itself(seed: int) -> No
     start = (2.0, random.uniform(2.0, 4.0), random.uniform(-1, 1))
     body = planner("ackermann")
     found = plan(body, grid, start, goal, finished=True)
-    assert ends_off(found, start, goal) == (0.0, 0.0)
+    assert ends_off(found, start, goal) == pytest.approx((0.0, 0.0), abs=1e-9)
     assert collisions(found.poses, grid, "ackermann") == 0
     cost = cost_of_poses(found.poses, grid, rates_of(body.motions))
     assert found.cost == pytest.approx(cost, rel=0.01)
