@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from ddqn_planner import Experience
-from ddqn_planner.experience.visits import Limits, Poses, visits_of
+from ddqn_planner.experience.visits import SPOT, Limits, Poses, visits_of
 from ddqn_planner.grid.arguments import MAX_SLOWNESS
 
 Float64 = NDArray[np.float64]
@@ -34,13 +34,23 @@ def forged_poses(draw: st.DrawFn) -> Poses:
     return Poses(np.array(time), np.array(position))
 
 
+def standing_and_creeping() -> Poses:
+    """A robot that stands for 30 s, again and again, 5 cm farther each time."""
+    time = np.append(np.arange(0.0, 301.0, 30.0), 301.0 + 1e-6 * np.arange(4))
+    x = np.append(np.arange(11) * 0.05, [1.0, 1.24, 1.48, 1.72])
+    return Poses(time, np.column_stack([x, np.zeros(len(x))]))
+
+
+@example(standing_and_creeping())
 @given(forged_poses())
 def test_no_drive_shows_more_than_its_time_and_the_greatest_speed_allow(
     poses: Poses,
 ) -> None:
     visits = visits_of(poses, SIDE, LIMITS, np.zeros(2))
     assert (visits.metres <= LIMITS.max_speed * visits.seconds + 1e-9).all()
-    assert (visits.waited <= LIMITS.max_pause).all()
+    # A robot waits at most once for each SPOT that it moves.
+    waits = visits.metres / SPOT + 1
+    assert (visits.waited <= LIMITS.max_pause * waits).all()
     elapsed = np.maximum(np.diff(poses.time), 0)
     assert visits.total_seconds <= elapsed.sum() + 1e-6
     # Each pair of poses shows a way of a few metres at most, so that a short file with

@@ -2,6 +2,7 @@
 
 import math
 import re
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -38,7 +39,7 @@ from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.nodes.requests import MapPose, PlanInputs, request_to
 from ddqn_planner.planning import Planner, PlanStatus
 from ddqn_planner.planning.path_finder import last_step
-from ddqn_planner.planning.pose_planner import PoseRequest
+from ddqn_planner.planning.plan import PosePlan, PoseRequest
 
 CELL, ORIGIN = 0.1, (-1.0, 2.0, 0.5)
 START, BESIDE, BEYOND = (
@@ -449,28 +450,41 @@ def test_a_better_path_begins_where_the_moved_robot_is(
     }
     settings = [f"{name}:={value}" for name, value in parameters.items()]
     with node_here(model, *settings) as (node, executor):
-        paths: list[np.ndarray] = []
+        published: list[np.ndarray] = []
         node.create_subscription(
-            Path, "plan", lambda path: paths.append(array_of(path)), LATCHED
+            Path, "plan", lambda path: published.append(array_of(path)), LATCHED
         )
         result_of(executor, node.model_source.wait_until_loaded())
         planner: Any = node.model_source.planner
         robot = [at_pose(*grid.cell_to_world(START), 0.5)]
+        first_paths: list[np.ndarray] = []
 
         def steps(request: PoseRequest) -> Any:
-            if request.is_bound_proved and len(robot) == 1:
-                x, y, yaw = paths[0][12].tolist()
+            if request.is_bound_proved and not first_paths:
+                # The node keeps a path before it publishes it.
+                plan = node._active_goal.last.plan
+                assert isinstance(plan, PosePlan)
+                first_paths.append(plan.poses)
+                x, y, yaw = first_paths[0][12].tolist()
                 robot.append(at_pose(x, y + 0.01, yaw))
                 node.poses.receive(robot[1])
             return Planner.steps(planner, request)
+
+        def has_better_path() -> bool:
+            return bool(first_paths and published) and not np.allclose(
+                published[-1][0], first_paths[0][0]
+            )
 
         monkeypatch.setattr(planner, "steps", steps)
         node.map_source.take(map_message(rooms, grid, next(NUMBERS)))
         node.poses.receive(robot[0])
         node._on_goals(pose(grid, BEYOND, 2.1, 0.01))
-        while len(paths) < 2:
-            executor.spin_once(60)
-    first, better = paths
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline and not has_better_path():
+            executor.spin_once(1)
+    first = first_paths[0]
+    better = published[-1]
+    assert has_better_path()
     x, y, yaw = array_of(Path(poses=robot[1:]))[0]
     assert math.dist(better[0, :2], (x, y)) < CELL
     assert math.cos(better[0, 2] - yaw) > math.cos(0.25)
