@@ -78,9 +78,10 @@ def _plan_poses(planner: Planner) -> None:
     # A goal in the cell of the start is reached by a joint.
     x, y, yaw = start
     planner.plan_poses(grid, start, (x, y + 0.1 * resolution, yaw))
-    # Lower bounds where cells have costs need other code.
+    # Where cells have costs, lower bounds and estimates need other code.
     costs = np.ones(walled.shape, np.int8)
-    planner.plan_poses(GridMap(walled, resolution, cost=costs), start, goal)
+    with_costs = GridMap(walled, resolution, cost=costs)
+    planner.plan_poses(with_costs, start, goal, prove=False)
     opened = grid.with_patch(np.zeros((side, 1), np.bool_), side, 0)
     planner.plan_poses(opened, start, goal)
     plan = planner.plan_poses(opened.with_patch([[True]], side, 0), start, goal)
