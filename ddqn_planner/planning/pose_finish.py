@@ -254,12 +254,16 @@ class Finish:
 
     def cost_of_joint(self, cost_of_cell: float) -> float:
         """Return what a joint to an exact goal may cost where cells cost so much."""
+        rates = self._rates
         cells = END_COST
         if math.isfinite(self._radius):
             cells += self._radius
-        if math.isfinite(self._rates.spin):
-            cells += 2 * math.pi * self._rates.spin
-        return cells * cost_of_cell + CUSPS_OF_JOINT * self._rates.cusp
+        if math.isfinite(rates.spin):
+            cells += 2 * math.pi * rates.spin
+        # Else a car that cannot reverse would drive a circle to move aside.
+        has_cusps = math.isfinite(rates.behind + rates.bend_behind)
+        cusps = CUSPS_OF_JOINT if has_cusps else 0
+        return cells * cost_of_cell + cusps * rates.cusp
 
     def _in_one_cell(
         self, path: PosePath, start: Any, goal: Any, grid: GridMap, world: World
@@ -289,7 +293,15 @@ class Finish:
         cost_of_cell = cost_of_curve(ends[0], 0, course)
         most_cost = self.cost_of_joint(cost_of_cell)
         chain = chain_between(ends[0], ends[1], most_cost, course)
-        return path if chain is None else _path_of(chain, path, exact_ends, grid)
+        if chain is None:
+            return path
+        dx, dy, turn = ends[1] - ends[0]
+        # Each cell costs 1 or more, and so does each cell of a bend.
+        cost_of_turn = min(self._radius / 1.001, self._rates.spin)
+        least_cost = max(math.hypot(dx, dy), abs(turn) * cost_of_turn)
+        chain = chain._replace(planned_costs=chain.costs)
+        path = path._replace(least_costs=np.array([least_cost]))
+        return _path_of(chain, path, exact_ends, grid)
 
     def _chain(
         self,

@@ -61,6 +61,7 @@ def test_a_goal_in_the_cell_of_the_start_is_reached(
     assert ends_off(found, start, goal) == (0.0, 0.0)
     assert collisions(found.poses, HALL, motion) == 0
     assert found.reason == found.status.value
+    assert 1 <= found.bound < math.inf
     cost = cost_of_poses(found.poses, HALL, rates_of(body.motions))
     assert found.cost == pytest.approx(cost, rel=0.01)
     steps = np.hypot(*np.diff(found.poses[:, :2], axis=0).T)
