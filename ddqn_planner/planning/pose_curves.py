@@ -341,12 +341,21 @@ def _mean_multiplier(
     if not has_forbidden and not has_costs(layers):
         return 1.0
     count = max(math.ceil(length / (FINE if has_forbidden else COARSE)), 1)
+    # The middles of equal parts: from one to the next, the robot moves by a chord, and
+    # each chord is the one before it turned by the same angle.
+    part_turn = turn / count
+    part_length = length / count
+    middle = _pose_on(begin, part_turn / 2, part_length / 2, is_behind)
+    next_x, next_y, _ = _pose_on(middle, part_turn, part_length, is_behind)
+    x, y, _ = middle
+    chord_x = next_x - x
+    chord_y = next_y - y
+    cos = math.cos(part_turn)
+    sin = math.sin(part_turn)
     total = 0.0
     last_column = math.floor(begin[0] + 0.5)
     last_row = math.floor(begin[1] + 0.5)
-    for number in range(count):
-        share = (number + 0.5) / count
-        x, y, _ = _pose_on(begin, share * turn, share * length, is_behind)
+    for _ in range(count):
         column = math.floor(x + 0.5)
         row = math.floor(y + 0.5)
         if not is_inside(column, row, world):
@@ -358,6 +367,11 @@ def _mean_multiplier(
             last_column = column
             last_row = row
         total += max(multiplier_at(column, row, np.float64(1), layers), 1.0)
+        x += chord_x
+        y += chord_y
+        straight_x = chord_x
+        chord_x = cos * straight_x - sin * chord_y
+        chord_y = sin * straight_x + cos * chord_y
     return total / count
 
 
