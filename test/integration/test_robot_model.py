@@ -365,7 +365,7 @@ def test_actions_lead_through_poses_and_paths_are_checked(
         for cell, yaw in ((START, 0.5), (BESIDE, 2.0), (BEYOND, 1.0))
     )
 
-    with node_here(model) as (node, executor):
+    with node_here(model, "switch_threshold:=1.0") as (node, executor):
         run = partial(result_of, executor)
 
         def is_valid(path: Path) -> bool:
@@ -403,13 +403,16 @@ def test_actions_lead_through_poses_and_paths_are_checked(
             node.navigation.plan(PathQuery(start, [goal], ""), lambda: None)
         )
         poses_through = array_of(through)
-        from_door = np.abs(poses_through[:, :2] - grid.cell_to_world((30, 26))).sum(
-            axis=1
-        )
+        door = np.array(grid.cell_to_world((30, 26)))
+        from_door = np.abs(poses_through[:, :2] - door).sum(axis=1)
         number = int(from_door.argmin())
+        # To that side of the middle on which the path is.
+        left = np.array([-math.sin(ORIGIN[2]), math.cos(ORIGIN[2])])
+        side = np.sign((poses_through[number, :2] - door) @ left)
         aside = through.poses[number]
-        aside.pose.position.x -= 0.06 * math.sin(ORIGIN[2])
-        aside.pose.position.y += 0.06 * math.cos(ORIGIN[2])
+        x, y = (door + 0.085 * side * left).tolist()
+        aside.pose.position.x = x
+        aside.pose.position.y = y
         rest, outcome = run(
             node.navigation.plan(PathQuery(aside, [goal], ""), lambda: None)
         )
