@@ -195,7 +195,7 @@ def test_plan_drives_a_body_as_the_library_and_without_a_collision(
             (*grid.cell_to_world(cell), yaw)
             for cell, yaw in zip(cells, ends.get("yaws", (0, 0)), strict=True)
         )
-        planner = Planner(car.network, car.metadata)  # it knows no map yet
+        planner = Planner.load("car")  # it knows no map yet, and has no tables
         plan = planner.plan_poses(grid, start, goal, **{"bound": 1.0, **asked})
         given, status = [path, "--csv", file, *options.split()], 0 if plan.cells else 1
         answer = json.loads(

@@ -21,8 +21,10 @@ from ddqn_planner.planning.departure import (
 from ddqn_planner.planning.pose_world import SHIFT, TILE, is_occupied, is_passable
 from ddqn_planner.planning.queues import pop_from_heap, push_to_heap
 
-FURTHER: Final = 1.3  # times the way to the nearest goal, beyond which none is sought
-FARTHER: Final = 3.0  # the straight distance to a tile that was not reached counts so
+# No tile is visited to which it costs so many times as much as to the nearest goal.
+BEYOND_GOAL: Final = 1.3
+# What a cell of the straight distance to a tile that was not reached counts.
+UNREACHED_RATE: Final = 3.0
 # Of a tile's side: a cost that falls by less is kept, so that no tile is visited often.
 LEAST_FALL: Final = 0.05
 STEEPEST: Final = 1.5  # times the multiplier of a tile: what its cost rises, at most
@@ -175,7 +177,7 @@ def write_guide(search: Any, heap: Any, is_goal: Any, box: Any) -> None:
         row = tile // columns
         column = tile - row * columns
         if is_goal[row, column]:
-            greatest_key = min(greatest_key, FURTHER * cost[row, column])
+            greatest_key = min(greatest_key, BEYOND_GOAL * cost[row, column])
         _step_to_neighbours(row, column, search, heap, box)
 
 
@@ -202,7 +204,7 @@ def estimated_cost(x: int, y: int, heading: int, aim: Any, world: Any) -> Any:
     dy = y - departure.y
     here = cost[row, column]
     if here == 0:
-        return FARTHER * math.sqrt(dx * dx + dy * dy)
+        return UNREACHED_RATE * math.sqrt(dx * dx + dy * dy)
     steepest = STEEPEST * world.multipliers[row, column]
     rise_x = _rise(
         _cost_of_tile(row, column - 1, cost),
