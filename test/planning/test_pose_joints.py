@@ -40,11 +40,11 @@ def test_a_car_ends_exactly_in_a_bay_a_little_wider_than_itself(seed: int) -> No
     )
     start = (2.0, random.uniform(2.0, 4.0), random.uniform(-1, 1))
     body = planner("ackermann")
-    found = plan(body, grid, start, goal, finished=True)
-    assert ends_off(found, start, goal) == pytest.approx((0.0, 0.0), abs=1e-9)
-    assert collisions(found.poses, grid, "ackermann") == 0
-    cost = cost_of_poses(found.poses, grid, rates_of(body.motions))
-    assert found.cost == pytest.approx(cost, rel=0.01)
+    planned = plan(body, grid, start, goal, finished=True)
+    assert ends_off(planned, start, goal) == pytest.approx((0.0, 0.0), abs=1e-9)
+    assert collisions(planned.poses, grid, "ackermann") == 0
+    cost = cost_of_poses(planned.poses, grid, rates_of(body.motions))
+    assert planned.cost == pytest.approx(cost, rel=0.01)
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
@@ -57,14 +57,14 @@ def test_a_goal_in_the_cell_of_the_start_is_reached(
     start = (3.05, 3.05, 0.02)
     goal = tuple(np.add(start, off).tolist())
     body = planner(motion)
-    found = plan(body, HALL, start, goal, finished=True)
-    assert ends_off(found, start, goal) == (0.0, 0.0)
-    assert collisions(found.poses, HALL, motion) == 0
-    assert found.reason == found.status.value
-    assert 1 <= found.bound < math.inf
-    cost = cost_of_poses(found.poses, HALL, rates_of(body.motions))
-    assert found.cost == pytest.approx(cost, rel=0.01)
-    steps = np.hypot(*np.diff(found.poses[:, :2], axis=0).T)
+    planned = plan(body, HALL, start, goal, finished=True)
+    assert ends_off(planned, start, goal) == (0.0, 0.0)
+    assert collisions(planned.poses, HALL, motion) == 0
+    assert planned.reason == planned.status.value
+    assert 1 <= planned.bound < math.inf
+    cost = cost_of_poses(planned.poses, HALL, rates_of(body.motions))
+    assert planned.cost == pytest.approx(cost, rel=0.01)
+    steps = np.hypot(*np.diff(planned.poses[:, :2], axis=0).T)
     assert steps.max() <= 0.51 * CELL
     if motion == "ackermann":
         assert steps.min() > 1e-6
@@ -73,9 +73,9 @@ def test_a_goal_in_the_cell_of_the_start_is_reached(
 def test_a_start_that_is_the_goal_is_the_path() -> None:
     pose = (3.02, 3.04, 0.1)
     for motion in MOTIONS:
-        found = plan(planner(motion), HALL, pose, pose, finished=True)
-        assert found.poses.tolist() == [list(pose)]
-        assert found.bound == 1
+        planned = plan(planner(motion), HALL, pose, pose, finished=True)
+        assert planned.poses.tolist() == [list(pose)]
+        assert planned.bound == 1
 
 
 def test_a_car_without_room_to_move_aside_stays_and_says_why() -> None:
@@ -84,17 +84,17 @@ def test_a_car_without_room_to_move_aside_stays_and_says_why() -> None:
     grid = GridMap(occupancy, CELL)
     start: Pose = (3.05, 3.05, 0.0)
     goal: Pose = (3.05, 3.08, 0.0)
-    found = plan(planner("ackermann"), grid, start, goal, finished=True)
-    assert len(found.poses) == 1
-    assert "start and goal lie in one cell" in found.reason
+    planned = plan(planner("ackermann"), grid, start, goal, finished=True)
+    assert len(planned.poses) == 1
+    assert "start and goal lie in one cell" in planned.reason
 
 
 def test_a_goal_without_a_heading_in_the_cell_of_the_start_asks_for_no_turn() -> None:
     start = (3.05, 3.05, 0.1)
     body = planner("differential")
     request = PoseRequest(HALL, start, (start,), tolerance=(0.0, math.pi))
-    found = last_step(body.steps(request))
-    assert found.poses.tolist() == [list(start)]
+    planned = last_step(body.steps(request))
+    assert planned.poses.tolist() == [list(start)]
 
 
 def test_ends_beside_start_and_goal_are_said() -> None:
@@ -104,8 +104,8 @@ def test_ends_beside_start_and_goal_are_said() -> None:
     grid = GridMap(occupancy, CELL)
     start = (1.5, 3.05, 0.35)
     goal = (4.5, 3.05, -0.35)
-    found = plan(planner("ackermann"), grid, start, goal, finished=True)
-    assert found.reason.endswith(
+    planned = plan(planner("ackermann"), grid, start, goal, finished=True)
+    assert planned.reason.endswith(
         "; the path begins beside the start and ends beside the goal: no curve that is"
         " free leads there"
     )
