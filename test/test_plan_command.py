@@ -234,6 +234,7 @@ def test_plan_leads_a_body_out_of_an_obstacle(rooms: Any, console: Any) -> None:
     )
     assert answer["poses"] == plan.poses.tolist()
     assert answer["escape"] == plan.escape > 0
+    assert plan.reason.startswith("succeeded; the start is occupied")
 
 
 def test_plan_tells_how_a_body_drives_or_why_it_cannot(

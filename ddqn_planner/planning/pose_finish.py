@@ -322,8 +322,13 @@ class Finish:
             exact_ends = int(chain.first_track == FROM_START) + int(
                 chain.last_track == TO_GOAL
             )
-            if chain.cost <= cost * (1 + SAME_END) + exact_ends * end_cost:
+            most_cost = cost * (1 + SAME_END) + exact_ends * end_cost
+            if chain.cost <= most_cost:
                 return chain
+        # An exact goal may cost as much as by a joint.
+        most_cost += self.cost_of_joint(cost_of_cell) - end_cost
+        if chain.last_track == TO_GOAL and chain.cost <= most_cost:
+            return chain
         chain = best_chain(tracks[:1], costs, Limits(1.0, end_cost), course)
         return chain if chain.cost <= cost * (1 + SAME_END) else None
 

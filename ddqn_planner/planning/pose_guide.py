@@ -22,7 +22,7 @@ from ddqn_planner.planning.pose_world import SHIFT, TILE, is_occupied, is_passab
 from ddqn_planner.planning.queues import pop_from_heap, push_to_heap
 
 # No tile is visited to which it costs so many times as much as to the nearest goal.
-BEYOND_GOAL: Final = 1.3
+BEYOND_GOAL: Final = 1.1
 # What a cell of the straight distance to a tile that was not reached counts.
 UNREACHED_RATE: Final = 3.0
 # Of a tile's side: a cost that falls by less is kept, so that no tile is visited often.

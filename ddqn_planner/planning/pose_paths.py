@@ -116,7 +116,7 @@ class PosePath(NamedTuple):
             driven=float(np.hypot(steps[:, 0], steps[:, 1]).sum()) / grid.resolution,
             bound=bound,
             escape=escape,
-            reason=f"{PlanStatus.SUCCEEDED}; {ESCAPE_IN_WORDS}" if escape else "",
+            reason=f"{PlanStatus.SUCCEEDED.value}; {ESCAPE_IN_WORDS}" if escape else "",
         )
 
 

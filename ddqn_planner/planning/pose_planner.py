@@ -201,16 +201,22 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         if bound == math.inf:
             return PosePlan(PlanStatus.NO_PATH, field_ms=clock.field_ms)
         path = field.rollout(start.state, request.bound, is_proved)
-        remark = ""
         if request.finished:
             goal = self._end_of(path, request)
             path = self._finished(path, goal, request, start.world)
-            remark = paths.ends_in_words(path, request.start, goal)
             if len(path.poses) > 1:
                 field.path = path
-        plan = path.plan(0, grid)
-        plan = replace(plan, reason=plan.reason + remark)
+        plan = self._plan_along(path, request)
         return replace(plan, field_ms=clock.field_ms, rollout_ms=clock.rollout_ms)
+
+    def _plan_along(self, path: paths.PosePath, request: PoseRequest) -> PosePlan:
+        """Return the plan along a path, whose reason says which ends are not exact."""
+        plan = path.plan(0, request.grid)
+        if not request.finished:
+            return plan
+        goal = self._end_of(path, request)
+        remark = paths.ends_in_words(path, request.start, goal)
+        return replace(plan, reason=plan.reason + remark)
 
     def _end_of(
         self, path: paths.PosePath, request: PoseRequest
@@ -689,12 +695,11 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
             # depends on its start.
             if first < path.escape:
                 continue
+            rest = path.part(first, len(path.poses))
             if request.finished:
-                rest = path.part(first, len(path.poses))
                 world = self._world(request.grid)
-                path = self._finish.joined(rest, request.start, request.grid, world)
-                first = 0
-            plan = path.plan(first, request.grid)
+                rest = self._finish.joined(rest, request.start, request.grid, world)
+            plan = self._plan_along(rest, request)
             is_within_bound = plan.bound <= request.bound * paths.SAME
             if is_within_bound or not request.is_bound_proved:
                 return plan

@@ -104,8 +104,12 @@ def test_ends_beside_start_and_goal_are_said() -> None:
     grid = GridMap(occupancy, CELL)
     start = (1.5, 3.05, 0.35)
     goal = (4.5, 3.05, -0.35)
-    planned = plan(planner("ackermann"), grid, start, goal, finished=True)
+    body = planner("ackermann")
+    planned = plan(body, grid, start, goal, finished=True)
     assert planned.reason.endswith(
         "; the path begins beside the start and ends beside the goal: no curve that is"
         " free leads there"
     )
+    # The second time, the plan is that along the path that is kept.
+    again = plan(body, grid, start, goal, finished=True)
+    assert again.reason == planned.reason
