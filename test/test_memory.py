@@ -35,7 +35,10 @@ def test_pages_of_llvm_are_given_back_and_code_is_compiled_and_run_as_before() -
     planner, grid = new_planner(), GridMap(np.zeros((30, 30), np.bool_))
     list(warm_up(planner))
     plan = planner.plan(grid, (0, 0), (20, 20))
+    # Other tests of this process may have given the pages back.
+    assert numba.njit(lambda x: 2 * x)(21) == 42
     before = resident(LLVM)
+    assert before > 0
     give_back()
     assert resident(LLVM) < before / 4
     assert new_planner().plan(grid, (0, 0), (20, 20)) == plan
