@@ -287,11 +287,7 @@ class Finish:
         )
         if not is_inside_free or not all(count_free(end[None], course) for end in ends):
             return path
-        # Of a line of one cell.
-        course.pieces[:] = 0
-        course.pieces[0, 1] = 1
-        cost_of_cell = cost_of_curve(ends[0], 0, course)
-        most_cost = self.cost_of_joint(cost_of_cell)
+        most_cost = self.cost_of_joint(_cost_of_cell_ahead(ends[0], course))
         chain = chain_between(ends[0], ends[1], most_cost, course)
         if chain is None:
             return path
@@ -331,6 +327,14 @@ class Finish:
             return chain
         chain = best_chain(tracks[:1], costs, Limits(1.0, end_cost), course)
         return chain if chain.cost <= cost * (1 + SAME_END) else None
+
+
+def _cost_of_cell_ahead(pose: Float64, course: Course) -> float:
+    """Return what a line of one cell costs from a pose (3,) on."""
+    course.pieces[:] = 0
+    course.pieces[0, 1] = 1
+    cost: float = cost_of_curve(pose, 0, course)
+    return cost
 
 
 def words_of(rates: Rates) -> Int64:
