@@ -133,6 +133,7 @@ class ExpectedTimes:
             kind = CHANGES if has_changes(message) else "experience"
             data = bytes_of(kind, message)
             if message.layout == self._layout:
+                self._is_behind = False
                 return False
             if kind == CHANGES:
                 return self._apply_changes(message.layout, data)

@@ -10,6 +10,7 @@ import resource
 import signal
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -34,6 +35,7 @@ from ddqn_planner.nodes.conversions import (
     has_changes,
 )
 from ddqn_planner.nodes.driving import NAVIGATION
+from ddqn_planner.nodes.expected_times import ASK_PERIOD
 from ddqn_planner.nodes.quality import LATCHED
 
 VALUES = np.zeros((40, 100), dtype=np.int8)
@@ -120,6 +122,29 @@ class Site(User):
         episode = wait_for("episode", ends)
         self.saved.wait()
         return episode
+
+    def experience_after(self, changes: UInt8MultiArray) -> Experience:
+        """Send changes that the planner cannot use; return what it then gets.
+
+        They are sent again each second: the planner may get them before an experience
+        that the trainer sent earlier, since two nodes send to one topic.
+        """
+        self.experience.clear()
+
+        def experience() -> UInt8MultiArray | None:
+            self.client.publish("trainer/experience", changes, LATCHED)
+            with suppress(TimeoutError):
+                return self.experience.wait(is_whole, timeout=1)
+            return None
+
+        whole = bytes_of("experience", wait_for("the experience", experience))
+        return Experience.from_bytes(whole)
+
+    def is_silent(self) -> bool:
+        """Return whether no planner has asked for the experience for a while."""
+        self.experience.clear()
+        time.sleep(1.5 * ASK_PERIOD)
+        return not self.experience.messages()
 
     def record_in(self, folder: FilePath) -> None:
         self.client.set_parameters("trainer", output_folder=str(folder))
@@ -253,12 +278,9 @@ def test_the_robot_goes_round_what_was_slow_until_it_forgets(
     changes = unknown.changes_since(state)
     assert changes is not None
     for data in (changes, changes[:-20]):  # or as if another version had written it
-        site.experience.clear()
-        message = bytes_message(CHANGES, data)
-        site.client.publish("trainer/experience", message, LATCHED)
-        whole = bytes_of("experience", site.experience.wait(is_whole))
-        known = Experience.from_bytes(whole).evidence
+        known = site.experience_after(bytes_message(CHANGES, data)).evidence
         assert known.driven == pytest.approx(330, rel=0.1)
+    wait_for("end of questions", site.is_silent)
     assert not is_below(site.client.get_plan(*ends))
 
     site.episodes.clear()
