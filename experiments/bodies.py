@@ -25,6 +25,7 @@ from processes import memory
 from random_maps import KINDS, generate_map
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
+from slow_places import times
 from tables import table
 
 from ddqn_planner import GridMap, Planner, load_map
@@ -630,6 +631,12 @@ FIGURES: Final = {
         "map | first, mean ms | worst | next | repair | new | ratio | worst "
         "| bound | MB",
         speed,
+    ),
+    "times": (
+        "model | expected times | requests | without: median ms | mean | 95 % "
+        "| with: median | mean | 95 % | ratio: median | mean | 95 % "
+        "| first paths, mean",
+        times,
     ),
 }
 
