@@ -115,13 +115,10 @@ def reason_of_failure(
     grid = request.grid
     start_cell, *goal_cells = request.cells
     has_several_goals = len(goal_cells) > 1
+    problem = plan.explanation.cause
     # A plan that unknown space has prevented has a remedy of its own.
-    is_unknown = plan.reason.endswith(unknown_space.REMEDY)
-    if is_unknown:
-        problem, _, remedy = plan.reason.partition("; ")
-    else:
-        problem = plan.reason if has_several_goals else plan.status.value
-        remedy = _remedy_of(plan, request)
+    is_unknown = bool(plan.explanation.remedy)
+    remedy = plan.explanation.remedy or _remedy_of(plan, request)
     goals_in_words = f"goal: {_place(goal, goal_cells[0])}"
     if has_several_goals:
         problem = f"no path to any of {len(goal_cells)} goals: {problem}"
@@ -176,10 +173,9 @@ def reason_of_path(request: Request, plan: Plan, path: ExactPath) -> str:
         # In metres between centres of cells, as the tolerance counts.
         metres = math.dist(plan.goal, goal_cells[0]) * grid.resolution
         reason += f"; the goal {problem} and moved {metres:.3g} m"
-    if isinstance(plan, PosePlan):
-        _, separator, remarks = plan.reason.partition("; ")
-        reason += separator + remarks
-    elif grid.is_obstacle(plan.path[0]):
+    for remark in plan.explanation.remarks:
+        reason += f"; {remark}"
+    if not isinstance(plan, PosePlan) and grid.is_obstacle(plan.path[0]):
         radius = f"{_clearing_radius(request):.3g} m"
         reason += (
             f"; the start is occupied: obstacles within {radius} of it were ignored"

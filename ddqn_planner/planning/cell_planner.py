@@ -26,7 +26,13 @@ from ddqn_planner.planning.paths import (
     search,
     way_and_ends,
 )
-from ddqn_planner.planning.plan import Plan, PlanMethod, PlanRequest, PlanStatus
+from ddqn_planner.planning.plan import (
+    Explanation,
+    Plan,
+    PlanMethod,
+    PlanRequest,
+    PlanStatus,
+)
 from ddqn_planner.planning.segments import Path, cost_along, straightened
 
 VISITS = 2**18  # about how many cells a field visits in one step of a plan: some 30 ms
@@ -119,10 +125,12 @@ class CellPlanner(PathFinder[PlanRequest, Plan]):
             request.under_way, request.start, request.grid, request.move_rule
         )
 
-    def _reason(self, request: PlanRequest, plan: Plan) -> PausingGenerator[str]:
+    def _explanation(
+        self, request: PlanRequest, plan: Plan
+    ) -> PausingGenerator[Explanation]:
         """Return why there is no path, in words."""
         yield from ()  # it never pauses, but must be a generator
-        return unknown_space.reason_of(request, plan)
+        return unknown_space.explanation_of(request, plan)
 
     def expected(self, plan: Plan, request: PlanRequest) -> Plan:
         """Return a plan with the cost of its path on the map of a request."""

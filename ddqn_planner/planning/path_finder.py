@@ -13,9 +13,13 @@ from numpy.typing import NDArray
 from ddqn_planner.grid.grid_map import Exploration
 from ddqn_planner.planning import unknown_space
 from ddqn_planner.planning.exploration import error_of_difference
-from ddqn_planner.planning.plan import PathRequest, Plan
+from ddqn_planner.planning.plan import (
+    AnyPlan,
+    Explanation,
+    PathRequest,
+    explained,
+)
 
-AnyPlan = TypeVar("AnyPlan", bound=Plan)
 Request = TypeVar("Request", bound="PathRequest[Any]")
 Result = TypeVar("Result")
 # A part of the flow: a generator that yields None before each slow step, so that
@@ -87,8 +91,8 @@ class PathFinder(ABC, Generic[Request, AnyPlan]):
         has_several_goals = len(request.goals) > 1
         if unknown_space.has_more_to_say(request.grid, plan, has_several_goals):
             yield  # a pause: a slow step follows
-            reason = yield from self._reason(request, plan)
-            plan = replace(plan, reason=reason)
+            explanation = yield from self._explanation(request, plan)
+            plan = explained(plan, explanation)
         return plan
 
     def _find(self, request: Request, clock: Clock) -> PausingGenerator[AnyPlan]:
@@ -142,7 +146,9 @@ class PathFinder(ABC, Generic[Request, AnyPlan]):
         """
 
     @abstractmethod
-    def _reason(self, request: Request, plan: AnyPlan) -> Generator[None, None, str]:
+    def _explanation(
+        self, request: Request, plan: AnyPlan
+    ) -> PausingGenerator[Explanation]:
         """Return why there is no path, in words."""
 
     @abstractmethod

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Generic, TypeAlias, TypeVar
+from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,7 @@ CHOICES: tuple[tuple[str, type[Choice]], ...] = (
 Pose: TypeAlias = tuple[float, float, float]  # metres, metres, radians; map frame
 Place = TypeVar("Place", Cell, Pose)
 Number = TypeVar("Number", bound=np.generic)
+AnyPlan = TypeVar("AnyPlan", bound="Plan")
 
 
 @dataclass(frozen=True)
@@ -149,6 +150,23 @@ class PoseRequest(PathRequest[Pose]):
         return replace(self, start=(x, y, yaw), goals=(goal,))
 
 
+class Explanation(NamedTuple):
+    """The clauses of which a plan's reason is made."""
+
+    cause: str  # the words of the status, or more exactly why there is no path
+    remarks: tuple[str, ...] = ()  # in what a path differs from its request
+    remedy: str = ""  # what to do if unknown space is why there is no path
+
+    def __str__(self) -> str:
+        clauses = [self.cause, *self.remarks]
+        if self.remedy:
+            clauses.append(self.remedy)
+        return "; ".join(clauses)
+
+
+UNEXPLAINED = Explanation(cause="")  # until the plan's status is its cause
+
+
 @dataclass(frozen=True, eq=False)
 class Plan:
     """A path, or the reason why there is none.
@@ -182,6 +200,8 @@ class Plan:
     field_ms, rollout_ms : float
         How long a planner took for the Q field, and for the path from it, in
         milliseconds.
+    explanation : Explanation
+        The clauses of the reason. By default its cause is the status in words.
     """
 
     status: PlanStatus
@@ -194,6 +214,7 @@ class Plan:
     field_ms: float = 0.0
     rollout_ms: float = 0.0
     reason: str = ""
+    explanation: Explanation = field(default=UNEXPLAINED, kw_only=True)
 
     def __post_init__(self) -> None:
         """Turn the fields into their types: a sequence of cells is a path, too.
@@ -216,6 +237,9 @@ class Plan:
                 object.__setattr__(self, name, choice(value))
         if not self.reason:
             object.__setattr__(self, "reason", self.status.value)
+        if not self.explanation.cause:
+            by_status = self.explanation._replace(cause=self.status.value)
+            object.__setattr__(self, "explanation", by_status)
 
     def __setstate__(self, state: dict[str, object]) -> None:
         """Take what was pickled or copied: NumPy forgets that arrays are read-only."""
@@ -311,6 +335,11 @@ class PosePlan(Plan):
         return *super()._identity(), self.poses.tobytes(), self.bound
 
 
+def explained(plan: AnyPlan, explanation: Explanation) -> AnyPlan:
+    """Return a plan with an explanation, and the reason that says it."""
+    return replace(plan, reason=str(explanation), explanation=explanation)
+
+
 def joined(plans: Sequence[Plan]) -> Plan:
     """Return the plan through several goals, made of the plans of its legs.
 
@@ -352,12 +381,11 @@ def _with_poses_of(plans: Sequence[Plan]) -> PosePlan:
     """Return the plan of the last leg with the poses of all legs."""
     legs = [plan for plan in plans if isinstance(plan, PosePlan)]
     return replace(
-        legs[-1],
+        explained(legs[-1], legs[0].explanation),
         poses=_end_to_end([leg.poses for leg in legs]),
         driven=sum(leg.driven for leg in legs),
         bound=max(leg.bound for leg in legs),
         escape=legs[0].escape,
-        reason=legs[0].reason,
     )
 
 

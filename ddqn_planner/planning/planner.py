@@ -26,6 +26,7 @@ from ddqn_planner.planning.plan import (
     Pose,
     PosePlan,
     PoseRequest,
+    explained,
     joined,
 )
 from ddqn_planner.planning.pose_planner import PosePlanner
@@ -289,7 +290,9 @@ class Planner:
                 start_clearing_radius=start_clearing_radius,
             )
             if plan.status is not PlanStatus.SUCCEEDED or plan.goal is None:
-                return replace(plan, goal=goal, reason=f"{name}{plan.reason}")
+                why = plan.explanation
+                why = why._replace(cause=f"{name}{why.cause}")
+                return explained(replace(plan, goal=goal), why)
             plans.append(plan)
             start = plan.goal
         return joined(plans)

@@ -10,7 +10,13 @@ from ddqn_planner.compiled import in_place
 from ddqn_planner.grid import GridMap
 from ddqn_planner.grid.layers import multipliers_of
 from ddqn_planner.grid.moves import ACTION_OF_STEP
-from ddqn_planner.planning.plan import SAME_POSE, PlanStatus, PosePlan
+from ddqn_planner.planning.plan import (
+    SAME_POSE,
+    Explanation,
+    PlanStatus,
+    PosePlan,
+    explained,
+)
 from ddqn_planner.planning.pose_world import body_costs
 from ddqn_planner.robot.directions import (
     ON_THE_SPOT,
@@ -86,28 +92,36 @@ class PosePath(NamedTuple):
             least_costs=np.concatenate([self.least_costs, rest.least_costs[1:]]),
         )
 
-    def plan(self, first: int, grid: GridMap) -> PosePlan:
-        """Return the plan along the rest of the path, from pose number `first` on.
+    def plan(self, grid: GridMap, remark: str = "") -> PosePlan:
+        """Return the plan along the path.
 
-        The plan's cost is in seconds on a map `grid` of expected times, else in cells.
+        Parameters
+        ----------
+        grid : GridMap
+            On a map of expected times the plan's cost is in seconds, else in cells.
+        remark : str
+            In what the path differs from its request, besides an escape; empty for
+            nothing.
         """
-        poses = self.poses[first:]  # (M, 3): metres and radians
+        poses = self.poses[:]  # a view, which alone cannot be written to
         poses.flags.writeable = False
-        cells = self.cells[first:]  # (M, 2): in which the poses lie
+        cells = self.cells
         is_new_cell = np.append(True, (cells[1:] != cells[:-1]).any(axis=1))
-        # Costs are in cells, from the first pose of the path to each pose.
-        cost_before = float(self.costs[first])
-        cost = float(self.costs[-1]) - cost_before
-        least_cost = float(self.least_costs[first])
+        cost = float(self.costs[-1]) - float(self.costs[0])
+        least_cost = float(self.least_costs[0])
         bound = math.inf  # of the ratio of the cost to the least cost of any path
         if cost <= least_cost * SAME:
             bound = 1.0
         elif least_cost > 0:
             bound = max(cost / least_cost, 1.0)
-        steps = np.diff(poses[:, :2], axis=0)  # (M - 1, 2), in metres
+        steps = np.diff(poses[:, :2], axis=0)  # (N - 1, 2), in metres
         goal_x, goal_y = cells[-1].tolist()
-        escape = max(self.escape - first, 0)
-        return PosePlan(
+        remarks = []
+        if self.escape:
+            remarks.append(ESCAPE_IN_WORDS)
+        if remark:
+            remarks.append(remark)
+        plan = PosePlan(
             PlanStatus.SUCCEEDED,
             cells[is_new_cell],
             cost=cost * (grid.seconds_per_cell or 1.0),
@@ -115,9 +129,9 @@ class PosePath(NamedTuple):
             poses=poses,
             driven=float(np.hypot(steps[:, 0], steps[:, 1]).sum()) / grid.resolution,
             bound=bound,
-            escape=escape,
-            reason=f"{PlanStatus.SUCCEEDED.value}; {ESCAPE_IN_WORDS}" if escape else "",
+            escape=self.escape,
         )
+        return explained(plan, Explanation(plan.status.value, tuple(remarks)))
 
 
 class BodyPoints(NamedTuple):
@@ -147,7 +161,7 @@ def points_of(corners: Float64, resolution: float) -> BodyPoints:
 
 
 def ends_in_words(path: PosePath, start: Any, goal: Any) -> str:
-    """Return what to add to a plan's reason if an end of its path is not exact.
+    """Return which ends of a path are not exact; empty if both are.
 
     `start` and `goal` are (x, y, yaw) in metres and radians, as the path's poses.
     """
@@ -157,7 +171,7 @@ def ends_in_words(path: PosePath, start: Any, goal: Any) -> str:
     if path.escape:
         is_start_off = False
     if len(path.poses) == 1 and (is_start_off or is_goal_off):
-        return f"; {NO_DRIVE}"
+        return NO_DRIVE
     places = []
     if is_start_off:
         places.append("begins beside the start")
@@ -165,7 +179,7 @@ def ends_in_words(path: PosePath, start: Any, goal: Any) -> str:
         places.append("ends beside the goal")
     if not places:
         return ""
-    return f"; the path {' and '.join(places)}: no curve that is free leads there"
+    return f"the path {' and '.join(places)}: no curve that is free leads there"
 
 
 def in_cells(poses: Float64, grid: GridMap) -> Float64:

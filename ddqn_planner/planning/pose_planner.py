@@ -20,6 +20,7 @@ from ddqn_planner.planning.field_cache import FieldCache
 from ddqn_planner.planning.path_finder import Clock, PathFinder, PausingGenerator
 from ddqn_planner.planning.plan import (
     ROUNDING,
+    Explanation,
     PlanStatus,
     Pose,
     PosePlan,
@@ -201,22 +202,15 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         if bound == math.inf:
             return PosePlan(PlanStatus.NO_PATH, field_ms=clock.field_ms)
         path = field.rollout(start.state, request.bound, is_proved)
+        remark = ""
         if request.finished:
             goal = self._end_of(path, request)
             path = self._finished(path, goal, request, start.world)
+            remark = paths.ends_in_words(path, request.start, goal)
             if len(path.poses) > 1:
                 field.path = path
-        plan = self._plan_along(path, request)
+        plan = path.plan(grid, remark)
         return replace(plan, field_ms=clock.field_ms, rollout_ms=clock.rollout_ms)
-
-    def _plan_along(self, path: paths.PosePath, request: PoseRequest) -> PosePlan:
-        """Return the plan along a path, whose reason says which ends are not exact."""
-        plan = path.plan(0, request.grid)
-        if not request.finished:
-            return plan
-        goal = self._end_of(path, request)
-        remark = paths.ends_in_words(path, request.start, goal)
-        return replace(plan, reason=plan.reason + remark)
 
     def _end_of(
         self, path: paths.PosePath, request: PoseRequest
@@ -260,17 +254,19 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
             finished = self._finish.finished(path, start, goal, grid, world)
         return finished._replace(is_finished=True)
 
-    def _reason(self, request: PoseRequest, plan: PosePlan) -> PausingGenerator[str]:
+    def _explanation(
+        self, request: PoseRequest, plan: PosePlan
+    ) -> PausingGenerator[Explanation]:
         """Return why there is no path, in words.
 
         Besides the status of the plan, these say whether a path would lead through
         unknown space, and what stops each of several goals.
         """
-        status: str = plan.status.value
+        by_status = Explanation(plan.status.value)
         start_cell, *goal_cells = request.cells
         if not any(map(request.grid.contains, goal_cells)):
             outside = [unknown_space.OUTSIDE] * len(goal_cells)
-            return unknown_space.reason_of_goals(outside, "")
+            return unknown_space.explanation_of_goals(outside, "")
         # The same map with unknown cells free, and the body on it.
         free_grid = with_unknown_free(request.grid)
         free_world = world_of(free_grid, self.body)
@@ -279,30 +275,31 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         has_several_goals = len(request.goals) > 1
         if plan.status is PlanStatus.START_OCCUPIED:
             if start is None:
-                return status
+                return by_status
             place = self._place_in_words(request, start_cell)
-            return f"the start {place}; {unknown_space.REMEDY}"
+            return Explanation(f"the start {place}", remedy=unknown_space.REMEDY)
         if start is None and not has_several_goals:
-            return status
+            return by_status
         # 2. The goals: why no path can end at each; empty words for a goal with room.
         places = [
             self._goal_in_words(request, goal, free_grid, free_world)
             for goal in request.goals
         ]
-        reason_of_places = _reason_of_places(places, request.grid, start is not None)
-        if reason_of_places or start is None:
-            return reason_of_places
+        by_places = _explanation_by_places(places, request.grid, start is not None)
+        if by_places is not None:
+            return by_places
+        assert start is not None
         # 3. A path through unknown space.
         states = self._ends_with_room(request, places, start, free_grid, free_world)
         if not len(states):
-            return status
+            return by_status
         field = PoseField(states, free_grid, free_world)
         through = yield from self._through_unknown_space(field, start)
         if has_several_goals:
-            return unknown_space.reason_of_goals(places, through)
+            return unknown_space.explanation_of_goals(places, through)
         if not through:
-            return status
-        return f"{status}, {through}; {unknown_space.REMEDY}"
+            return by_status
+        return Explanation(f"{by_status.cause}, {through}", remedy=unknown_space.REMEDY)
 
     def _ends_with_room(
         self,
@@ -376,7 +373,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         unknown = request.grid.unknown
         if unknown is not None and unknown[y, x]:
             return unknown_space.IN_UNKNOWN_SPACE
-        return "is so near to unknown space that the robot's body touches it"
+        return unknown_space.TOUCHING_UNKNOWN_SPACE
 
     def rest_of_path(self, request: PoseRequest) -> NDArray[np.float64]:
         """Return the rest of the path under way, (N, 3)."""
@@ -463,10 +460,9 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         cells = paths.cells_of(paths.in_cells(rest, grid))
         costs = np.linspace(0, rest_cost, len(rest))
         escape = poses_of_escape(rest, grid, self.points)
+        path = paths.PosePath(rest, cells, costs, least_cost - costs, escape)
         return replace(
-            paths.PosePath(rest, cells, costs, least_cost - costs, escape).plan(
-                0, grid
-            ),
+            path.plan(grid),
             extra_cost=ratio - 1,
             field_ms=plan.field_ms,
             rollout_ms=plan.rollout_ms,
@@ -696,10 +692,13 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
             if first < path.escape:
                 continue
             rest = path.part(first, len(path.poses))
+            remark = ""
             if request.finished:
                 world = self._world(request.grid)
                 rest = self._finish.joined(rest, request.start, request.grid, world)
-            plan = self._plan_along(rest, request)
+                goal = self._end_of(rest, request)
+                remark = paths.ends_in_words(rest, request.start, goal)
+            plan = rest.plan(request.grid, remark)
             is_within_bound = plan.bound <= request.bound * paths.SAME
             if is_within_bound or not request.is_bound_proved:
                 return plan
@@ -729,11 +728,13 @@ def body_of_network(network: RobotNetwork) -> Body:
     return body
 
 
-def _reason_of_places(places: Sequence[str], grid: GridMap, has_start: bool) -> str:
+def _explanation_by_places(
+    places: Sequence[str], grid: GridMap, has_start: bool
+) -> Explanation | None:
     """Return why there is no path, if the places of the goals alone tell that.
 
-    The text is empty if a search has to tell whether a path leads through unknown
-    space, or if there is nothing to add to the status of a plan to one goal.
+    None if a search has to tell whether a path leads through unknown space, or if there
+    is nothing to add to the status of a plan to one goal.
 
     Parameters
     ----------
@@ -745,8 +746,9 @@ def _reason_of_places(places: Sequence[str], grid: GridMap, has_start: bool) -> 
     """
     if len(places) == 1:
         place = places[0]
-        is_goal_unknown = unknown_space.UNKNOWN_SPACE in place
-        return f"the goal {place}; {unknown_space.REMEDY}" if is_goal_unknown else ""
+        if place in unknown_space.UNKNOWN_PLACES:
+            return Explanation(f"the goal {place}", remedy=unknown_space.REMEDY)
+        return None
     if all(places) or grid.unknown is None or not has_start:
-        return unknown_space.reason_of_goals(places, "")
-    return ""
+        return unknown_space.explanation_of_goals(places, "")
+    return None

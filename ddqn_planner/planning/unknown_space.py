@@ -1,4 +1,4 @@
-"""Says why a plan has no path: unknown space, and the reason of each goal."""
+"""Explains why a plan has no path: unknown space, and what stops each goal."""
 
 from __future__ import annotations
 
@@ -12,13 +12,21 @@ from ddqn_planner.grid import Cell, GridMap
 from ddqn_planner.grid.boxes import Box, wider
 from ddqn_planner.grid.inflation import ROUNDING, with_unknown_free
 from ddqn_planner.planning.paths import way_and_ends
-from ddqn_planner.planning.plan import Plan, PlanRequest, PlanStatus
+from ddqn_planner.planning.plan import Explanation, Plan, PlanRequest, PlanStatus
 
 REMEDY = "set allow_unknown, or map it"
-UNKNOWN_SPACE = "unknown space"
-IN_UNKNOWN_SPACE = "lies in unknown space"
+# Why no path can end at a goal, in words.
 OUTSIDE = "lies outside the map"
 OCCUPIED = "is occupied"
+IN_UNKNOWN_SPACE = "lies in unknown space"
+NEAR_UNKNOWN_SPACE = "is nearer to unknown space than the robot's body allows"
+TOUCHING_UNKNOWN_SPACE = "is so near to unknown space that the robot's body touches it"
+# Those that have the remedy.
+UNKNOWN_PLACES: Final = (
+    IN_UNKNOWN_SPACE,
+    NEAR_UNKNOWN_SPACE,
+    TOUCHING_UNKNOWN_SPACE,
+)
 THROUGH_UNKNOWN_SPACE = "but a path leads through unknown space"
 MAYBE_THROUGH_UNKNOWN_SPACE = "but a path may lead through unknown space"
 
@@ -48,17 +56,19 @@ def has_more_to_say(grid: GridMap, plan: Plan, has_several_goals: bool) -> bool:
     return grid.unknown is not None and plan.status in POSSIBLY_UNKNOWN
 
 
-def reason_of(request: PlanRequest, plan: Plan) -> str:
+def explanation_of(request: PlanRequest, plan: Plan) -> Explanation:
     """Return why a plan has no path, in words.
 
     These are the words of the plan's status. If unknown space may be the reason, they
     say that and what to do. For several goals, they say what stops each of them.
     """
     grid = request.grid
-    status: str = plan.status.value
+    status = plan.status.value
     if plan.status is PlanStatus.START_OCCUPIED:
         place = place_in_words(grid, request.start)
-        return f"the start {place}; {REMEDY}" if place else status
+        if place:
+            return Explanation(f"the start {place}", remedy=REMEDY)
+        return Explanation(status)
     if len(request.goals) > 1:
         places = [goal_in_words(grid, goal) for goal in request.goals]
         free_goals = tuple(goal for goal in request.goals if grid.is_free(goal))
@@ -67,16 +77,16 @@ def reason_of(request: PlanRequest, plan: Plan) -> str:
             request_of_free = replace(request, goals=free_goals)
             if _leads_through_unknown_space(request_of_free):
                 through = THROUGH_UNKNOWN_SPACE
-        return reason_of_goals(places, through)
+        return explanation_of_goals(places, through)
     if plan.status is PlanStatus.GOAL_OCCUPIED:
         place = place_in_words(grid, request.goals[0])
         if place:
-            return f"the goal {place}; {REMEDY}"
+            return Explanation(f"the goal {place}", remedy=REMEDY)
         if request.reach < 1:  # no other cell is within the tolerance
-            return status
+            return Explanation(status)
     if _leads_through_unknown_space(request):
-        return f"{status}, {THROUGH_UNKNOWN_SPACE}; {REMEDY}"
-    return status
+        return Explanation(f"{status}, {THROUGH_UNKNOWN_SPACE}", remedy=REMEDY)
+    return Explanation(status)
 
 
 def _leads_through_unknown_space(request: PlanRequest) -> bool:
@@ -125,10 +135,10 @@ def place_in_words(grid: GridMap, cell: Cell) -> str:
     dx = columns + box.columns.start - x
     if (np.hypot(dx, dy) < radius).any():
         return ""
-    return "is nearer to unknown space than the robot's body allows"
+    return NEAR_UNKNOWN_SPACE
 
 
-def reason_of_goals(places: Sequence[str], through: str) -> str:
+def explanation_of_goals(places: Sequence[str], through: str) -> Explanation:
     """Return why no path leads to any of several goals, by their numbers from 1 on.
 
     Parameters
@@ -139,23 +149,22 @@ def reason_of_goals(places: Sequence[str], through: str) -> str:
     through : str
         The words for a path through unknown space; empty if there is no such path.
     """
-    reasons = []
+    causes = []
     numbers_cut_off = []  # of the goals that are free
     for index in _goals_to_name(places):
         if places[index]:
-            reasons.append(f"goal {index + 1} {places[index]}")
+            causes.append(f"goal {index + 1} {places[index]}")
         else:
             numbers_cut_off.append(str(index + 1))
     if numbers_cut_off:
         goals = "goals" if len(numbers_cut_off) > 1 else "goal"
-        reasons.append(f"no path leads to {goals} {', '.join(numbers_cut_off)}")
+        causes.append(f"no path leads to {goals} {', '.join(numbers_cut_off)}")
     if len(places) > MOST_NAMED:
-        reasons.append("...")
+        causes.append("...")
     if through:
-        reasons.append(through)
-    words = ", ".join(reasons)
-    has_remedy = bool(through) or any(UNKNOWN_SPACE in place for place in places)
-    return f"{words}; {REMEDY}" if has_remedy else words
+        causes.append(through)
+    is_unknown = bool(through) or any(place in UNKNOWN_PLACES for place in places)
+    return Explanation(", ".join(causes), remedy=REMEDY if is_unknown else "")
 
 
 def _goals_to_name(places: Sequence[str]) -> list[int]:
@@ -166,7 +175,7 @@ def _goals_to_name(places: Sequence[str]) -> list[int]:
     """
     indices = range(len(places))
     unknown_first = sorted(
-        indices, key=lambda index: UNKNOWN_SPACE not in places[index]
+        indices, key=lambda index: places[index] not in UNKNOWN_PLACES
     )
     return sorted(unknown_first[:MOST_NAMED])
 

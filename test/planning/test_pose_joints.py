@@ -106,10 +106,12 @@ def test_ends_beside_start_and_goal_are_said() -> None:
     goal = (4.5, 3.05, -0.35)
     body = planner("ackermann")
     planned = plan(body, grid, start, goal, finished=True)
-    assert planned.reason.endswith(
-        "; the path begins beside the start and ends beside the goal: no curve that is"
+    remark = (
+        "the path begins beside the start and ends beside the goal: no curve that is"
         " free leads there"
     )
+    assert planned.explanation.remarks == (remark,)
+    assert planned.reason == f"succeeded; {remark}"
     # The second time, the plan is that along the path that is kept.
     again = plan(body, grid, start, goal, finished=True)
     assert again.reason == planned.reason

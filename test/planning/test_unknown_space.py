@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from ddqn_planner import GridMap, Planner, PlanStatus, inflate, load_map
 from ddqn_planner.cli import main
 from ddqn_planner.grid.inflation import grid_from_costmap
+from ddqn_planner.planning.plan import Explanation
 from ddqn_planner.planning.unknown_space import REMEDY
 
 FREE, WALL, UNKNOWN = 0, 100, -1
@@ -201,6 +202,27 @@ def test_costmaps_name_unknown_space_but_not_what_is_inscribed(
     closed[:, 14:17] = 99, UNKNOWN, 99
     inscribed = planner.plan(grid_from_costmap(closed), START, GOAL)
     assert inscribed.reason == "no path leads from the start to the goal"
+
+
+def test_a_reason_is_made_of_its_parts(planner: Planner) -> None:
+    remedy = {"remedy": REMEDY}
+    occupied, unknown = (grid_of(goal=value) for value in (WALL, UNKNOWN))
+    in_unknown, to_goal_2 = f"the goal {IN_UNKNOWN}", "goal 2 of 2: the goal"
+    for plan, explanation in (
+        (planner.plan(grid_of(), START, GOAL), Explanation("succeeded")),
+        (planner.plan(occupied, START, GOAL), Explanation("the goal is occupied")),
+        (planner.plan(unknown, START, GOAL), Explanation(in_unknown, **remedy)),
+        (
+            planner.plan_nearest(unknown, START, [GOAL, GOAL]),
+            Explanation(f"goal 1 {IN_UNKNOWN}, goal 2 {IN_UNKNOWN}", **remedy),
+        ),
+        (
+            planner.plan_through(unknown, START, [(3, 5), GOAL]),
+            Explanation(f"{to_goal_2} {IN_UNKNOWN}", **remedy),
+        ),
+    ):
+        assert plan.explanation == explanation
+        assert plan.reason == str(explanation)
 
 
 def test_plans_of_one_outcome_are_equal_whatever_their_reason(planner: Planner) -> None:
