@@ -4,17 +4,22 @@ import math
 
 import numpy as np
 import pytest
-from networks import robot_planner
+from networks import new_planner, robot_planner
 
 from ddqn_planner import GridMap, Planner
 from ddqn_planner.model import RobotNetwork
+from ddqn_planner.planning import departure
+from ddqn_planner.planning.departure import make_departures
 from ddqn_planner.planning.pose_field import PoseField
-from ddqn_planner.planning.pose_guide import mean_multiplier
+from ddqn_planner.planning.pose_guide import estimated_cost, mean_multiplier
 from ddqn_planner.planning.pose_planner import body_of_network
 from ddqn_planner.planning.pose_space import Aim
-from ddqn_planner.planning.pose_world import State, World, world_of
+from ddqn_planner.planning.pose_world import TILE, Body, State, World, world_of
+from ddqn_planner.robot.motions import turn_between
 
 CELL = 0.1  # metres
+SIDE = 160  # cells
+MIDDLE = SIDE // 2
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +82,162 @@ def test_a_guided_search_visits_few_states_and_its_path_costs_little_more(
 
 def without_guide(_: PoseField, aim: Aim) -> Aim:
     return aim
+
+
+def open_map(cost: int = 0) -> GridMap:
+    """A square map without obstacles on which each cell costs the same."""
+    costs = np.full((SIDE, SIDE), cost, np.int8)
+    return GridMap(np.zeros((SIDE, SIDE), np.bool_), CELL, cost=costs)
+
+
+def body_with_tables(planner: Planner, are_written: bool) -> Body:
+    """The robot's body with all tables of departures, or without any."""
+    assert planner.pose_planner is not None
+    body = planner.pose_planner.body
+    tables = make_departures(len(body.departures.cost), body.directions)
+    body = body._replace(departures=tables)
+    if are_written:
+        departure.write_ahead(body)
+    return body
+
+
+def guided_field(start: State, goal: State, grid: GridMap, body: Body) -> PoseField:
+    """A field that is about to grow from a goal to a start, by estimates."""
+    field = PoseField(np.array([goal]), grid, world_of(grid, body))
+    field._aim_at(start, weight=2.0, has_guide=True)
+    assert field.known.aim.guide.cost.size > 0
+    return field
+
+
+def estimate(field: PoseField, state: State) -> float:
+    return float(estimated_cost(*state, field.known.aim, field.world))
+
+
+def nearest_heading(yaw: float, body: Body) -> int:
+    return int(np.abs(turn_between(body.angle, yaw)).argmin())
+
+
+@pytest.mark.parametrize("knows_departure", [False, True])
+def test_an_estimate_is_near_the_least_cost_on_an_open_map(
+    planner: Planner, knows_departure: bool
+) -> None:
+    random = np.random.default_rng(3)
+    body = body_with_tables(planner, knows_departure)
+    for _ in range(30):
+        yaw = random.uniform(-math.pi, math.pi)
+        distance = random.uniform(4, 70)
+        heading = nearest_heading(yaw, body)
+        if knows_departure:
+            heading = int(random.integers(body.angle.size))
+        start = (MIDDLE, MIDDLE, heading)
+        goal = (
+            MIDDLE + round(distance * math.cos(yaw)),
+            MIDDLE + round(distance * math.sin(yaw)),
+            int(random.integers(body.angle.size)),
+        )
+        field = guided_field(start, goal, open_map(), body)
+        estimated = estimate(field, goal)
+        field.reach(start, 1.0, 10**7)
+        least = float(field.rollout(start, 1.0).costs[-1])
+        assert abs(estimated - least) < 4 + 0.1 * least
+
+
+@pytest.mark.parametrize("knows_departure", [False, True])
+def test_an_estimate_rises_with_the_turn_from_the_way_to_the_heading_at_its_end(
+    planner: Planner, knows_departure: bool
+) -> None:
+    body = body_with_tables(planner, knows_departure)
+    for yaw in np.arange(-math.pi, math.pi, math.pi / 6).tolist():
+        start = (MIDDLE, MIDDLE, nearest_heading(yaw, body))
+        for distance in (20, 30, 50, 70):
+            x = MIDDLE + round(distance * math.cos(yaw))
+            y = MIDDLE + round(distance * math.sin(yaw))
+            field = guided_field(start, (x, y, 0), open_map(), body)
+            turns = np.abs(turn_between(body.angle, math.atan2(y - MIDDLE, x - MIDDLE)))
+            by_turn = [estimate(field, (x, y, h)) for h in np.argsort(turns).tolist()]
+            assert (np.diff(by_turn) > -2).all()
+            assert by_turn[0] == pytest.approx(min(by_turn), abs=0.5)
+            # It has to turn round on the spot, or to drive in reverse at last.
+            assert by_turn[-1] > by_turn[0] + 10
+
+
+@pytest.mark.parametrize("knows_departure", [False, True])
+def test_an_estimate_rises_with_the_distance_by_what_a_cell_costs(
+    planner: Planner, knows_departure: bool
+) -> None:
+    body = body_with_tables(planner, knows_departure)
+    cost = 0 if knows_departure else 50
+    of_cell = 1 if knows_departure else 3
+    for dx, dy in ((1, 0), (0, 1), (-1, 0), (0, -1), (1, 1), (1, -1), (2, 1), (-1, 2)):
+        heading = nearest_heading(math.atan2(dy, dx), body)
+        start = (MIDDLE, MIDDLE, heading)
+        step = math.hypot(dx, dy)
+        steps = int(70 / step)
+        goal = (MIDDLE + steps * dx, MIDDLE + steps * dy, heading)
+        field = guided_field(start, goal, open_map(cost), body)
+        numbers = np.arange(16, steps + 1)
+        estimates = [
+            estimate(field, (MIDDLE + number * dx, MIDDLE + number * dy, heading))
+            for number in numbers.tolist()
+        ]
+        rises = np.diff(estimates) / (step * of_cell)
+        assert rises.min() > 0.8
+        assert rises.max() < 1.35
+        assert estimates[-1] == pytest.approx(70 * of_cell, rel=0.1)
+
+
+def test_a_guide_visits_the_tiles_on_ways_little_longer_than_the_shortest(
+    planner: Planner,
+) -> None:
+    body = body_with_tables(planner, are_written=False)
+    start = (MIDDLE - 40, MIDDLE, 0)
+    goal = (MIDDLE + 40, MIDDLE, 0)
+    guide = guided_field(start, goal, open_map(), body).known.aim.guide
+    row, column = np.indices(guide.cost.shape)
+    way = np.zeros(guide.cost.shape)  # by the middle of each tile, in cells
+    for x, y, _ in (start, goal):
+        dx = TILE * (column + 0.5) - x
+        dy = TILE * (row + 0.5) - y
+        way += np.hypot(dx, dy)
+    is_visited = guide.cost > 0
+    assert is_visited[way < 1.08 * 80].all()
+    assert not is_visited[way > 1.3 * 80].any()
+
+
+def test_a_guide_s_costs_are_those_of_paths_of_cells(planner: Planner) -> None:
+    """Which turn by 45 degrees at least, so they cost up to 8 % more."""
+    random = np.random.default_rng(4)
+    body = body_with_tables(planner, are_written=False)
+    start = (20, 20, 0)
+    for _ in range(2):
+        occupancy = np.zeros((SIDE, SIDE), np.bool_)
+        wall = int(random.integers(40, 70))
+        occupancy[: SIDE - 30, wall : wall + 2] = True
+        blocks = random.integers(0, 100, (4, 4)).astype(np.int8)
+        cost = np.where(occupancy, 0, blocks.repeat(40, axis=0).repeat(40, axis=1))
+        grid = GridMap(occupancy, CELL, cost=cost.astype(np.int8))
+        guide = guided_field(start, (140, 20, 0), grid, body).known.aim.guide
+        by_cells = -new_planner().q_field(grid, start[:2]).value
+        costs = by_cells[TILE // 2 :: TILE, TILE // 2 :: TILE]
+        is_compared = (guide.cost > 0) & np.isfinite(costs) & (costs > 60)
+        assert is_compared.sum() > 500
+        ratio = guide.cost[is_compared] / costs[is_compared]
+        assert ratio.min() > 0.9
+        assert ratio.max() < 1.2
+        assert 0.98 < ratio.mean() < 1.03
+
+
+def test_states_that_the_guide_did_not_reach_come_last(planner: Planner) -> None:
+    """So those of a closed room, through whose walls no way leads."""
+    occupancy = np.zeros((SIDE, SIDE), np.bool_)
+    occupancy[60:100, 60:100] = True
+    occupancy[63:97, 63:97] = False
+    grid = GridMap(occupancy, CELL, cost=np.zeros((SIDE, SIDE), np.int8))
+    body = body_with_tables(planner, are_written=False)
+    field = guided_field((20, MIDDLE, 0), (140, MIDDLE, 0), grid, body)
+    inside = estimate(field, (MIDDLE, MIDDLE, 0))
+    assert inside > estimate(field, (140, MIDDLE, 0))
+    assert inside > 1.5 * (MIDDLE - 20)
 
 
 def test_a_guided_search_tells_that_there_is_no_path(planner: Planner) -> None:
