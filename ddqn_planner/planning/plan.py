@@ -378,10 +378,13 @@ def are_joined(plans: Sequence[Plan]) -> bool:
 
 
 def _with_poses_of(plans: Sequence[Plan]) -> PosePlan:
-    """Return the plan of the last leg with the poses of all legs."""
+    """Return the plan of the last leg with the poses and the remarks of all legs."""
     legs = [plan for plan in plans if isinstance(plan, PosePlan)]
+    last = legs[-1]
+    all_remarks = [remark for leg in legs for remark in leg.explanation.remarks]
+    each_once = tuple(dict.fromkeys(all_remarks))
     return replace(
-        explained(legs[-1], legs[0].explanation),
+        explained(last, last.explanation._replace(remarks=each_once)),
         poses=_end_to_end([leg.poses for leg in legs]),
         driven=sum(leg.driven for leg in legs),
         bound=max(leg.bound for leg in legs),

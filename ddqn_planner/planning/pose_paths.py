@@ -161,25 +161,35 @@ def points_of(corners: Float64, resolution: float) -> BodyPoints:
 
 
 def ends_in_words(path: PosePath, start: Any, goal: Any) -> str:
-    """Return which ends of a path are not exact; empty if both are.
+    """Return which ends of a new path are not exact, and why; empty if both are.
 
     `start` and `goal` are (x, y, yaw) in metres and radians, as the path's poses.
+    """
+    ends = inexact_ends_in_words(path, start, goal)
+    if not ends:
+        return ""
+    if len(path.poses) == 1:
+        return NO_DRIVE
+    return f"{ends}: no curve that is free leads there"
+
+
+def inexact_ends_in_words(path: PosePath, start: Any, goal: Any) -> str:
+    """Return which ends of a path are not exact; empty if both are.
+
+    A path out of obstacles begins where its primitives do. `start` and `goal` are as in
+    `ends_in_words`.
     """
     off = np.abs(path.poses[[0, -1]] - (start, goal))  # (2, 3)
     off[:, 2] = np.abs(turn_between(0, off[:, 2]))
     is_start_off, is_goal_off = (off.max(axis=1) > SAME_POSE).tolist()
     if path.escape:
         is_start_off = False
-    if len(path.poses) == 1 and (is_start_off or is_goal_off):
-        return NO_DRIVE
     places = []
     if is_start_off:
         places.append("begins beside the start")
     if is_goal_off:
         places.append("ends beside the goal")
-    if not places:
-        return ""
-    return f"the path {' and '.join(places)}: no curve that is free leads there"
+    return f"the path {' and '.join(places)}" if places else ""
 
 
 def in_cells(poses: Float64, grid: GridMap) -> Float64:

@@ -20,6 +20,7 @@ from ddqn_planner.planning.field_cache import FieldCache
 from ddqn_planner.planning.path_finder import Clock, PathFinder, PausingGenerator
 from ddqn_planner.planning.plan import (
     ROUNDING,
+    SAME_POSE,
     Explanation,
     PlanStatus,
     Pose,
@@ -462,11 +463,40 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         escape = poses_of_escape(rest, grid, self.points)
         path = paths.PosePath(rest, cells, costs, least_cost - costs, escape)
         return replace(
-            path.plan(grid),
+            path.plan(grid, self._ends_of_kept_in_words(path, request)),
             extra_cost=ratio - 1,
             field_ms=plan.field_ms,
             rollout_ms=plan.rollout_ms,
         )
+
+    def _ends_of_kept_in_words(self, path: paths.PosePath, request: PoseRequest) -> str:
+        """Return which ends of the kept rest of a path are not exact; empty for none.
+
+        Why they are not is unknown: the goal may have moved a little since. The rest
+        begins at the pose nearest to the robot, in any case beside it. So its first
+        pose counts only if it is that of a path from which no curve led to the start.
+        """
+        if not request.finished:
+            return ""
+        start = request.start
+        is_whole = len(path.poses) == len(request.under_way)
+        if not is_whole or not self._begins_in_state_of_start(path, request):
+            start = path.poses[0]
+        goal = self._end_of(path, request)
+        return paths.inexact_ends_in_words(path, start, goal)
+
+    def _begins_in_state_of_start(
+        self, path: paths.PosePath, request: PoseRequest
+    ) -> bool:
+        """Return whether a path begins in a state as near to the start as there is."""
+        grid = request.grid
+        for column, row, number in self._nearest_states(grid, request.start):
+            x, y = grid.cell_to_world((column, row))
+            yaw = self.body.angle[number] + grid.origin[2]
+            dx, dy, turn = path.poses[0] - (x, y, yaw)
+            if max(abs(dx), abs(dy), abs(turn_between(0, turn))) <= SAME_POSE:
+                return True
+        return False
 
     def _cost_of_cusp_between(
         self,

@@ -1,6 +1,7 @@
 """Exact ends where no single curve leads: in tight places, and within one cell."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,12 +13,14 @@ from planning.test_poses import BODIES, CELL, planner
 
 from ddqn_planner import GridMap
 from ddqn_planner.planning.path_finder import last_step
-from ddqn_planner.planning.plan import Pose, PoseRequest
+from ddqn_planner.planning.plan import Pose, PoseRequest, joined
 from ddqn_planner.planning.pose_paths import cost_of_poses
 from ddqn_planner.robot.driving_costs import rates_of
 
 SIDE = 60  # cells
 HALL = GridMap(np.zeros((SIDE, SIDE), np.bool_), CELL)
+# It has room for a body along it, not askew.
+CORRIDOR = GridMap(np.ones((SIDE, SIDE)), CELL).with_patch(np.zeros((5, 50)), 5, 28)
 
 
 def collisions(poses: np.ndarray, grid: GridMap, motion: str) -> int:
@@ -98,12 +101,7 @@ def test_a_goal_without_a_heading_in_the_cell_of_the_start_asks_for_no_turn() ->
 
 
 def test_ends_beside_start_and_goal_are_said() -> None:
-    """The corridor has room for the body along it, not askew."""
-    occupancy = np.ones((SIDE, SIDE), np.bool_)
-    occupancy[28:33, 5:55] = False
-    grid = GridMap(occupancy, CELL)
-    start = (1.5, 3.05, 0.35)
-    goal = (4.5, 3.05, -0.35)
+    grid, start, goal = CORRIDOR, (1.5, 3.05, 0.35), (4.5, 3.05, -0.35)
     body = planner("ackermann")
     planned = plan(body, grid, start, goal, finished=True)
     remark = (
@@ -115,3 +113,49 @@ def test_ends_beside_start_and_goal_are_said() -> None:
     # The second time, the plan is that along the path that is kept.
     again = plan(body, grid, start, goal, finished=True)
     assert again.reason == planned.reason
+
+
+def test_each_remark_on_the_legs_of_a_path_is_one_on_the_path() -> None:
+    start, goals = (1.5, 3.05, 0.35), [(3.0, 3.05, 0.0), (4.5, 3.05, -0.35)]
+    body = planner("ackermann")
+    legs = [plan(body, CORRIDOR, start, goals[0], finished=True)]
+    request = PoseRequest(CORRIDOR, start, (goals[0],)).after(legs[0], goals[1])
+    legs.append(last_step(body.steps(request)))
+    begin, end = (leg.explanation.remarks for leg in legs)
+    assert "begins beside" in begin[0]
+    assert "ends beside" in end[0]
+    for plans, remarks in ((legs, begin + end), ([legs[0], legs[0]], begin)):
+        path = joined(plans)
+        assert path.explanation.remarks == remarks
+        assert path.reason == "; ".join(["succeeded", *remarks])
+
+
+@pytest.mark.parametrize("passed", [0, 9, 10])  # poses
+def test_ends_beside_start_and_goal_are_said_of_a_path_that_is_kept(
+    passed: int,
+) -> None:
+    """A robot on its way is beside its path in any case: then the goal alone counts."""
+    grid, start, goal = CORRIDOR, (1.5, 3.05, 0.35), (4.5, 3.05, -0.35)
+    body = planner("ackermann")
+    first = plan(body, grid, start, goal, finished=True)
+    robot = start
+    if passed:
+        x, y, yaw = (first.poses[passed] + (0.01, 0.01, 0.02)).tolist()
+        robot = x, y, yaw
+    request = PoseRequest(grid, robot, (goal,), bound=1.0, switch_threshold=1.0)
+    body = planner("ackermann")  # it knows no last path of its own
+    kept = last_step(body.steps(replace(request, under_way=first.poses)))
+    assert np.array_equal(kept.poses, first.poses[passed:])
+    ends = "ends beside the goal"
+    if not passed:
+        ends = f"begins beside the start and {ends}"
+    assert kept.reason == f"succeeded; the path {ends}"
+    # The first path between exact ends says nothing, wherever the robot stands.
+    straight = (1.5, 3.05, 0.0), (4.5, 3.05, 0.0)
+    exact = plan(body, grid, *straight, finished=True)
+    for off in (0.0, 0.02):
+        robot = 1.5, 3.05 + off, 0.0
+        request = PoseRequest(grid, robot, straight[1:], switch_threshold=1.0)
+        kept = last_step(body.steps(replace(request, under_way=exact.poses)))
+        assert np.array_equal(kept.poses, exact.poses)
+        assert kept.reason == "succeeded"
