@@ -26,6 +26,7 @@ from integration.robot import (
     Robot,
     corners_of,
     odometry,
+    point_of,
     points_of,
     repeating,
     yaw_of,
@@ -142,7 +143,7 @@ def test_a_start_on_an_obstacle_or_deep_in_one_is_told(
         ),
     ):
         robot.reset(**parameters)
-        robot.set_map(robot.stamped_map(values))
+        robot.plan_on(robot.stamped_map(values), "")
         robot.clear()
         path = robot.get_plan(robot.pose((10, 4)), robot.pose((0, 0)))
         assert bool(path.poses) == reason.startswith(";")
@@ -172,7 +173,7 @@ def test_unknown_space_is_named_where_it_is_the_reason(
         ),
     ):
         robot.reset(robot_radius=radius)
-        robot.set_map(robot.stamped_map(values))
+        robot.plan_on(robot.stamped_map(values), "")
         robot.clear()
         assert robot.get_plan(robot.pose((2, 2)), robot.pose(goal)).poses == []
         robot.wait_for_reason(f"^{reason}{remedy}")
@@ -206,12 +207,18 @@ def test_a_goal_moves_within_the_tolerance_of_the_request(robot: Robot) -> None:
     robot.send_goal(robot.pose((10, 2)))
     robot.wait_for_path((0, 2), (9, 2))
     robot.value.wait(lambda value: value.data[2 * 20 + 9] == 100)
-    robot.set_map(robot.map_with(np.s_[:, 10], 100))
+    robot.plan_on(robot.map_with(np.s_[:, 10], 100))
     assert get_cells(1.5, (12, 2)) == [(9, 2)]
     robot.wait_for_reason("a path of .*; the goal is cut off and moved 1.5 m")
 
 
 def test_the_start_comes_from_odometry(robot: Robot) -> None:
+    def is_at(cell: Cell) -> bool:
+        """Send odometry, a message of which may be lost; return whether it has come."""
+        robot.client.publish("odom", odometry(robot, cell))
+        path = robot.get_plan(PoseStamped(), robot.pose((0, 0)))
+        return points_of(path)[:1] == [point_of(robot.pose(cell))]
+
     def wait_until_unknown(refused: str, remedy: str) -> None:
         # What was refused of one source is forgotten with the source.
         other = rf"((?!{refused} refused).)*"
@@ -227,14 +234,15 @@ def test_the_start_comes_from_odometry(robot: Robot) -> None:
     wait_until_unknown("initialpose", "nothing came on /robot/odom in the map's frame")
     robot.client.publisher(Odometry, "odom")
     robot.client.wait_for_discovery("planner")
-    robot.client.publish("odom", odometry(robot, (2, 2)))
+    wait_for("the first pose", lambda: is_at((2, 2)))
     robot.wait_for_path((2, 2), (19, 14))
     robot.clear()
     # It goes on moving; the next plan begins where it is then.
-    robot.client.publish("odom", odometry(robot, (3, 2)))
-    robot.client.publish("odom", odometry(robot, (4, 2), frame=""))
+    wait_for("the next pose", lambda: is_at((3, 2)))
+    without_frame = odometry(robot, (4, 2), frame="")
     refused = "odom refused: the start's frame is ''"
-    assert robot.wait_for_reason(refused).level == WARN
+    with repeating(robot.client, lambda: robot.client.publish("odom", without_frame)):
+        assert robot.wait_for_reason(refused).level == WARN
     assert robot.plans.messages() == []
     robot.send_goal(robot.pose((0, 14)))
     robot.wait_for_path((3, 2), (0, 14))
@@ -389,6 +397,11 @@ def test_odometry_counts_while_it_comes(run_robot: Any, model: Path) -> None:
     def plans() -> bool:
         return bool(robot.get_plan(PoseStamped(), robot.pose(GOAL)).poses)
 
+    def plans_after_odometry() -> bool:
+        """Send odometry, which may be lost, and ask for a plan."""
+        client.publish("odom", odometry(robot, START))
+        return plans()
+
     parameters = {"model": str(model), "start_source": "odometry", "use_sim_time": True}
     parameters["qos_overrides./listening/map.subscription.durability"] = "volatile"
     with run_robot("/listening", parameters) as robot:
@@ -403,8 +416,7 @@ def test_odometry_counts_while_it_comes(run_robot: Any, model: Path) -> None:
         for began in (1000, 500):
             set_clock(began)
             assert not plans()
-            client.publish("odom", odometry(robot, START))
-            wait_for("plan", plans)
+            wait_for("plan", plans_after_odometry)
             set_clock(began + 2)
             assert plans()
             set_clock(began + 3)
@@ -412,8 +424,7 @@ def test_odometry_counts_while_it_comes(run_robot: Any, model: Path) -> None:
             robot.wait_for_reason(
                 r"nothing came on /\w+/odom for 3 s; publish it more often"
             )
-            client.publish("odom", odometry(robot, START))
-            wait_for("plan", plans)
+            wait_for("plan", plans_after_odometry)
         assert node.log.count("the clock jumped by -503 s") == 1
 
         (heard,) = (
