@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place
 from ddqn_planner.planning.pose_curves import (
+    TURN_OF_PIECE,
     Course,
     Int64,
     cost_of_curve,
@@ -19,7 +20,7 @@ from ddqn_planner.planning.pose_curves import (
     is_curve_free,
     is_in_reverse,
     least_cost_of_curve,
-    write_curve,
+    poses_of_curve,
     write_pieces,
 )
 from ddqn_planner.planning.pose_paths import Float64
@@ -111,6 +112,13 @@ class Sides(NamedTuple):
     first: Int64  # (G,): of the first turn, or NO_SIDE
     last: Int64  # (G,): of the last turn, or NO_SIDE
     flips: Int64  # (G,): changes between both sides
+
+
+class Reverses(NamedTuple):
+    """Whether a path is driven in reverse at G of its poses."""
+
+    before: NDArray[np.bool_]  # (G,): in the step to the pose, or in the first step
+    after: NDArray[np.bool_]  # (G,): in the step from the pose, or in the last step
 
 
 class Nodes(NamedTuple):
@@ -337,7 +345,7 @@ def _curve_without_cost(node: int, word: int, pieces: Float64) -> Any:
     first_side = NO_SIDE
     last_side = NO_SIDE
     for piece in range(len(pieces)):
-        turn = pieces[piece, 0]
+        turn = pieces[piece, TURN_OF_PIECE]
         weight += TURN_WEIGHT * abs(turn)
         if abs(turn) < NO_TURN:
             continue
@@ -399,38 +407,76 @@ def _nodes_of(tracks: list[Track], planned_costs: Float64) -> Nodes:
     planned = tracks[PLANNED]
     is_behind = directions_of_travel(planned.poses) < 0  # (N - 1,)
     indices = _node_poses(planned.poses, is_behind)  # (G,)
+    poses = np.array([track.poses[indices] for track in tracks])  # (T, G, 3)
     costs = np.array([track.costs[indices] for track in tracks])  # (T, G)
-    has_node = np.isfinite(costs)
-    has_node[FROM_START : FROM_START + 1, NODES_OF_END:] = False
-    has_node[TO_GOAL:, :-NODES_OF_END] = False
-    # (N,) each, group by group.
-    group, path = np.nonzero(has_node.T)
-    node_number = np.full((len(tracks), len(indices) + 1), NO_NODE)
-    node_number[path, group] = np.arange(len(path))
+    # The tracks that have a node in each group, and the numbers of these nodes.
+    has_node = _has_node(costs)  # (T, G)
+    nodes_of_group = has_node.sum(axis=0)  # (G,)
+    group, path = np.nonzero(has_node.T)  # (N,) each, for N nodes, group by group
+    next_node = _next_nodes(has_node)  # (T, G)
+    # The stretches from each group to the next one.
     yaw = planned.poses[:, 2]
     sides = _sides_of_stretches(yaw, indices)
     weights = _weights_of_stretches(yaw, indices, costs, sides.flips)  # (T, G)
-    is_after = np.append(is_behind, is_behind[-1])[indices]  # (G,)
-    is_before = is_behind[np.maximum(indices - 1, 0)]
-    poses = np.array([track.poses[indices] for track in tracks])  # (T, G, 3)
-    shape = len(path), 2, 2
+    is_reverse = _reverses_at(indices, is_behind)
+    directions = np.where(is_reverse.after, REVERSE, FORWARD)  # (G,)
+    by_arrival_and_side = len(path), 2, 2
     return Nodes(
         pose=poses[path, group],
         path=path,
         pose_index=indices[group],
-        next_node=node_number[path, group + 1],
+        next_node=next_node[path, group],
         next_weight=weights[path, group],
-        next_direction=np.where(is_after, REVERSE, FORWARD)[group],
+        next_direction=directions[group],
         next_first_side=sides.first[group],
         next_last_side=sides.last[group],
-        first=np.append(0, np.cumsum(has_node.sum(axis=0))),
+        first=np.append(0, np.cumsum(nodes_of_group)),
         cost_before=planned_costs[indices],
-        may_reverse=is_before | is_after,
-        value=np.full(shape, np.inf),
-        chosen_node=np.full(shape, NO_NODE),
-        chosen_word=np.full(shape, KEPT),
-        chosen_side=np.full(shape, NO_SIDE),
+        may_reverse=is_reverse.before | is_reverse.after,
+        value=np.full(by_arrival_and_side, np.inf),
+        chosen_node=np.full(by_arrival_and_side, NO_NODE),
+        chosen_word=np.full(by_arrival_and_side, KEPT),
+        chosen_side=np.full(by_arrival_and_side, NO_SIDE),
     )
+
+
+def _has_node(costs: Float64) -> NDArray[np.bool_]:
+    """Return whether each of T tracks has a node in each of G groups: (T, G).
+
+    `costs` (T, G) are those of the tracks up to the groups' poses. A track has no node
+    where they are infinite, and a moved one only has some near its exact end.
+    """
+    has_node = np.isfinite(costs)
+    is_moved = len(costs) > PLANNED + 1
+    if is_moved:
+        has_node[FROM_START, NODES_OF_END:] = False
+        has_node[TO_GOAL, :-NODES_OF_END] = False
+    return has_node
+
+
+def _next_nodes(has_node: NDArray[np.bool_]) -> Int64:
+    """Return the node of the same track in the next group, or NO_NODE: (T, G).
+
+    `has_node` (T, G) tells which tracks have a node in each group.
+    """
+    tracks, groups = has_node.shape
+    # Nodes are numbered group by group; after the last group there is none.
+    number = np.full((tracks, groups + 1), NO_NODE)
+    group, track = np.nonzero(has_node.T)  # (N,) each
+    number[track, group] = np.arange(len(track))
+    return number[:, 1:]
+
+
+def _reverses_at(indices: Int64, is_behind: NDArray[np.bool_]) -> Reverses:
+    """Return whether a path of N poses is driven in reverse at G of them.
+
+    `indices` (G,) are the numbers of these poses, and `is_behind` (N - 1,) tells which
+    steps are driven in reverse.
+    """
+    last_step = len(is_behind) - 1
+    step_before = np.maximum(indices - 1, 0)
+    step_after = np.minimum(indices, last_step)
+    return Reverses(before=is_behind[step_before], after=is_behind[step_after])
 
 
 def _sides_of_stretches(yaw: Float64, indices: Int64) -> Sides:
@@ -565,7 +611,7 @@ def _follow(
         poses.append(part.poses)
         costs.append(cost + part.costs)
         replaced_costs.append(
-            _evenly(planned_costs[begin], planned_costs[end], len(part.poses))
+            evenly(planned_costs[begin], planned_costs[end], len(part.poses))
         )
         cost += float(part.costs[-1])
         node = next_node
@@ -580,7 +626,7 @@ def _follow(
     )
 
 
-def _evenly(first: float, last: float, count: int) -> Float64:
+def evenly(first: float, last: float, count: int) -> Float64:
     """Return so many numbers, evenly from the first (not included) to the last."""
     return np.linspace(first, last, count + 1)[1:]
 
@@ -595,8 +641,6 @@ def _curve(begin: Float64, end: Float64, word: int, course: Course) -> _Part:
     """Return the curve of a word from a pose (3,) to another."""
     write_pieces(begin, end, word, course.radius, course.pieces)
     cost = cost_of_curve(begin, word, course)
-    count = write_curve(begin, word, course.pieces, np.empty((0, 3)))
-    poses = np.empty((count, 3))
-    write_curve(begin, word, course.pieces, poses)
+    poses = poses_of_curve(begin, word, course)
     poses[-1] = end
-    return _Part(poses, _evenly(0.0, cost, count))
+    return _Part(poses, evenly(0.0, cost, len(poses)))

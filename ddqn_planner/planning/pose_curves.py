@@ -39,6 +39,10 @@ MARGIN: Final = STEP / 2 + 0.01
 YAWS: Final = 128
 PLACES: Final = 4
 SAME_END: Final = 1e-9  # cells and radians
+# The columns of `Course.pieces`: by how many radians a piece turns to the left, and how
+# many cells it is long.
+TURN_OF_PIECE: Final = 0
+LENGTH_OF_PIECE: Final = 1
 # Dubins curves ahead are the words 0 to 3, those in reverse 4 to 7.
 DUBINS_WORDS: Final = 4
 SPIN_AHEAD: Final = 8
@@ -223,6 +227,53 @@ def _write_line_between_turns(
 
 
 @in_place
+def _centre_of_circle(yaw: float, side: int, radius: float) -> tuple[float, float]:
+    """Return the centre of the circle of an arc, from a pose on the arc.
+
+    The pose has a yaw, and the arc turns to the left if its side is 1, to the right if
+    its side is -1.
+    """
+    to_left = side * radius
+    return -to_left * math.sin(yaw), to_left * math.cos(yaw)
+
+
+@in_place
+def _write_line_between_arcs(
+    begin: Float64, end: Float64, word: int, radius: float, pieces: Float64
+) -> float:
+    """Write the pieces of a line between two arcs; return the length of the curve.
+
+    The length is infinite if one circle crosses the other, so that no line lies between
+    an arc of one and an arc of the other.
+    """
+    # In reverse, the robot drives where its back points.
+    back = math.pi if word >= DUBINS_WORDS else 0.0
+    begin_yaw = begin[2] + back
+    end_yaw = end[2] + back
+    first_side = 1 if word & 1 else -1  # 1: the arc turns left
+    last_side = 1 if word & 2 else -1
+    # From the centre of the first circle to that of the last one.
+    first_x, first_y = _centre_of_circle(begin_yaw, first_side, radius)
+    last_x, last_y = _centre_of_circle(end_yaw, last_side, radius)
+    dx = end[0] - begin[0] + last_x - first_x
+    dy = end[1] - begin[1] + last_y - first_y
+    # The line is a tangent of both circles. Between arcs to different sides, it crosses
+    # from one side of the centres to the other.
+    across = (first_side - last_side) * radius
+    square_of_line = dx * dx + dy * dy - across * across
+    if square_of_line < 0:
+        return np.inf
+    line = math.sqrt(square_of_line)
+    line_yaw = math.atan2(dy, dx) + math.atan2(across, line)
+    first_turn = _whole_turn(first_side * (line_yaw - begin_yaw))
+    last_turn = _whole_turn(last_side * (end_yaw - line_yaw))
+    pieces[0] = (first_side * first_turn, radius * first_turn)
+    pieces[1] = (0.0, line)
+    pieces[2] = (last_side * last_turn, radius * last_turn)
+    return line + radius * (first_turn + last_turn)
+
+
+@in_place
 def write_pieces(
     begin: Float64, end: Float64, word: int, radius: float, pieces: Float64
 ) -> float:
@@ -233,32 +284,7 @@ def write_pieces(
     """
     if word >= SPIN_AHEAD:
         return _write_line_between_turns(begin, end, word, pieces)
-    dx = end[0] - begin[0]
-    dy = end[1] - begin[1]
-    # In reverse, the robot drives where its back points.
-    back = math.pi if word >= DUBINS_WORDS else 0.0
-    begin_yaw = begin[2] + back
-    end_yaw = end[2] + back
-    first_side = 1 if word & 1 else -1  # 1: the arc turns left
-    last_side = 1 if word & 2 else -1
-    # From the centre of the first circle to that of the last.
-    first_radius = first_side * radius
-    last_radius = last_side * radius
-    centre_x = dx - last_radius * math.sin(end_yaw) + first_radius * math.sin(begin_yaw)
-    centre_y = dy + last_radius * math.cos(end_yaw) - first_radius * math.cos(begin_yaw)
-    # The line is a tangent of both circles.
-    across = first_radius - last_radius
-    square = centre_x * centre_x + centre_y * centre_y - across * across
-    if square < 0:
-        return np.inf
-    line = math.sqrt(square)
-    line_yaw = math.atan2(centre_y, centre_x) + math.atan2(across, line)
-    first_turn = _whole_turn(first_side * (line_yaw - begin_yaw))
-    last_turn = _whole_turn(last_side * (end_yaw - line_yaw))
-    pieces[0] = (first_side * first_turn, radius * first_turn)
-    pieces[1] = (0.0, line)
-    pieces[2] = (last_side * last_turn, radius * last_turn)
-    return line + radius * (first_turn + last_turn)
+    return _write_line_between_arcs(begin, end, word, radius, pieces)
 
 
 @in_place
@@ -314,8 +340,8 @@ def is_curve_free(begin: Float64, word: int, stride: int, course: Any) -> bool:
     is_behind = is_in_reverse(word)
     pose = (begin[0], begin[1], begin[2])
     for piece in range(3):
-        turn = course.pieces[piece, 0]
-        length = course.pieces[piece, 1]
+        turn = course.pieces[piece, TURN_OF_PIECE]
+        length = course.pieces[piece, LENGTH_OF_PIECE]
         if _is_empty(turn, length):
             continue
         if not _is_piece_free(pose, turn, length, is_behind, stride, course):
@@ -395,8 +421,8 @@ def least_cost_of_curve(word: int, course: Any) -> float:
     is_behind = is_in_reverse(word)
     cost = 0.0
     for piece in range(3):
-        turn = course.pieces[piece, 0]
-        length = course.pieces[piece, 1]
+        turn = course.pieces[piece, TURN_OF_PIECE]
+        length = course.pieces[piece, LENGTH_OF_PIECE]
         if not _is_empty(turn, length):
             cost += _least_cost_of_piece(turn, length, is_behind, course.rates)
     return cost
@@ -409,8 +435,8 @@ def cost_of_curve(begin: Float64, word: int, course: Any) -> float:
     pose = (begin[0], begin[1], begin[2])
     cost = 0.0
     for piece in range(3):
-        turn = course.pieces[piece, 0]
-        length = course.pieces[piece, 1]
+        turn = course.pieces[piece, TURN_OF_PIECE]
+        length = course.pieces[piece, LENGTH_OF_PIECE]
         if _is_empty(turn, length):
             continue
         least = _least_cost_of_piece(turn, length, is_behind, course.rates)
@@ -426,8 +452,8 @@ def write_curve(begin: Float64, word: int, pieces: Float64, poses: Float64) -> i
     pose = (begin[0], begin[1], begin[2])
     count = 0
     for piece in range(3):
-        turn = pieces[piece, 0]
-        length = pieces[piece, 1]
+        turn = pieces[piece, TURN_OF_PIECE]
+        length = pieces[piece, LENGTH_OF_PIECE]
         if _is_empty(turn, length):
             continue
         steps_of_length = math.ceil(length / SPACING - 1e-9)
@@ -440,6 +466,14 @@ def write_curve(begin: Float64, word: int, pieces: Float64, poses: Float64) -> i
             count += 1
         pose = _pose_on(pose, turn, length, is_behind)
     return count
+
+
+def poses_of_curve(begin: Float64, word: int, course: Course) -> Float64:
+    """Return the poses (N, 3) of the curve of `course.pieces`, except the first."""
+    count = write_curve(begin, word, course.pieces, np.empty((0, 3)))
+    poses = np.empty((count, 3))
+    write_curve(begin, word, course.pieces, poses)
+    return poses
 
 
 # The planned path

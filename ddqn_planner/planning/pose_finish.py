@@ -27,6 +27,7 @@ from ddqn_planner.planning.pose_chain import (
 )
 from ddqn_planner.planning.pose_curves import (
     DUBINS_WORDS,
+    LENGTH_OF_PIECE,
     MARGIN,
     PLACES,
     SAME_END,
@@ -332,7 +333,7 @@ class Finish:
 def _cost_of_cell_ahead(pose: Float64, course: Course) -> float:
     """Return what a line of one cell costs from a pose (3,) on."""
     course.pieces[:] = 0
-    course.pieces[0, 1] = 1
+    course.pieces[0, LENGTH_OF_PIECE] = 1
     cost: float = cost_of_curve(pose, 0, course)
     return cost
 

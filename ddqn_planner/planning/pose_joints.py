@@ -20,6 +20,7 @@ from ddqn_planner.planning.pose_chain import (
     STRIDES,
     TO_GOAL,
     Chain,
+    evenly,
     lengths_of,
 )
 from ddqn_planner.planning.pose_curves import (
@@ -31,8 +32,8 @@ from ddqn_planner.planning.pose_curves import (
     is_curve_free,
     is_in_reverse,
     least_cost_of_curve,
+    poses_of_curve,
     write_costs,
-    write_curve,
     write_pieces,
 )
 from ddqn_planner.planning.pose_paths import Float64
@@ -218,34 +219,43 @@ def _joined(
     if joint.stretch == NO_STRETCH:
         return None
     stretch = stretches[joint.stretch]
-    begin = stretch.poses[-1]
-    end = rest.pose[joint.rest]
-    write_pieces(begin, end, joint.word, course.radius, course.pieces)
-    curve = _poses_of(begin, joint.word, course)
-    if len(curve):
-        curve[-1] = end
-    cost_of_end = stretch.cost + cost_of_curve(begin, joint.word, course)
     number = int(rest.number[joint.rest])
+    return _with_joint(chain, number, stretch, joint.word, course)
+
+
+def _with_joint(
+    chain: Chain, number: int, stretch: Stretch, word: int, course: Course
+) -> Chain:
+    """Return a chain with a joint in the place of its poses up to pose `number`.
+
+    The joint is a stretch and then the curve of a word.
+    """
+    begin_of_curve = stretch.poses[-1]
+    end_of_curve = chain.poses[number]
+    write_pieces(begin_of_curve, end_of_curve, word, course.radius, course.pieces)
+    curve = poses_of_curve(begin_of_curve, word, course)
+    if len(curve):
+        curve[-1] = end_of_curve
     poses = np.concatenate([stretch.poses, curve, chain.poses[number + 1 :]])
-    costs_of_rest = _without_cusps(chain, course)[number:]
-    costs = np.concatenate(
-        [
-            np.linspace(0, stretch.cost, len(stretch.poses)),
-            np.linspace(stretch.cost, cost_of_end, len(curve) + 1)[1:],
-            cost_of_end + costs_of_rest[1:] - costs_of_rest[0],
-        ]
-    )
-    first_planned_costs = np.linspace(
+    # The costs up to each pose.
+    cost_of_joint = stretch.cost + cost_of_curve(begin_of_curve, word, course)
+    costs_on_stretch = np.linspace(0, stretch.cost, len(stretch.poses))
+    costs_on_curve = evenly(stretch.cost, cost_of_joint, len(curve))
+    old_costs = _without_cusps(chain, course)
+    costs_on_rest = cost_of_joint + old_costs[number + 1 :] - old_costs[number]
+    costs = np.concatenate([costs_on_stretch, costs_on_curve, costs_on_rest])
+    cusps = cusps_before(directions_of_travel(poses))
+    # The joint replaces the planned path up to the end of the curve, evenly.
+    planned_costs_on_joint = np.linspace(
         chain.planned_costs[0],
         chain.planned_costs[number],
         len(stretch.poses) + len(curve),
     )
-    later_planned_costs = chain.planned_costs[number + 1 :]
-    cusps = cusps_before(directions_of_travel(poses))
+    planned_costs_on_rest = chain.planned_costs[number + 1 :]
     return chain._replace(
         poses=poses,
         costs=costs + course.rates.cusp * cusps,
-        planned_costs=np.concatenate([first_planned_costs, later_planned_costs]),
+        planned_costs=np.concatenate([planned_costs_on_joint, planned_costs_on_rest]),
     )
 
 
@@ -261,7 +271,9 @@ def _stretches_from(start: Float64, course: Course) -> Iterator[Stretch]:
                 cost = cost_of_curve(start, word, course)
                 if not math.isfinite(cost) or not is_curve_free(start, word, 1, course):
                     break
-                poses = np.concatenate([start[None], _poses_of(start, word, course)])
+                poses = np.concatenate(
+                    [start[None], poses_of_curve(start, word, course)]
+                )
                 yield Stretch(poses, direction, cost)
 
 
@@ -281,23 +293,37 @@ def _as_arrays(stretches: Sequence[Stretch]) -> Stretches:
 
 def _rest_of(chain: Chain, course: Course) -> Rest:
     """Return the poses of a chain to which a joint may lead."""
-    lengths = lengths_of(chain.poses)
-    farthest = min(float(lengths[-1]), FARTHEST * _unit_of(course))
-    number = np.searchsorted(lengths, np.arange(0, farthest, SPACING_OF_JOINTS))
-    number = np.unique(np.append(number, len(lengths) - 1))
-    directions = directions_of_travel(chain.poses)
-    driven = np.flatnonzero(directions)
-    # Of each pose, the next step that is driven ahead or in reverse; or none.
-    next_step = np.append(driven, -1)[np.searchsorted(driven, number)]
-    cusps = cusps_before(directions)
-    later_cusps = np.where(next_step < 0, 0, cusps[-1] - cusps[next_step + 1])
-    costs = _without_cusps(chain, course)
+    number = _numbers_of_ends(chain.poses, course)  # (M,)
+    directions = directions_of_travel(chain.poses)  # (N - 1,), for N poses
+    cusps = cusps_before(directions)  # (N,)
+    # The rest begins in the direction of the next step that is driven ahead or in
+    # reverse. Whether this step begins with a cusp depends on the joint.
+    driven_steps = np.flatnonzero(directions)
+    place = np.searchsorted(driven_steps, number)
+    has_step = place < len(driven_steps)
+    next_step = driven_steps[place[has_step]]
+    direction = np.zeros(len(number), np.int64)
+    direction[has_step] = directions[next_step]
+    later_cusps = np.zeros(len(number), np.int64)
+    later_cusps[has_step] = cusps[-1] - cusps[next_step + 1]
+    costs = _without_cusps(chain, course)  # (N,)
     return Rest(
         pose=chain.poses[number],
         number=number,
         cost=costs[-1] - costs[number] + course.rates.cusp * later_cusps,
-        direction=np.where(next_step < 0, 0, np.append(directions, 0)[next_step]),
+        direction=direction,
     )
+
+
+def _numbers_of_ends(poses: Float64, course: Course) -> Int64:
+    """Return the numbers of the poses (N, 3) to which a curve may lead, sorted.
+
+    These are poses at even distances, as far as a joint may lead, and the last one.
+    """
+    lengths = lengths_of(poses)
+    farthest = min(float(lengths[-1]), FARTHEST * _unit_of(course))
+    even = np.searchsorted(lengths, np.arange(0, farthest, SPACING_OF_JOINTS))
+    return np.unique(np.append(even, len(poses) - 1))
 
 
 def _without_cusps(chain: Chain, course: Course) -> Float64:
@@ -305,11 +331,3 @@ def _without_cusps(chain: Chain, course: Course) -> Float64:
     cusps = cusps_before(directions_of_travel(chain.poses))
     costs: Float64 = chain.costs - course.rates.cusp * cusps
     return costs
-
-
-def _poses_of(begin: Float64, word: int, course: Course) -> Float64:
-    """Return the poses of the curve of `course.pieces`, except the first."""
-    count = write_curve(begin, word, course.pieces, np.empty((0, 3)))
-    poses = np.empty((count, 3))
-    write_curve(begin, word, course.pieces, poses)
-    return poses
