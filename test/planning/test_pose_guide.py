@@ -7,9 +7,10 @@ import pytest
 from networks import new_planner, robot_planner
 
 from ddqn_planner import GridMap, Planner
+from ddqn_planner.grid.layers import multipliers_of as multipliers_of_costs
 from ddqn_planner.model import RobotNetwork
 from ddqn_planner.planning import departure
-from ddqn_planner.planning.departure import make_departures
+from ddqn_planner.planning.departure import REACH, departure_cost, make_departures
 from ddqn_planner.planning.pose_field import PoseField
 from ddqn_planner.planning.pose_guide import estimated_cost, mean_multiplier
 from ddqn_planner.planning.pose_planner import body_of_network
@@ -266,3 +267,63 @@ def test_a_changed_map_has_the_multipliers_of_a_new_one(planner: Planner) -> Non
 def test_planners_of_one_network_share_its_tables(planner: Planner) -> None:
     assert isinstance(planner.network, RobotNetwork)
     assert body_of_network(planner.network) is body_of_network(planner.network)
+
+
+def test_no_estimate_is_below_what_a_departure_costs() -> None:
+    """A car that faces away from its goal has to turn round first."""
+    body = body_with_tables(robot_planner("ackermann", CELL), are_written=True)
+    start = (MIDDLE, MIDDLE, nearest_heading(math.pi, body))
+    field = guided_field(start, (MIDDLE + 60, MIDDLE, 0), open_map(), body)
+    aim = field.known.aim
+    reached = np.argwhere(aim.guide.cost > 0)
+    assert len(reached) > 100
+    for row, column in reached.tolist():
+        x = TILE * column + TILE // 2
+        y = TILE * row + TILE // 2
+        of_departure = departure_cost(x, y, aim.departure)
+        assert aim.guide.cost[row, column] >= of_departure * (1 - 1e-6)
+    near_start = abs(TILE * reached + TILE // 2 - MIDDLE).max(axis=1) < REACH - TILE
+    for row, column in reached[near_start].tolist():
+        for y, x in np.ndindex(TILE, TILE):
+            state = (TILE * column + x, TILE * row + y, 0)
+            of_departure = departure_cost(*state[:2], aim.departure)
+            assert estimate(field, state) >= of_departure * (1 - 1e-6)
+
+
+def test_an_estimate_follows_no_jump_between_tiles(planner: Planner) -> None:
+    """As there is one where a wall ends between two tiles."""
+    body = body_with_tables(planner, are_written=False)
+    start = (MIDDLE, MIDDLE, 0)
+    field = guided_field(start, (140, MIDDLE, 0), open_map(50), body)
+    cost = field.known.aim.guide.cost
+    row, column = 20, 30
+    for costs in ((10.0, 500.0, 900.0), (900.0, 500.0, 10.0)):
+        cost[row, column - 1 : column + 2] = costs
+        cost[row - 1 : row + 2, column] = 500
+        way = [
+            min(estimate(field, (x, TILE * row + 1, heading)) for heading in range(16))
+            for x in range(TILE * column, TILE * (column + 1))
+        ]
+        # A cell of cost 50 counts as 3.
+        rises = np.diff(way) * np.sign(costs[2] - costs[0])
+        assert (rises > 0).all()
+        assert (rises <= 2 * 3).all()
+        assert np.mean(way) == pytest.approx(500, abs=1)
+
+
+def test_the_multiplier_of_a_tile_is_the_mean_of_its_free_cells(
+    planner: Planner,
+) -> None:
+    assert planner.pose_planner is not None
+    random = np.random.default_rng(5)
+    occupancy = random.random((30, 46)) < 0.3
+    cost = random.integers(0, 100, occupancy.shape).astype(np.int8)
+    grid = GridMap(occupancy, CELL, cost=np.where(occupancy, 0, cost).astype(np.int8))
+    multipliers = multipliers_of(world_of(grid, planner.pose_planner.body))
+    of_cells = multipliers_of_costs(cost)
+    for row, column in np.ndindex(multipliers.shape):
+        rows = slice(TILE * row, TILE * (row + 1))
+        columns = slice(TILE * column, TILE * (column + 1))
+        is_free = ~occupancy[rows, columns]
+        mean = of_cells[rows, columns][is_free].mean() if is_free.any() else 1
+        assert multipliers[row, column] == pytest.approx(mean)
