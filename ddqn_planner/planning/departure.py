@@ -151,21 +151,44 @@ def write_departure(heading: int, body: Any) -> None:
     row = heading // body.directions
     costs = _costs_inside(row * body.directions, body)  # (SIDE, SIDE, H)
     cost_inside = costs.min(axis=2)
+    way_along = _cells_around() @ DIRECTIONS.T  # (SIDE * SIDE, PARTS)
+    excess = _least_excess(cost_inside, way_along, body)  # (PARTS,)
+    # A path to a cell of the square may leave the square and come back.
+    cost_outside = (way_along + excess).max(axis=1).reshape(SIDE, SIDE)
+    least_cost = np.minimum(cost_inside - ROUNDING, cost_outside)
+    turn = costs - least_cost[:, :, None]  # (SIDE, SIDE, H)
+    body.departures.cost[row] = least_cost
+    body.departures.turn[row] = np.minimum(turn * PER_CELL, MOST_STEPS)
+    body.departures.excess[row] = excess  # at last: it tells that the table is written
+
+
+def _cells_around() -> NDArray[np.int64]:
+    """Return x and y of the cells of the square around a start: (SIDE * SIDE, 2)."""
     y, x = np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1]
-    cells = np.column_stack([x.ravel(), y.ravel()])  # (SIDE * SIDE, 2)
-    way_along = cells @ DIRECTIONS.T  # (SIDE * SIDE, PARTS)
+    return np.column_stack([x.ravel(), y.ravel()])
+
+
+def _least_excess(
+    cost_inside: NDArray[np.float32], way_along: NDArray[np.float64], body: Any
+) -> NDArray[np.float64]:
+    """Return the excess of the way along each direction: (PARTS,), see `Departure`.
+
+    Parameters
+    ----------
+    cost_inside : (SIDE, SIDE)
+        The least cost of a path from a start that stays in the square, to each cell.
+    way_along : (SIDE * SIDE, PARTS)
+        The way from the start to each cell along each direction.
+    body : Body
+    """
     # The last state of a path before it leaves the square lies on the rim. From there
     # on the path costs no less than its way along any direction.
     longest = np.abs(body.offset).max()
-    is_on_rim = np.abs(cells).max(axis=1) > REACH - longest
-    from_rim = cost_inside.reshape(-1, 1)[is_on_rim] - way_along[is_on_rim]
-    excess = from_rim.min(axis=0) - ROUNDING  # (PARTS,)
-    cost_outside = (way_along + excess).max(axis=1).reshape(SIDE, SIDE)
-    least_cost = np.minimum(cost_inside - ROUNDING, cost_outside)
-    steps = (costs - least_cost[:, :, None]) * PER_CELL
-    body.departures.cost[row] = least_cost
-    body.departures.turn[row] = np.minimum(steps, MOST_STEPS)
-    body.departures.excess[row] = excess  # at last: it tells that the table is written
+    is_on_rim = np.abs(_cells_around()).max(axis=1) > REACH - longest
+    cost_on_rim = cost_inside.reshape(-1, 1)[is_on_rim]  # (K, 1), for K cells
+    excess = (cost_on_rim - way_along[is_on_rim]).min(axis=0)
+    least_excess: NDArray[np.float64] = excess - ROUNDING
+    return least_excess
 
 
 def _costs_inside(heading: int, body: Any) -> NDArray[np.float32]:
@@ -181,6 +204,30 @@ def _costs_inside(heading: int, body: Any) -> NDArray[np.float32]:
     return cost
 
 
+@inlined
+def _queue(x: int, y: int, heading: int, new_cost: Any, cost: Any, heap: Any) -> None:
+    """Write the cost of a state to a table (SIDE, SIDE, H) and queue its number."""
+    cost[y, x, heading] = new_cost
+    number = (y * SIDE + x) * cost.shape[2] + heading
+    push_to_heap(new_cost, number, heap)
+
+
+@inlined
+def _expand(x: int, y: int, heading: int, cost: Any, heap: Any, body: Any) -> None:
+    """Queue the states to which primitives lead more cheaply by way of a state."""
+    cost_of_state = cost[y, x, heading]
+    first = body.first_starting[heading]
+    for primitive in range(first, body.first_starting[heading + 1]):
+        end_x = x + body.offset[primitive, 0]
+        end_y = y + body.offset[primitive, 1]
+        if not (0 <= end_x < SIDE and 0 <= end_y < SIDE):
+            continue
+        end = body.end[primitive]
+        cost_of_end = np.float32(cost_of_state + body.cost[primitive])
+        if cost_of_end < cost[end_y, end_x, end]:
+            _queue(end_x, end_y, end, cost_of_end, cost, heap)
+
+
 @in_place
 def _spread(heading: int, cost: NDArray[np.float32], heap: Heap, body: Any) -> None:
     """Write the least costs from a start by Dijkstra, where there are no obstacles.
@@ -189,28 +236,15 @@ def _spread(heading: int, cost: NDArray[np.float32], heap: Heap, body: Any) -> N
     `_costs_inside`.
     """
     headings = cost.shape[2]
-    for directed in range(heading, heading + body.directions):
-        cost[REACH, REACH, directed] = 0
-        push_to_heap(0, (REACH * SIDE + REACH) * headings + directed, heap)
+    for start_heading in range(heading, heading + body.directions):
+        _queue(REACH, REACH, start_heading, np.float32(0), cost, heap)
     while heap.size[0] > 0:
         key = heap.keys[0]
-        state = pop_from_heap(heap)
-        cell = state // headings
-        start = state - cell * headings
+        number = pop_from_heap(heap)
+        cell = number // headings
         y = cell // SIDE
         x = cell - y * SIDE
-        if key > cost[y, x, start]:  # it was queued again at a smaller cost
-            continue
-        for primitive in range(
-            body.first_starting[start], body.first_starting[start + 1]
-        ):
-            end_x = x + body.offset[primitive, 0]
-            end_y = y + body.offset[primitive, 1]
-            if not (0 <= end_x < SIDE and 0 <= end_y < SIDE):
-                continue
-            end = body.end[primitive]
-            cost_of_end = np.float32(key + body.cost[primitive])
-            if cost_of_end < cost[end_y, end_x, end]:
-                cost[end_y, end_x, end] = cost_of_end
-                number = (end_y * SIDE + end_x) * headings + end
-                push_to_heap(cost_of_end, number, heap)
+        heading_there = number - cell * headings
+        # The state may have been queued again at a smaller cost, and expanded.
+        if key <= cost[y, x, heading_there]:
+            _expand(x, y, heading_there, cost, heap, body)
