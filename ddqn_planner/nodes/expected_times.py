@@ -127,24 +127,39 @@ class ExpectedTimes:
         ValueError
             If the message or the file holds no experience.
         """
-        if message is None:
-            newer = self._load_file()
-        else:
-            kind = CHANGES if has_changes(message) else "experience"
-            data = bytes_of(kind, message)
-            if message.layout == self._layout:
-                self._is_behind = False
-                return False
-            if kind == CHANGES:
-                return self._apply_changes(message.layout, data)
-            # If this one cannot be read, neither can the answer to another request.
-            self._is_behind = False
-            newer = Experience.from_bytes(data)
-        if newer is not None and self._experience is not None:
-            newer.take_posterior_from(self._experience)
-        self._experience = newer
-        self._layout = None if message is None else message.layout
+        if message is not None:
+            return self._load_message(message)
+        self._replace_experience(self._load_file(), layout=None)
         return True
+
+    def _load_message(self, message: UInt8MultiArray) -> bool:
+        """Use the experience of a message, or the changes of it, by the message's kind.
+
+        See `load` for the result and the error.
+        """
+        kind = CHANGES if has_changes(message) else "experience"
+        data = bytes_of(kind, message)
+        if message.layout == self._layout:
+            self._is_behind = False
+            return False
+        if kind == CHANGES:
+            return self._apply_changes(message.layout, data)
+        # If this one cannot be read, neither can the answer to another request.
+        self._is_behind = False
+        self._replace_experience(Experience.from_bytes(data), message.layout)
+        return True
+
+    def _replace_experience(
+        self, experience: Experience | None, layout: MultiArrayLayout | None
+    ) -> None:
+        """Use another experience, or none, instead of the one in use.
+
+        `layout` is that of the message in which it came; None for the one of a file.
+        """
+        if experience is not None and self._experience is not None:
+            experience.take_posterior_from(self._experience)
+        self._experience = experience
+        self._layout = layout
 
     def _apply_changes(self, layout: MultiArrayLayout, data: bytes) -> bool:
         """Change the experience in use; False if these changes do not follow on it.
@@ -152,12 +167,13 @@ class ExpectedTimes:
         `layout` and `data` are those of the trainer's message.
         """
         experience = self._experience
-        self._is_behind = True  # also if the changes cannot be read
-        is_applied = experience is not None and experience.apply_changes(data)
-        self._is_behind = not is_applied
-        if is_applied:
-            self._layout = layout
-        return is_applied
+        # Until they are applied. An error says that they cannot be read.
+        self._is_behind = True
+        if experience is None or not experience.apply_changes(data):
+            return False
+        self._is_behind = False
+        self._layout = layout
+        return True
 
     def _load_file(self) -> Experience | None:
         """Return the experience of the parameter's file; None without a file.

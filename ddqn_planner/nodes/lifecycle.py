@@ -288,23 +288,12 @@ class ManagedNode(BaseNode):
     ) -> ChangeState.Response:
         """Answer ``~/change_state``: do the transition that the request names.
 
-        The request has the label of the transition, or an empty label and its number. A
-        transition is refused if it does not begin at the present state, and while the
+        A transition is refused if it does not begin at the present state, and while the
         node changes its state or stops.
         """
-        labels = {change.number: change.label for change in self._changes()}
-        number = request.transition.id
-        requested_label = request.transition.label
-        label = requested_label or labels.get(number, "")
-        is_refused = self._is_changing or self.is_stopping
-        if is_refused or label not in labels.values():
-            transition = f"transition {number}"
-            if requested_label:
-                transition = repr(requested_label)
-            choices = ", ".join(labels.values()) or "none"
-            self.get_logger().error(
-                f"{transition} refused: the node has {choices} {self._circumstance()}"
-            )
+        label = self._label_of(request.transition)
+        if not label or self._is_changing or self.is_stopping:
+            self._log_refusal(request.transition)
             return response
         self._is_changing = True
         try:
@@ -318,6 +307,28 @@ class ManagedNode(BaseNode):
         finally:
             self._is_changing = False
         return response
+
+    def _label_of(self, transition: Transition) -> str:
+        """Return the label of a transition that the present state has; else empty.
+
+        A request has the label of the transition, or an empty label and its number.
+        """
+        for change in self._changes():
+            is_named = change.label == transition.label
+            is_numbered = not transition.label and change.number == transition.id
+            if is_named or is_numbered:
+                return change.label
+        return ""
+
+    def _log_refusal(self, transition: Transition) -> None:
+        """Log that a requested transition is refused, and which ones the node has."""
+        requested = f"transition {transition.id}"
+        if transition.label:
+            requested = repr(transition.label)
+        choices = ", ".join(change.label for change in self._changes()) or "none"
+        self.get_logger().error(
+            f"{requested} refused: the node has {choices} {self._circumstance()}"
+        )
 
     def _circumstance(self) -> str:
         """Return why a transition is refused, as the end of a sentence."""

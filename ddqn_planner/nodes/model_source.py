@@ -149,6 +149,20 @@ class ModelSource:
 
     def _load_and_compile(self) -> FirstModels:
         """Load the models that the parameters name, in the worker's thread."""
+        bodies, problem_of_bodies = self._load_bodies()
+        try:
+            model = read_model(self._node.value("model"))
+            self._compile(model, bodies)
+        except Exception as error:
+            problem = f"{str(error) or repr(error)}; or set the parameter 'model'"
+            return FirstModels(None, bodies, problem, problem_of_bodies)
+        return FirstModels(model, bodies, problem_of_bodies=problem_of_bodies)
+
+    def _load_bodies(self) -> tuple[list[LoadedModel], str]:
+        """Return those of the parameter ``models`` that can be read.
+
+        The text says why others cannot; it is empty if all can.
+        """
         bodies = []
         problems = []
         for name in self._node.value("models"):
@@ -156,26 +170,27 @@ class ModelSource:
                 bodies += read_bodies([name])
             except Exception as error:
                 problems.append(str(error) or repr(error))
-        problem_of_bodies = " / ".join(problems)
-        try:
-            model = read_model(self._node.value("model"))
-            compiling = self._compile(model)
-            gc.set_threshold(NEW_OBJECTS)
-            next(compiling)
-            if bodies and not model.has_body:
-                next(self._compile(bodies[0]))
-        except Exception as error:
-            problem = f"{str(error) or repr(error)}; or set the parameter 'model'"
-            return FirstModels(None, bodies, problem, problem_of_bodies)
+        return bodies, " / ".join(problems)
+
+    def _compile(self, model: LoadedModel, bodies: Sequence[LoadedModel]) -> None:
+        """Compile what most requests need, and a moment later the rest.
+
+        The model is that of the parameter ``model``, which may know no body, and
+        `bodies` are those of ``models``.
+        """
+        gc.set_threshold(NEW_OBJECTS)
+        compilation = self._compilation_for(model)
+        next(compilation)
+        if bodies and not model.has_body:
+            next(self._compilation_for(bodies[0]))
         # A collection of all objects that exist now would stop the node for 45 ms.
         gc.freeze()
-        rest = threading.Timer(REST_AFTER, next, [compiling])
+        rest = threading.Timer(REST_AFTER, next, [compilation])
         rest.daemon = True  # the end of the process does not wait for it
         rest.start()
-        return FirstModels(model, bodies, problem_of_bodies=problem_of_bodies)
 
-    def _compile(self, model: LoadedModel) -> Iterator[None]:
-        """Compile what requests to a planner with a model need, see `warm_up`."""
+    def _compilation_for(self, model: LoadedModel) -> Iterator[None]:
+        """Return the two steps of the compilation for a model, see `warm_up`."""
         planner = Planner(model.network, model.metadata)
         return warm_up(planner, self._node.value("follow_trainer"))
 
@@ -189,11 +204,12 @@ class ModelSource:
         if loading is None:
             return
         first: FirstModels = await loading
-        if self._bodies is None:
+        if self._bodies is None:  # none were set meanwhile
             self._bodies = first.bodies
             if first.problem_of_bodies:
                 self._diagnostics.refuse("models", first.problem_of_bodies)
-        if self.loading is not loading:
+        was_set_meanwhile = self.loading is not loading
+        if was_set_meanwhile:
             return
         if first.model is None:
             self.loading = None
@@ -356,7 +372,7 @@ class ModelSource:
         }
 
     def forget(self) -> None:
-        """Free the models and fields, also objects frozen by `_load_and_compile`."""
+        """Free the models and fields, also objects frozen by `_compile`."""
         self.planner = None
         self.file = ""
         self.loading = None

@@ -139,20 +139,32 @@ def unread_sections(
         The node's full name.
     """
     problems = []
-    for source, sections in _sources(arguments):
-        if not sections:
-            continue
-        own_sections = [section for section in sections if section.is_for(node)]
-        if not own_sections:
-            remedy = _remedy(sections, node)
-            problems.append(f"{source} sets nothing of {node}: {remedy}")
-        elif all(section.node_name == "**" for section in own_sections):
-            for section in sections:
-                if section not in own_sections and _is_meant(
-                    section, declared_names, node
-                ):
-                    problem = f"the section {section.pattern} is not for {node}"
-                    problems.append(f"{source}: {problem}; {_rename(section, node)}")
+    for source in _sources(arguments):
+        problems += _unread_sections_of(source, declared_names, node)
+    return problems
+
+
+def _unread_sections_of(
+    source: Source, declared_names: Collection[str], node: str
+) -> list[str]:
+    """Return a sentence about each part of a source that a node does not read.
+
+    The arguments are those of `unread_sections`.
+    """
+    words, sections = source
+    if not sections:
+        return []
+    own_sections = [section for section in sections if section.is_for(node)]
+    if not own_sections:
+        return [f"{words} sets nothing of {node}: {_remedy(sections, node)}"]
+    if any(section.node_name != "**" for section in own_sections):
+        return []  # besides a section for the node, others are for other nodes
+    problems = []
+    for section in sections:
+        is_other = section not in own_sections
+        if is_other and _is_meant(section, declared_names, node):
+            problem = f"the section {section.pattern} is not for {node}"
+            problems.append(f"{words}: {problem}; {_rename(section, node)}")
     return problems
 
 

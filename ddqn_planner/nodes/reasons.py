@@ -112,29 +112,49 @@ def reason_of_failure(
     robot_radius : float
         The parameter ``robot_radius``, in metres.
     """
+    problem = plan.explanation.cause
+    number_of_goals = len(request.goals)
+    if number_of_goals > 1:
+        problem = f"no path to any of {number_of_goals} goals: {problem}"
+    places = _places_in_words(request, start, goal)
+    lack_of_room = _lack_of_room_in_words(request, plan, robot_radius)
+    # Against unknown space, a plan has a remedy of its own.
+    remedy = plan.explanation.remedy or _remedy_of(plan, request)
+    return f"{problem} ({places}){lack_of_room}; {remedy}"
+
+
+def _places_in_words(request: Request, start: PoseStamped, goal: PoseStamped) -> str:
+    """Return where start and goals of a request lie, and how large its map is.
+
+    `start` and `goal` are those of the plan, in the map's frame.
+    """
     grid = request.grid
     start_cell, *goal_cells = request.cells
-    has_several_goals = len(goal_cells) > 1
-    problem = plan.explanation.cause
-    # A plan that unknown space has prevented has a remedy of its own.
-    is_unknown = bool(plan.explanation.remedy)
-    remedy = plan.explanation.remedy or _remedy_of(plan, request)
-    goals_in_words = f"goal: {_place(goal, goal_cells[0])}"
-    if has_several_goals:
-        problem = f"no path to any of {len(goal_cells)} goals: {problem}"
-        goals_in_words = _cells_in_words(goal_cells)
+    goals = f"goal: {_place(goal, goal_cells[0])}"
+    if len(goal_cells) > 1:
+        goals = _cells_in_words(goal_cells)
     size = f"map: {grid.width} x {grid.height} cells"
-    place = f"start: {_place(start, start_cell)}; {goals_in_words}; {size}"
-    reason = f"{problem} ({place})"
-    if plan.status is PlanStatus.GOAL_OCCUPIED and not is_unknown:
-        goals_on_map = filter(grid.contains, goal_cells)
-        # An occupied goal that is no obstacle lies in the inflated cells around one.
-        if not all(map(grid.is_obstacle, goals_on_map)):
-            limit = _clearance_in_words(plan, robot_radius)
-            reason += f", nearer to an obstacle than {limit}"
+    return f"start: {_place(start, start_cell)}; {goals}; {size}"
+
+
+def _lack_of_room_in_words(request: Request, plan: Plan, robot_radius: float) -> str:
+    """Return how much room an occupied start or goal lacks, as the end of a sentence.
+
+    It is empty for another status, for goals on obstacles, and for a start on which no
+    obstacle is ignored. `robot_radius` is in metres.
+    """
     if plan.status is PlanStatus.START_OCCUPIED and _clearing_radius(request):
-        reason += _depth_in_words(_clearing_radius(request))
-    return f"{reason}; {remedy}"
+        return _depth_in_words(_clearing_radius(request))
+    is_unknown = bool(plan.explanation.remedy)
+    if plan.status is not PlanStatus.GOAL_OCCUPIED or is_unknown:
+        return ""
+    grid = request.grid
+    _, *goal_cells = request.cells
+    goals_on_map = filter(grid.contains, goal_cells)
+    if all(map(grid.is_obstacle, goals_on_map)):
+        return ""
+    # A goal is occupied, and is no obstacle: it lies in the inflated cells around one.
+    return f", nearer to an obstacle than {_clearance_in_words(plan, robot_radius)}"
 
 
 def _remedy_of(plan: Plan, request: Request) -> str:
@@ -151,36 +171,53 @@ def _remedy_of(plan: Plan, request: Request) -> str:
     return remedy
 
 
-def reason_of_path(request: Request, plan: Plan, path: ExactPath) -> str:
+def reason_of_path(request: Request, plan: Plan, path: ExactPath = NO_PATH) -> str:
     """Return in words how long a path is, how it was found, and what was changed.
 
     The goal may have moved, or obstacles at the start may have been ignored. `plan` is
     the plan for `request`, with a path; `path` is this path between the exact poses for
     a disc, and empty for a body.
     """
-    grid = request.grid
-    _, *goal_cells = request.cells
-    length = plan.length if isinstance(plan, PosePlan) else path.length
-    reason = f"a path of {length:.2f} cells"
-    if len(goal_cells) > 1:
-        reason += f" to goal {nearest_goal(request, plan) + 1} of {len(goal_cells)}"
-    reason += f", {_method_in_words(plan)}"
-    if plan.extra_cost:
-        reason += f", kept: its cost is {plan.extra_cost:+.1%} beside that of a new one"
-    has_moved = len(goal_cells) == 1 and plan.goal != goal_cells[0]
-    if plan.goal is not None and has_moved:
-        problem = unknown_space.goal_in_words(grid, goal_cells[0]) or "is cut off"
-        # In metres between centres of cells, as the tolerance counts.
-        metres = math.dist(plan.goal, goal_cells[0]) * grid.resolution
-        reason += f"; the goal {problem} and moved {metres:.3g} m"
-    for remark in plan.explanation.remarks:
-        reason += f"; {remark}"
-    if not isinstance(plan, PosePlan) and grid.is_obstacle(plan.path[0]):
+    clauses = [_path_in_words(request, plan, path)]
+    moved_goal = _moved_goal_in_words(request, plan)
+    if moved_goal:
+        clauses.append(moved_goal)
+    clauses += plan.explanation.remarks
+    is_disc = not isinstance(plan, PosePlan)
+    if is_disc and request.grid.is_obstacle(plan.path[0]):
         radius = f"{_clearing_radius(request):.3g} m"
-        reason += (
-            f"; the start is occupied: obstacles within {radius} of it were ignored"
-        )
-    return reason
+        ignored = f"obstacles within {radius} of it were ignored"
+        clauses.append(f"the start is occupied: {ignored}")
+    return "; ".join(clauses)
+
+
+def _path_in_words(request: Request, plan: Plan, path: ExactPath) -> str:
+    """Return how long a path is, to which of several goals, and how it was found.
+
+    The arguments are those of `reason_of_path`.
+    """
+    length = plan.length if isinstance(plan, PosePlan) else path.length
+    words = f"a path of {length:.2f} cells"
+    number_of_goals = len(request.goals)
+    if number_of_goals > 1:
+        words += f" to goal {nearest_goal(request, plan) + 1} of {number_of_goals}"
+    words += f", {_method_in_words(plan)}"
+    if plan.extra_cost:
+        words += f", kept: its cost is {plan.extra_cost:+.1%} beside that of a new one"
+    return words
+
+
+def _moved_goal_in_words(request: Request, plan: Plan) -> str:
+    """Return how far a single goal has moved, and why; empty if it has not."""
+    _, *goal_cells = request.cells
+    goal = goal_cells[0]
+    if len(goal_cells) > 1 or plan.goal is None or plan.goal == goal:
+        return ""
+    grid = request.grid
+    problem = unknown_space.goal_in_words(grid, goal) or "is cut off"
+    # In metres between centres of cells, as the tolerance counts.
+    metres = math.dist(plan.goal, goal) * grid.resolution
+    return f"the goal {problem} and moved {metres:.3g} m"
 
 
 def _method_in_words(plan: Plan) -> str:

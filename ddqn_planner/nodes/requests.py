@@ -41,6 +41,7 @@ from ddqn_planner.nodes.reasons import (
     missed_goal_in_words,
     nearest_goal,
     reason_of,
+    reason_of_path,
 )
 from ddqn_planner.nodes.worker import Worker
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest
@@ -233,19 +234,44 @@ class Requests:
         costmap = self.map.arrivals.number
         outcome = await self.plan_once(query, current)
         if self._may_succeed_soon(query, costmap, outcome):
-            first_costmap = costmap
-            deadline = self.clock() + self.map.retry_wait
-            is_in_time = True
-            while outcome.has_failed and is_in_time:
-                if not await self._wait_for_costmap(costmap, deadline):
-                    # Until a costmap comes, the next query does not wait.
-                    self.map.arrivals.number_at_vain_wait = first_costmap
-                    break
-                is_in_time = self.clock() < deadline
-                costmap = self.map.arrivals.number
-                outcome = await self.plan_once(query, current)
+            retry = await self._plan_on_next_costmaps(query, current, costmap)
+            if retry is not None:
+                costmap, outcome = retry
         self.retries.note(query.goals, costmap, outcome)
         return outcome
+
+    async def _plan_on_next_costmaps(
+        self, query: PathQuery, current: Outcome | None, failed_costmap: int
+    ) -> tuple[int, Outcome] | None:
+        """Plan on each new costmap until a plan succeeds, or the retry's wait is over.
+
+        Parameters
+        ----------
+        query, current
+            See `plan`.
+        failed_costmap : int
+            The number, in `Arrivals`, of the costmap on which the query has failed.
+
+        Returns
+        -------
+        int and Outcome, or None
+            The number of the last costmap that came in time, and the outcome on it.
+            None if no costmap came: then later queries do not wait until one comes.
+        """
+        deadline = self.clock() + self.map.retry_wait
+        retry = None
+        last_costmap = failed_costmap
+        while await self._wait_for_costmap(last_costmap, deadline):
+            # A costmap that came in time counts, though it is planned on later.
+            is_last = self.clock() >= deadline
+            last_costmap = self.map.arrivals.number
+            outcome = await self.plan_once(query, current)
+            retry = last_costmap, outcome
+            if is_last or not outcome.has_failed:
+                return retry
+        if retry is None:
+            self.map.arrivals.number_at_vain_wait = failed_costmap
+        return retry
 
     def _may_succeed_soon(
         self, query: PathQuery, costmap: int, outcome: Outcome
@@ -364,12 +390,10 @@ class Requests:
             is when it is found.
         """
         planner = outcome.planner
-        goal = outcome.goal
         header = outcome.map_header
         assert isinstance(outcome.request, PoseRequest)
         assert isinstance(outcome.plan, PosePlan)
         assert planner is not None
-        assert goal is not None
         assert header is not None
         request = replace(
             outcome.request,
@@ -384,10 +408,9 @@ class Requests:
             start = await self._start_in_map(inputs)
             request = replace(request, start=pose_of(start.message))
             plan = await self._plan(planner, request)
-            if not len(plan.path):
-                return outcome  # the next request says why
-        # Reasons of paths name neither the start, here the goal, nor the robot_radius.
-        reason = reason_of(request, plan, goal, goal, 0.0)
+        if not len(plan.path):
+            return outcome  # the next request says why
+        reason = reason_of_path(request, plan)
         return replace(outcome, request=request, plan=plan, reason=reason)
 
     async def _plan_legs(
