@@ -727,7 +727,12 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
                 world = self._world(request.grid)
                 rest = self._finish.joined(rest, request.start, request.grid, world)
                 goal = self._end_of(rest, request)
-                remark = paths.ends_in_words(rest, request.start, goal)
+                has_arrived = len(rest.poses) == 1  # beside the last pose, perhaps
+                if has_arrived:
+                    (end,) = rest.poses
+                    remark = paths.inexact_ends_in_words(rest, end, goal)
+                else:
+                    remark = paths.ends_in_words(rest, request.start, goal)
             plan = rest.plan(request.grid, remark)
             is_within_bound = plan.bound <= request.bound * paths.SAME
             if is_within_bound or not request.is_bound_proved:

@@ -115,6 +115,21 @@ def test_ends_beside_start_and_goal_are_said() -> None:
     assert again.reason == planned.reason
 
 
+def test_a_robot_that_has_arrived_is_not_told_that_it_cannot_drive() -> None:
+    body = planner("ackermann")
+    for grid, yaw, reason in (
+        (HALL, 0.0, "succeeded"),
+        (CORRIDOR, -0.35, "succeeded; the path ends beside the goal"),
+    ):
+        goal = (4.52, 3.05, yaw)
+        poses = plan(body, grid, (1.5, 3.05, 0.0), goal, finished=True).poses
+        x, y, yaw_of_end = poses[-1].tolist()
+        beside = (x + 0.02, y - 0.02, yaw_of_end + 0.1)
+        arrived = plan(body, grid, beside, goal, finished=True)
+        assert np.array_equal(arrived.poses, poses[-1:])
+        assert arrived.reason == reason
+
+
 def test_each_remark_on_the_legs_of_a_path_is_one_on_the_path() -> None:
     start, goals = (1.5, 3.05, 0.35), [(3.0, 3.05, 0.0), (4.5, 3.05, -0.35)]
     body = planner("ackermann")
