@@ -99,9 +99,16 @@ class Site(User):
                 self.now += distance / steps / speed
                 self.send(self.odometry(*there))
             self.at = point
-        self.state(
-            **{f"robot{self.robot}": re.escape("({:.6g}, {:.6g})".format(*self.at))}
-        )
+        wait_for("the robot's place", self.is_seen)
+
+    def is_seen(self) -> bool:
+        """Return whether the trainer knows where the robot is; else send it again."""
+        place = re.escape("({:.6g}, {:.6g})".format(*self.at))
+        with suppress(TimeoutError):
+            return bool(self.state(timeout=5.0, **{f"robot{self.robot}": place}))
+        self.now += 0.1
+        self.send(self.odometry(*self.at))  # the last pose may be lost
+        return False
 
     def drive(
         self, points: list[tuple[float, float]], speed: float, then: Any = lambda: None

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from client import Client, values_of
+from client import TIMEOUT, Client, values_of
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Path
 from std_msgs.msg import String
@@ -65,7 +65,7 @@ class User:
     def refusal(self) -> str:
         return self.call("start", succeeds=False)
 
-    def state(self, **patterns: str) -> dict[str, str]:
+    def state(self, timeout: float = TIMEOUT, **patterns: str) -> dict[str, str]:
         """Return the next diagnostics of this trainer whose values match."""
 
         def values(array: DiagnosticArray) -> dict[str, str] | None:
@@ -78,6 +78,6 @@ class User:
             return found if is_it else None
 
         self.diagnostics.clear()
-        found = values(self.diagnostics.wait(values))
+        found = values(self.diagnostics.wait(values, timeout))
         assert found is not None
         return found
