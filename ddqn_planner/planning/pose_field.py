@@ -68,6 +68,11 @@ GREEDY_EXPONENT = 1.5
 EAGER_EXPONENT = 2.5
 # The weight of estimates of costs: mostly neither too low nor too high.
 WEIGHT_OF_GUIDE = 1.4
+# Each time that so many states were visited, the estimates have misled the search: they
+# get a greater weight, with which the search leaves fewer cheap states for the end.
+VISITS_OF_WEIGHT = 2**16
+HEAVIER = 1.5
+GREATEST_WEIGHT = 16.0
 
 
 def _untouched(count: int, dtype: DTypeLike) -> NDArray[Any]:
@@ -192,6 +197,9 @@ class PoseField(Field[Search]):
                         return math.inf
                 if self._should_learn_departure():
                     self._learn_departure()
+                elif self._should_weigh_more():
+                    aim = self.known.aim
+                    self._begin_round(aim._replace(weight=self._weight_of_guide()))
                 elif self._should_look_at_map():
                     # Finer tiles give better lower bounds: a new round begins.
                     self._begin_round(self._next_look())
@@ -226,12 +234,21 @@ class PoseField(Field[Search]):
         shape = self.world.nearness.shape  # (R, C): of tiles
         cost = _untouched(math.prod(shape), np.float32).reshape(shape)
         guide = Guide(cost, self.world.body.turn)
-        aim_with_guide = aim._replace(guide=guide, weight=WEIGHT_OF_GUIDE)
+        aim_with_guide = aim._replace(guide=guide, weight=self._weight_of_guide())
         search = self.known._replace(aim=aim_with_guide)
         goals = self._goal_tiles(SHIFT, shape)
         heap = make_heap(9 + 4 * cost.size)  # mostly no tile is queued again
         pose_guide.write_guide(search, heap, goals.is_goal, goals.box)
         return aim_with_guide if cost[goals.is_goal].any() else aim
+
+    def _weight_of_guide(self) -> float:
+        """Return the weight of estimates, which grows with the states visited."""
+        times_heavier = self.visits // VISITS_OF_WEIGHT
+        return min(WEIGHT_OF_GUIDE * HEAVIER**times_heavier, GREATEST_WEIGHT)
+
+    def _should_weigh_more(self) -> bool:
+        """Return whether estimates should count more in the order of states now."""
+        return self._is_guided() and self.known.aim.weight < self._weight_of_guide()
 
     def _goal_tiles(self, shift: int, shape: tuple[int, ...]) -> _GoalTiles:
         """Return in which tiles of 2**shift cells a side the goals lie."""

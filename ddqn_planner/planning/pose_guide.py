@@ -46,17 +46,20 @@ NO_GUIDE: Final = Guide(np.empty((0, 0), np.float32), np.empty((0, 0), np.float3
 
 @inlined
 def mean_multiplier(row: int, column: int, world: Any) -> Any:
-    """Return the mean multiplier of the free cells of a tile, kept in the world."""
+    """Return the mean multiplier of the free cells of a tile, kept in the world.
+
+    It is the harmonic mean: a path seeks the cheap cells of a tile.
+    """
     if world.multipliers[row, column] == 0:
-        total = 0.0
+        total = 0.0  # of the reciprocals
         count = 0
         one_float32 = np.float32(1)  # has the type in which primitives count them
         for y in range(row << SHIFT, min((row + 1) << SHIFT, world.height)):
             for x in range(column << SHIFT, min((column + 1) << SHIFT, world.width)):
                 if not is_occupied(x, y, world):
-                    total += multiplier_at(x, y, one_float32, world.layers)
+                    total += 1 / multiplier_at(x, y, one_float32, world.layers)
                     count += 1
-        world.multipliers[row, column] = total / count if count > 0 else 1.0
+        world.multipliers[row, column] = count / total if count > 0 else 1.0
     return world.multipliers[row, column]
 
 

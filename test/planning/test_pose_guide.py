@@ -9,7 +9,7 @@ from networks import new_planner, robot_planner
 from ddqn_planner import GridMap, Planner
 from ddqn_planner.grid.layers import multipliers_of as multipliers_of_costs
 from ddqn_planner.model import RobotNetwork
-from ddqn_planner.planning import departure
+from ddqn_planner.planning import departure, pose_field
 from ddqn_planner.planning.departure import REACH, departure_cost, make_departures
 from ddqn_planner.planning.pose_field import PoseField
 from ddqn_planner.planning.pose_guide import estimated_cost, mean_multiplier
@@ -249,6 +249,35 @@ def test_a_guided_search_tells_that_there_is_no_path(planner: Planner) -> None:
     assert field.reach((5, 30, 0), 1.2, 10**7, is_bound_proved=False) == math.inf
 
 
+def test_a_misled_search_visits_fewer_states_with_a_growing_weight(
+    planner: Planner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where half of all blocks are dear, each wall of them looks cheap to the guide."""
+    random = np.random.default_rng(6)
+    visits: dict[str, list[int]] = {"growing": [], "constant": []}
+    monkeypatch.setattr(pose_field, "VISITS_OF_WEIGHT", 2**11)
+    for _ in range(4):
+        is_dear = random.random((16, 16)) < 0.5
+        factors = np.where(is_dear, 100, 1).repeat(10, axis=0).repeat(10, axis=1)
+        grid = GridMap(np.zeros((SIDE, SIDE)), CELL, cost_multiplier=factors)
+        start = (8, 8, 0)
+        goal = (150, 150, 0)
+        field = field_to(goal, grid, planner)
+        bound = field.reach(start, 1.2, 10**7, is_bound_proved=False)
+        assert bound is not None
+        cost = field.rollout(start, 1.2, is_bound_proved=False).costs[-1]
+        visits["growing"].append(field.visits)
+        least = field_to(goal, grid, planner)
+        assert least.reach(start, 1.0, 10**7) == pytest.approx(1.0)
+        assert cost <= bound * least.rollout(start, 1.0).costs[-1] * (1 + 1e-5)
+        with monkeypatch.context() as patched:
+            patched.setattr(pose_field, "HEAVIER", 1.0)
+            other = field_to(goal, grid, planner)
+            other.reach(start, 1.2, 10**7, is_bound_proved=False)
+        visits["constant"].append(other.visits)
+    assert 2 * sum(visits["growing"]) < sum(visits["constant"])
+
+
 def test_a_changed_map_has_the_multipliers_of_a_new_one(planner: Planner) -> None:
     assert planner.pose_planner is not None
     body = planner.pose_planner.body
@@ -311,7 +340,7 @@ def test_an_estimate_follows_no_jump_between_tiles(planner: Planner) -> None:
         assert np.mean(way) == pytest.approx(500, abs=1)
 
 
-def test_the_multiplier_of_a_tile_is_the_mean_of_its_free_cells(
+def test_the_multiplier_of_a_tile_is_the_harmonic_mean_of_its_free_cells(
     planner: Planner,
 ) -> None:
     assert planner.pose_planner is not None
@@ -325,5 +354,6 @@ def test_the_multiplier_of_a_tile_is_the_mean_of_its_free_cells(
         rows = slice(TILE * row, TILE * (row + 1))
         columns = slice(TILE * column, TILE * (column + 1))
         is_free = ~occupancy[rows, columns]
-        mean = of_cells[rows, columns][is_free].mean() if is_free.any() else 1
+        reciprocals = 1 / of_cells[rows, columns][is_free]
+        mean = 1 / reciprocals.mean() if is_free.any() else 1
         assert multipliers[row, column] == pytest.approx(mean)
