@@ -46,11 +46,16 @@ from ddqn_planner.nodes.reasons import (
 from ddqn_planner.nodes.worker import Worker
 from ddqn_planner.planning import Plan, PlanMethod, Planner, PlanRequest
 from ddqn_planner.planning.exact_paths import NO_PATH, ExactPath, exact_path
-from ddqn_planner.planning.plan import PosePlan, are_joined, joined
+from ddqn_planner.planning.plan import PosePlan, are_joined, joined, with_remark
 from ddqn_planner.planning.pose_planner import PoseRequest
 
 RETRY_WITHIN = 2.0  # seconds after a failure; later if no newer costmap came
 MOST_FAILURES = 16
+# The remark on a path through several goals that none of its legs reaches exactly.
+BY_MIDDLES = (
+    "the path leads by the middles of the cells of its start and goals: from an exact"
+    " goal no curve that is free leads on"
+)
 
 Planning = Coroutine[None, None, Outcome]
 T = TypeVar("T")
@@ -438,7 +443,10 @@ class Requests:
             # No curve leads on from an exact end. Paths of primitives alone end in
             # states, from which the next ones lead on.
             of_primitives = replace(first_request, finished=False)
-            return await self._plan_legs(planner, of_primitives, later_goals)
+            legs = await self._plan_legs(planner, of_primitives, later_goals)
+            first_leg, *later_legs = legs.plans
+            first_leg = with_remark(first_leg, BY_MIDDLES)
+            return legs._replace(plans=[first_leg, *later_legs])
         return Legs(request, plans)
 
     async def _plan(self, planner: Planner, request: Request) -> Plan:

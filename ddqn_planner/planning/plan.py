@@ -340,6 +340,13 @@ def explained(plan: AnyPlan, explanation: Explanation) -> AnyPlan:
     return replace(plan, reason=str(explanation), explanation=explanation)
 
 
+def with_remark(plan: AnyPlan, remark: str) -> AnyPlan:
+    """Return a plan with one more remark on its path."""
+    explanation = plan.explanation
+    remarks = (*explanation.remarks, remark)
+    return explained(plan, explanation._replace(remarks=remarks))
+
+
 def joined(plans: Sequence[Plan]) -> Plan:
     """Return the plan through several goals, made of the plans of its legs.
 

@@ -36,7 +36,12 @@ from ddqn_planner.nodes.outcome import PathQuery
 from ddqn_planner.nodes.parameters import PlannerSettings
 from ddqn_planner.nodes.planner_node import PlannerNode
 from ddqn_planner.nodes.quality import LATCHED
-from ddqn_planner.nodes.requests import MapPose, PlanInputs, request_to
+from ddqn_planner.nodes.requests import (
+    BY_MIDDLES,
+    MapPose,
+    PlanInputs,
+    request_to,
+)
 from ddqn_planner.planning import Planner, PlanStatus
 from ddqn_planner.planning.path_finder import last_step
 from ddqn_planner.planning.plan import PosePlan, PoseRequest
@@ -441,6 +446,35 @@ def test_actions_lead_through_poses_and_paths_are_checked(
         )
         assert outcome.planner is node.model_source.planner
         assert outcome.planner is not former
+
+
+def test_a_path_by_goals_from_which_no_curve_leads_on_says_so(
+    tmp_path: FilePath,
+) -> None:
+    """A car has room along the corridor, and not to turn or to move aside."""
+    model = tmp_path / "car.safetensors"
+    robot_model(model, "ackermann", CELL, (0.35, 0.1, 0.15))
+    values = np.full((60, 60), 100, np.int8)
+    values[28:33, 5:55] = 0
+    grid = GridMap(values > 0, CELL)
+    start, first, *others = (
+        at_pose(*numbers)
+        for numbers in (
+            (1.5, 3.05, 0.0),
+            (4.0, 3.02, 0.1),
+            (4.1, 3.08, 0.0),
+            (5.0, 3.05, 0.0),
+        )
+    )
+    with node_here(model) as (node, executor):
+        node.map_source.take(map_message(values, grid, next(NUMBERS)))
+        for goal, is_exact in zip(others, (False, True), strict=True):
+            query = PathQuery(start, [first, goal])
+            planning = node.navigation.plan(query, lambda: None)
+            path, outcome = result_of(executor, planning)
+            end = array_of(Path(poses=[path.poses[-1], goal]))
+            assert np.allclose(end[0], end[1]) == is_exact
+            assert outcome.reason.endswith(f"; {BY_MIDDLES}") != is_exact
 
 
 def test_a_better_path_begins_where_the_moved_robot_is(
