@@ -116,7 +116,8 @@ def draw_times(
         curves[name] = ratios if name == banded else [np.median(ratios, axis=0)]
     figure, axes = plt.subplots(figsize=(7.2, 3.6), layout="constrained")
     missions = np.arange(len(curves[banded][0])) + width
-    draw_curves(axes, missions, curves, "mission", "time over the best possible")
+    xlabel = f"mission; each point is of the {width} missions up to it"
+    draw_curves(axes, missions, curves, xlabel, "time over the best possible")
     axes.axhline(1, color="black", linewidth=0.8)
     axes.legend(frameon=False)
     return figure, axes

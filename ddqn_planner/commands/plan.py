@@ -85,7 +85,7 @@ OPTIONS: Final = (
     ),
     Option("either-direction", bool, False, "body: the goal also in reverse"),
     Option(
-        "bound", float, 1.0, "body: how many times the least cost a path may have; inf"
+        "bound", float, 1.0, "body: times the least cost that a path may cost; inf: any"
     ),
     Option("cells", bool, False, "print each cell of the path, as X Y"),
     Option("csv", Path, None, "write the path's cells and metres, or its poses"),

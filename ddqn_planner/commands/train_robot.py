@@ -53,7 +53,8 @@ OPTIONS = (
         "lattice",
         Path,
         None,
-        "a file of Nav2's lattice generator, instead of these four",
+        "a file of Nav2's lattice generator, instead of motion, turning radius, "
+        "resolution and headings",
     ),
     Option("allow-reverse", bool, False, "the lattice's motions also in reverse"),
     Option(
