@@ -1,13 +1,10 @@
-"""Measures what a robot's body costs on a ROS map.
+"""Measures what a robot's body costs on a ROS map."""
 
-The arguments are the path of the map and the radius of the robot in metres.
-"""
-
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from processes import run_script
 from tables import table
 
 from ddqn_planner import MoveRule, Planner, inflate, load_map
@@ -59,4 +56,10 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    run_script(
+        main,
+        {
+            "map": "a map's YAML file, or a shipped map (office)",
+            "radius": "the robot's radius, metres (0.15)",
+        },
+    )

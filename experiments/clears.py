@@ -133,4 +133,4 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    run_script(main)
+    run_script(main, {"clears": "clears of each costmap (20)"})

@@ -108,4 +108,4 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    run_script(main)
+    run_script(main, {"python": "the Python that plans (this one)"})

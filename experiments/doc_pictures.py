@@ -4,7 +4,8 @@
 """
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from argparse import ArgumentParser
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -246,9 +247,15 @@ FILES: Mapping[str, Callable[[Path], None]] = {
 }
 
 
-def main(names: Sequence[str]) -> int:
+def main() -> int:
     """Draw pictures into docs/images, in few colours."""
-    for name in names or [*PICTURES, *FILES]:
+    names = [*PICTURES, *FILES]
+    parser = ArgumentParser(description=main.__doc__)
+    parser.add_argument("names", nargs="*", help=f"all by default: {', '.join(names)}")
+    chosen = parser.parse_args().names
+    if unknown := [name for name in chosen if name not in names]:
+        parser.error(f"there is no picture {unknown[0]!r}; give {', '.join(names)}")
+    for name in chosen or names:
         if name in FILES:
             path = IMAGES / name
             FILES[name](path)
@@ -269,4 +276,4 @@ def save_picture(figure: Any, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

@@ -146,4 +146,10 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    run_script(main)
+    run_script(
+        main,
+        {
+            "busy": "processes that keep the machine busy (0)",
+            "runs": "starts of each node (10)",
+        },
+    )

@@ -1,11 +1,11 @@
 """Measures the bytes of experience, and whether merging counts drives twice."""
 
-import sys
 import time
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from processes import run_script
 from tables import report
 
 from ddqn_planner import Experience, GridMap
@@ -82,4 +82,4 @@ def main(_: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    run_script(main, {})

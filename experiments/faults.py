@@ -334,4 +334,4 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    run_script(main)
+    run_script(main, {"kills": "kills of all nodes together (50)"})

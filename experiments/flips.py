@@ -153,4 +153,4 @@ def is_flip(last_path: NDArray[np.int32], path: NDArray[np.int32]) -> bool:
 
 
 if __name__ == "__main__":
-    run_script(main)
+    run_script(main, {})

@@ -349,4 +349,4 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    run_script(main)
+    run_script(main, {"requests": "requests of all clients together (10,000)"})

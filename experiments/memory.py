@@ -151,4 +151,4 @@ def main(_: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    processes.run_script(main)
+    processes.run_script(main, {})

@@ -358,4 +358,4 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    processes.run_script(main)
+    processes.run_script(main, {"map": "a ROS map's YAML file (the office)"})

@@ -6,7 +6,8 @@ import socket
 import subprocess
 import sys
 import sysconfig
-from collections.abc import Callable, Iterator, Sequence
+from argparse import ArgumentParser
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NoReturn
@@ -118,16 +119,32 @@ def cpu_seconds(process: int) -> float:
     return (user_ticks + system_ticks) / os.sysconf("SC_CLK_TCK")
 
 
-def run_script(main: Callable[[Sequence[str]], int]) -> NoReturn:
+def run_script(
+    main: Callable[[Sequence[str]], int], arguments: Mapping[str, str] | None = None
+) -> NoReturn:
     """Exit with what `main` returns for the command line.
 
     The nodes end with this process, also when a signal ends it.
+
+    Parameters
+    ----------
+    main
+        Takes the arguments of the command line.
+    arguments
+        What each argument means, by its name, for ``--help``; each may be left out.
+        None: `main` has a parser of its own.
     """
     # A shell starts what it runs in the background with SIGINT ignored, and so would
     # the nodes be.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    words = sys.argv[1:]
+    if arguments is not None:
+        parser = ArgumentParser(description=sys.modules["__main__"].__doc__)
+        for name, meaning in arguments.items():
+            parser.add_argument(name, nargs="?", help=meaning)
+        parser.parse_args(words)
     try:
-        sys.exit(main(sys.argv[1:]))
+        sys.exit(main(words))
     except KeyboardInterrupt:
         sys.exit(130)

@@ -389,4 +389,4 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    run_script(main)
+    run_script(main, {"minutes": "how long the nodes work (30)"})

@@ -19,6 +19,7 @@ import pyastar2d
 import tcod.path
 import torch
 from numpy.typing import NDArray
+from processes import run_script
 from random_maps import KINDS, Random, generate_map
 from stable_baselines3 import DQN
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -456,7 +457,7 @@ def measure_training() -> Iterator[bool]:
         yield report(figure, ratio, "x", bound, at_most=False)
 
 
-def main() -> int:
+def main(_: Sequence[str]) -> int:
     """Print each figure beside its bound; return 1 if one is missed."""
     torch.set_num_threads(1)
     # Else this process pauses to look for garbage among what it has imported.
@@ -480,4 +481,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_script(main, {})

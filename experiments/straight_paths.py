@@ -247,4 +247,4 @@ def _optimum(points: NDArray[np.int64], layers: Any) -> float:
 
 
 if __name__ == "__main__":
-    run_script(main)
+    run_script(main, {})
