@@ -11,6 +11,7 @@ from ddqn_planner.nodes.conversions import bytes_message, bytes_of
 from ddqn_planner.nodes.learning_node import LearningNode
 from ddqn_planner.nodes.quality import CHANGING, LATCHED
 from ddqn_planner.nodes.worker import Worker
+from ddqn_planner.robot.footprint import in_words
 
 if TYPE_CHECKING:
     from ddqn_planner.training.robot import RobotTrainer
@@ -94,7 +95,7 @@ class BodyTraining:
         if not isinstance(network, RobotNetwork):
             raise ValueError("the model knows no body; ask with that of a robot")
         logger = self._node.get_logger()
-        logger.info(f"training the footprint {network.footprint.round(3).tolist()}")
+        logger.info(f"training the footprint {in_words(network.footprint)}")
         trainer = RobotTrainer(
             network.footprint.tolist(), network.motions, order.seed, order.padding
         )

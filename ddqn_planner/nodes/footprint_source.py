@@ -51,7 +51,7 @@ class FootprintSource:
         self._is_needed = is_needed
         self._on_footprint = on_footprint
         # The corners of the message whose footprint was told of last.
-        self._last_corners: Corners = np.empty((0, 2))
+        self._last_corners: Corners | None = None
         node.create_subscription(PolygonStamped, TOPIC, self._on_message, 1)
 
     def _on_message(self, message: PolygonStamped) -> None:
@@ -71,7 +71,7 @@ class FootprintSource:
     def _is_like_last(self, corners: Corners) -> bool:
         """Return whether corners (K, 2) are the last ones but for rounding."""
         last = self._last_corners
-        if corners.shape != last.shape:
+        if last is None or corners.shape != last.shape:
             return False
         return bool(np.abs(corners - last).max(initial=0.0) < TOLERANCE / 2)
 

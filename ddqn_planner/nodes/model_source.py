@@ -23,7 +23,7 @@ from ddqn_planner.nodes.diagnostics import PlannerDiagnostics
 from ddqn_planner.nodes.worker import Worker
 from ddqn_planner.planning import Planner
 from ddqn_planner.robot.cover import best_cover, excess
-from ddqn_planner.robot.footprint import Corners
+from ddqn_planner.robot.footprint import Corners, in_words
 from ddqn_planner.warm_up import warm_up
 
 # Seconds from the loading of a model to the compilation of what few requests need: what
@@ -35,7 +35,6 @@ NEW_OBJECTS = 20_000
 # Metres by which a model may be larger than the footprint that it is used for, or a
 # cell: more is told.
 ROOM = 0.05
-MOST_LETTERS = 500  # of a footprint in a message
 TRAIN = (
     "train one with ddqn-planner train-robot and name it in the parameter models "
     "(a costmap's footprint contains its footprint_padding)"
@@ -385,9 +384,3 @@ class ModelSource:
         self._larger_network = None
         gc.unfreeze()
         gc.collect()
-
-
-def in_words(footprint: Corners) -> str:
-    """Return a footprint (K, 2) as Nav2 writes it, to the millimetre."""
-    text = str(footprint.round(3).tolist())
-    return text if len(text) <= MOST_LETTERS else f"{text[:MOST_LETTERS]}..."

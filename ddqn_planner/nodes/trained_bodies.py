@@ -13,11 +13,11 @@ from ddqn_planner.nodes.base_node import BaseNode
 from ddqn_planner.nodes.clocks import STEADY
 from ddqn_planner.nodes.conversions import bytes_message, bytes_of
 from ddqn_planner.nodes.diagnostics import Diagnostics
-from ddqn_planner.nodes.model_source import LoadedModel, ModelSource, in_words
+from ddqn_planner.nodes.model_source import LoadedModel, ModelSource
 from ddqn_planner.nodes.quality import LATCHED
 from ddqn_planner.nodes.worker import Worker
 from ddqn_planner.robot.cover import TOLERANCE, excess
-from ddqn_planner.robot.footprint import Corners
+from ddqn_planner.robot.footprint import Corners, in_words
 
 REQUESTS = "trainer/untrained_body"
 ANSWERS = "trainer/body"

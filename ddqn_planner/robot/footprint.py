@@ -16,6 +16,7 @@ Points = NDArray[np.float64]  # (N, 2)
 
 CIRCLE_CORNERS: Final = 24  # of the polygon around a circle
 MAX_CORNERS: Final = 1000
+MOST_LETTERS: Final = 500  # of a footprint in words
 MAX_DISTANCE: Final = 100.0  # metres from the robot's origin to a corner
 SAME_CORNER: Final = 1e-6  # metres: corners at this distance are the same
 MIN_THICKNESS: Final = 1e-4  # metres: a thinner body has no area
@@ -82,11 +83,17 @@ def read_footprint(footprint: Any, padding: float = 0.0) -> Corners:
     return padded
 
 
+def in_words(footprint: Corners) -> str:
+    """Return a footprint (K, 2) as Nav2 writes it, to the millimetre, cut if long."""
+    text = str(footprint.round(3).tolist())
+    return text if len(text) <= MOST_LETTERS else f"{text[:MOST_LETTERS]}..."
+
+
 def _check_polygon(corners: Corners, text: str) -> None:
     """Raise a ValueError, with a footprint's text, if its corners form no polygon."""
     if len(corners) < 3:
-        problem = f"the footprint {text} has fewer than three or more points that"
-        raise ValueError(f"{problem} differ; {REMEDY}")
+        problem = f"the footprint {text} has fewer than three points that differ"
+        raise ValueError(f"{problem}; {REMEDY}")
     centred = corners - corners.mean(axis=0)
     thickness = np.linalg.svd(centred, compute_uv=False)[1]
     if thickness < MIN_THICKNESS:

@@ -91,6 +91,9 @@ def test_a_footprint_is_told_once_wherever_the_robot_is(
     diagnostics = PlannerDiagnostics(node)
     FootprintSource(node, diagnostics, transforms, lambda: True, told.append)
     publish = node.callbacks[TOPIC]
+    # A message without corners is refused also before the first footprint.
+    publish(message(FOOTPRINT[:0], "base_link"))
+    assert "fewer than three points" in diagnostics.refused[TOPIC]
     for pose in poses:
         transforms.robot = np.array(pose)
         publish(message(placed(FOOTPRINT, transforms.robot), "map"))

@@ -305,11 +305,11 @@ def test_swept_cells_are_those_that_a_polygon_touches(footprint: Any) -> None:
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("[[1, 2], [3, 4]]", "three or more points"),
+        ("[[1, 2], [3, 4]]", "three points that differ"),
         ("a robot", "a robot.*give a radius"),
         ("[[0, 0], [1, 1], [1, 0], [0, 1]]", "cross"),
         ("[[0, 0], [1, 1], [2, 2]]", "on one line; give points around an area"),
-        ([(0, 0), (1, 0), (1, 0), (0, 0)], "three or more points"),
+        ([(0, 0), (1, 0), (1, 0), (0, 0)], "three points that differ"),
         ("-1", "the radius is -1"),
         (0, "the radius is 0; give 0.001 to 100 metres"),
         (True, "the radius is (True|np.False_|False); give 0.001"),
