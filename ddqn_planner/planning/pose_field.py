@@ -72,7 +72,7 @@ WEIGHT_OF_GUIDE = 1.4
 # get a greater weight, with which the search leaves fewer cheap states for the end.
 VISITS_OF_WEIGHT = 2**16
 HEAVIER = 1.5
-GREATEST_WEIGHT = 16.0
+GREATEST_WEIGHT = 1e3
 
 
 def _untouched(count: int, dtype: DTypeLike) -> NDArray[Any]:
