@@ -18,7 +18,13 @@ from ddqn_planner.planning.departure import (
     part_of,
     turn_at_arrival,
 )
-from ddqn_planner.planning.pose_world import SHIFT, TILE, is_occupied, is_passable
+from ddqn_planner.planning.pose_world import (
+    SHIFT,
+    TILE,
+    is_occupied,
+    is_passable,
+    offset_from_box,
+)
 from ddqn_planner.planning.queues import pop_from_heap, push_to_heap
 
 # No tile is visited to which it costs so many times as much as to the nearest goal.
@@ -109,9 +115,8 @@ def _push_tile(
 ) -> None:
     """Write the cost of a tile and queue it, in the order of A* toward a box."""
     search.aim.guide.cost[row, column] = new_cost
-    dx = max(box[0] - column, column - box[2], 0)
-    dy = max(box[1] - row, row - box[3], 0)
-    key = new_cost + TILE * math.sqrt(dx * dx + dy * dy)
+    columns, rows = offset_from_box(column, row, box)
+    key = new_cost + TILE * math.sqrt(columns * columns + rows * rows)
     if heap.size[0] < heap.keys.size:
         push_to_heap(key, row * search.aim.guide.cost.shape[1] + column, heap)
 

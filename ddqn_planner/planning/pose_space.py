@@ -20,6 +20,7 @@ from ddqn_planner.planning.pose_world import (
     is_inside,
     is_occupied,
     is_passable,
+    offset_from_box,
     stands_on_obstacle,
 )
 from ddqn_planner.planning.queues import (
@@ -584,7 +585,9 @@ STRAIGHT, DIAGONAL = 5, 7
 # primitive, so that up to half a step at each border of tiles may count as of the other
 # tile. That is less than 0.5 % of a tile of 2 cells.
 HEIGHT_SHARE: Final = 0.99
-FURTHER: Final = 1.2  # times the path to the nearest goal, beyond which none is sought
+# No corner is visited to which it takes so many times as many steps as to the nearest
+# goal. A guide looks less far, see `pose_guide.BEYOND_GOAL`, as it proves nothing.
+BEYOND_GOAL: Final = 1.2
 LONGER: Final = math.sqrt(1 + (DIAGONAL / STRAIGHT - 1) ** 2)
 
 
@@ -604,8 +607,7 @@ def steps_to_box(x: int, y: int, box: NDArray[np.int64]) -> int:
     All are corners of tiles, counted in tiles. The box (4,) is the least x, the least
     y, the greatest x and the greatest y.
     """
-    columns = max(box[0] - x, x - box[2], 0)
-    rows = max(box[1] - y, y - box[3], 0)
+    columns, rows = offset_from_box(x, y, box)
     return steps(columns, rows)
 
 
@@ -692,7 +694,7 @@ def write_corner_bounds(
         if last_key > key:  # the corner was queued once more, with fewer steps
             continue
         if is_goal[y, x]:
-            greatest_key = min(greatest_key, FURTHER * step_count[y, x])
+            greatest_key = min(greatest_key, BEYOND_GOAL * step_count[y, x])
         _step_over_tiles(x, y, search, multipliers, passability, box)
     if multipliers.size > 0:
         _turn_into_height(search, last_key, multipliers, box)

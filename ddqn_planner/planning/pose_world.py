@@ -738,6 +738,18 @@ def is_passable(
     return bool(passability[row, column] == PASSABLE)
 
 
+@inlined
+def offset_from_box(column: int, row: int, box: Any) -> tuple[int, int]:
+    """Return how many columns and rows a tile lies outside a box of tiles.
+
+    The box (4,) is the least column and row in it, and the greatest. Corners of tiles
+    are counted in the same way.
+    """
+    columns = max(box[0] - column, column - box[2], 0)
+    rows = max(box[1] - row, row - box[3], 0)
+    return columns, rows
+
+
 @in_place
 def move_free_to_front(states: NDArray[np.int64], world: World) -> int:
     """Move the states at which the body has room to the front; return how many.
