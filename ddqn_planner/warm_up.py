@@ -8,7 +8,9 @@ from ddqn_planner.experience import Experience
 from ddqn_planner.grid import GridMap
 from ddqn_planner.planning import Planner, departure
 from ddqn_planner.planning.exact_paths import exact_path
+from ddqn_planner.planning.path_finder import last_step
 from ddqn_planner.planning.paths import rest_of_path
+from ddqn_planner.planning.plan import PoseRequest
 
 
 def warm_up(planner: Planner, learns: bool = False) -> Iterator[None]:
@@ -63,7 +65,7 @@ def _plan_poses(planner: Planner) -> None:
 
     A wall divides the map into two rooms. The body plans from one room to the other
     with the wall, without it, and past an obstacle in its place, and within one cell;
-    then the rest of the last path is computed.
+    then the last path is compared with a new one.
     """
     assert planner.pose_planner is not None
     resolution = planner.pose_planner.motions.resolution
@@ -85,4 +87,5 @@ def _plan_poses(planner: Planner) -> None:
     opened = grid.with_patch(np.zeros((side, 1), np.bool_), side, 0)
     planner.plan_poses(opened, start, goal)
     plan = planner.plan_poses(opened.with_patch([[True]], side, 0), start, goal)
-    planner.pose_planner.rest_of(plan.poses, start, grid)
+    request = PoseRequest(opened, start, (goal,), under_way=plan.poses)
+    last_step(planner.pose_planner.steps(request))

@@ -141,7 +141,9 @@ import sys
 import numpy as np
 from ddqn_planner import Experience, GridMap, Planner
 from ddqn_planner.planning.exact_paths import exact_path
+from ddqn_planner.planning.path_finder import last_step
 from ddqn_planner.planning.paths import rest_of_path
+from ddqn_planner.planning.plan import PoseRequest
 from ddqn_planner.warm_up import warm_up
 
 
@@ -169,6 +171,9 @@ def ask_for_poses(planner):
         planner.plan_poses(patched, (1, 1, 0), [(5, 4, 1), (5, 1, 1)], (0.3, 0.2))
         planner.plan_poses(grid.with_patch([[True]], 119, 0), (1, 1, 0), (5, 4, 1))
         planner.pose_planner.rest_of(plan.poses, (1, 1, 0), patched)
+        for poses in (plan.poses, plan.poses[3:]):
+            request = PoseRequest(grid, (1, 1, 0), ((5, 4, 1),), under_way=poses)
+            last_step(planner.pose_planner.steps(request))
 
 
 def ask(planner):

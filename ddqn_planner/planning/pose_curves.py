@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ddqn_planner.compiled import in_place
 from ddqn_planner.grid.layers import forbids, has_costs, multiplier_at
 from ddqn_planner.grid.moves import ACTION_OF_STEP
-from ddqn_planner.planning.pose_paths import Float64
+from ddqn_planner.planning.pose_paths import Float64, least_cost_of_step
 from ddqn_planner.planning.pose_world import (
     BORDER,
     LAST_BIT,
@@ -24,7 +24,7 @@ from ddqn_planner.planning.pose_world import (
     is_far,
     is_inside,
 )
-from ddqn_planner.robot.directions import AHEAD, ON_THE_SPOT
+from ddqn_planner.robot.directions import AHEAD
 from ddqn_planner.robot.driving_costs import Rates
 from ddqn_planner.robot.motions import ANGLE, SPACING
 
@@ -506,26 +506,18 @@ def count_free(path: Float64, course: Any) -> int:
 
 
 @in_place
-def _least_cost_of_step(
-    dx: float, dy: float, yaw: float, turn: float, rates: Any
-) -> float:
-    """Return what a step of a path costs where each cell costs 1.
+def _direction_of_step(
+    dx: float, dy: float, length: float, yaw: float, turn: float
+) -> int:
+    """Return the direction of travel of a step, see `directions_of_travel`.
 
     It leads by (dx, dy), in cells, and turns from a yaw on.
     """
-    length = math.sqrt(dx * dx + dy * dy)
-    is_bend = abs(turn) > ON_THE_SPOT
-    if length < ON_THE_SPOT:
-        return abs(turn) * rates.spin if is_bend else 0.0
     mean_yaw = yaw + turn / 2
     ahead = dx * math.cos(mean_yaw) + dy * math.sin(mean_yaw)
     if ahead > AHEAD * length:
-        rate: float = rates.bend_ahead if is_bend else rates.ahead
-    elif ahead < -AHEAD * length:
-        rate = rates.bend_behind if is_bend else rates.behind
-    else:
-        rate = rates.aside
-    return length * rate
+        return 1
+    return -1 if ahead < -AHEAD * length else 0
 
 
 @in_place
@@ -544,11 +536,10 @@ def write_costs(path: Float64, count: int, course: Any, costs: Float64) -> None:
         dx = path[number, 0] - x
         dy = path[number, 1] - y
         turn = path[number, 2] - yaw
-        least = _least_cost_of_step(dx, dy, yaw, turn, course.rates)
-        # The cells that the step passes, as those of a line.
-        direction = math.atan2(dy, dx)
         length = math.sqrt(dx * dx + dy * dy)
-        multiplier = _mean_multiplier(
-            (x, y, direction), 0.0, length, False, course.world
-        )
+        direction = _direction_of_step(dx, dy, length, yaw, turn)
+        least = least_cost_of_step(length, turn, direction, course.rates)
+        # The cells that the step passes, as those of a line.
+        line = (x, y, math.atan2(dy, dx))
+        multiplier = _mean_multiplier(line, 0.0, length, False, course.world)
         costs[number] = costs[number - 1] + least * multiplier

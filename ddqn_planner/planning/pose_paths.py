@@ -278,44 +278,78 @@ def cells_of(path: Float64) -> NDArray[np.int32]:
     return np.floor(path[:, :2] + 0.5).astype(np.int32)
 
 
+@in_place
+def least_cost_of_step(length: float, turn: float, direction: int, rates: Any) -> float:
+    """Return what a step from pose to pose costs where each cell costs 1, in cells.
+
+    Parameters
+    ----------
+    length : float
+        In cells. A step shorter than `ON_THE_SPOT` is a turn on the spot.
+    turn : float
+        In radians.
+    direction : int
+        Of travel, see `directions_of_travel`.
+    rates : Rates
+        Infinite where the robot cannot drive so; then so is the cost.
+    """
+    is_bend = abs(turn) > ON_THE_SPOT
+    if length < ON_THE_SPOT:
+        return abs(turn) * rates.spin if is_bend else 0.0
+    if direction > 0:
+        rate: float = rates.bend_ahead if is_bend else rates.ahead
+    elif direction < 0:
+        rate = rates.bend_behind if is_bend else rates.behind
+    else:
+        rate = rates.aside
+    return length * rate
+
+
+@in_place
+def _write_least_costs(
+    lengths: Float64,
+    turns: Float64,
+    directions: NDArray[np.int64],
+    rates: Any,
+    costs: Float64,
+) -> None:
+    """Write what N steps cost where each cell costs 1: (N,), see `least_cost_of_step`.
+
+    All arrays are (N,).
+    """
+    for step in range(len(costs)):
+        costs[step] = least_cost_of_step(
+            lengths[step], turns[step], directions[step], rates
+        )
+
+
 def cost_of_poses(poses: Float64, grid: GridMap, rates: Rates) -> float:
     """Return the cost of a path along poses (N, 3), in cells.
 
-    The poses are in metres and radians, in the map's frame. A step from a pose to the
-    next one costs its length or its turn on the spot by the robot's rates, times the
-    multiplier of the step's cell. What the robot cannot drive costs as much as another
-    robot's. The sum is nearly the cost of the primitives of which the path is made.
+    The poses are in metres and radians, in the map's frame. The layers of the map count
+    at the cell in which a step begins, so the sum is nearly the cost of the primitives
+    of which the path is made. What the robot cannot drive costs as much as another
+    robot's.
     """
     path = in_cells(poses, grid)
     path[:, 2] = np.unwrap(path[:, 2])
     usual_spin = TURN / grid.resolution
     usual_rates = Rates(1.0, 1.0, BEHIND, BEHIND, BEHIND, usual_spin)
-    rate = Rates(*np.where(np.isfinite(rates), rates, usual_rates).tolist())
-    steps: Float64 = np.diff(path[:, :2], axis=0)
-    dx = steps[:, 0]
-    dy = steps[:, 1]
-    # All arrays from here on are (N - 1,), a number for each step.
-    length = np.hypot(dx, dy)
-    turn = np.abs(np.diff(path[:, 2]))
-    direction = directions_of_travel(path)
-    is_bend = turn > ON_THE_SPOT
-    rate_ahead = np.where(is_bend, rate.bend_ahead, rate.ahead)
-    rate_behind = np.where(is_bend, rate.bend_behind, rate.behind)
-    rate_along = np.where(direction > 0, rate_ahead, rate_behind)
-    drive_cost = length * np.where(direction == 0, rate.aside, rate_along)
-    is_on_the_spot = length < ON_THE_SPOT
-    cost = np.where(is_on_the_spot, turn * rate.spin, drive_cost)
-    # The layers of the map count at the cell in which a step begins.
+    finite_rates = Rates(*np.where(np.isfinite(rates), rates, usual_rates).tolist())
+    dx, dy, turns = np.diff(path, axis=0).T  # (N - 1,) each
+    directions = directions_of_travel(path)  # (N - 1,)
+    costs = np.empty(len(directions))  # of the steps
+    _write_least_costs(np.hypot(dx, dy), turns.copy(), directions, finite_rates, costs)
     cells = cells_of(path[:-1])  # (N - 1, 2)
     x = cells[:, 0]
     y = cells[:, 1]
     cell_costs = body_costs(grid)
     if cell_costs is not None:
-        cost *= multipliers_of(cell_costs[y, x])
+        costs *= multipliers_of(cell_costs[y, x])
     if grid.slowness is not None:
-        cost *= grid.slowness[y, x]
-    cusps = int(cusps_before(direction)[-1])
-    return float(cost.sum()) + rate.cusp * cusps
+        costs *= grid.slowness[y, x]
+    cusps = int(cusps_before(directions)[-1])
+    return float(costs.sum()) + finite_rates.cusp * cusps
 
 
 @in_place
