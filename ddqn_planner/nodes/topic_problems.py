@@ -1,4 +1,7 @@
-"""Why a node does not receive what is published on its topics, or receives too much."""
+"""Why a node does not receive what is published on its topics, or receives too much.
+
+Or why another node may receive what is sent to it.
+"""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -13,6 +16,9 @@ EFFECTS_OF_SEVERAL_PUBLISHERS: dict[object, str] = {
     Odometry: "the robot's place may jump from one's to the other's",
     OccupancyGrid: "each message replaces the last one of the other",
 }
+# The name of a publisher's node that is not discovered yet, or not there any more.
+UNKNOWN_NAME = "_NODE_NAME_UNKNOWN_"
+KILLED = "a node that was killed counts for some 20 s more"
 
 
 class Misfit(NamedTuple):
@@ -30,9 +36,25 @@ MISFITS = (
 
 
 def topic_problems(node: Node) -> Iterator[str]:
-    """Yield a sentence for each problem of the topics that a node subscribes to."""
+    """Yield a sentence for each problem of the topics that a node subscribes to.
+
+    And one if other nodes have the node's name, and so its services.
+    """
+    yield from _problem_of_name(node)
     for subscription in node.subscriptions:
         yield from _problems_of(subscription, node)
+
+
+def _problem_of_name(node: Node) -> Iterator[str]:
+    """Yield a sentence if other nodes have the node's name."""
+    name = node.get_name(), node.get_namespace()
+    nodes = node.get_node_names_and_namespaces().count(name)
+    if nodes > 1:
+        yield (
+            f"{nodes} nodes are called {node.get_fully_qualified_name()}, so another "
+            "one may answer its requests; end the others, or start them with another "
+            f"name (-r __node:=NAME) or namespace (-r __ns:=/NAME); {KILLED}"
+        )
 
 
 def _problems_of(subscription: Subscription, node: Node) -> Iterator[str]:
@@ -40,6 +62,8 @@ def _problems_of(subscription: Subscription, node: Node) -> Iterator[str]:
     topic = subscription.topic_name
     misfits_by_publisher: list[tuple[str, list[Misfit]]] = []
     for publisher in node.get_publishers_info_by_topic(topic):
+        if publisher.node_name == UNKNOWN_NAME:
+            continue
         name = f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
         misfits = _misfits(publisher.qos_profile, subscription.qos_profile)
         misfits_by_publisher.append((name, misfits))
@@ -47,9 +71,11 @@ def _problems_of(subscription: Subscription, node: Node) -> Iterator[str]:
     effect = EFFECTS_OF_SEVERAL_PUBLISHERS.get(subscription.msg_type)
     if effect and len(received_names) > 1:
         names = ", ".join(sorted(received_names))
+        has_namesakes = len({*received_names}) < len(received_names)
+        hint = f"; {KILLED}" if has_namesakes else ""
         yield (
             f"{topic} has {len(received_names)} publishers ({names}), so {effect}; "
-            "let one publish, or remap the others"
+            f"let one publish, or remap the others{hint}"
         )
     for name, misfits in misfits_by_publisher:
         for policy, offered, requested in misfits:
