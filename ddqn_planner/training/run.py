@@ -102,6 +102,7 @@ class TrainingRun(WorkFolder):
                 yield progress
                 if "stop" in self.requests:
                     break
+            self._after = "then start it again: it continues from the last save"
             self.try_to_save()
 
     def _progress(self, every: int | None) -> Iterator[Progress]:

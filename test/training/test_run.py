@@ -156,6 +156,18 @@ def test_a_failed_save_is_tried_again_later(small: Scenario, tmp_path: Path) -> 
     run.close()
 
 
+def test_a_last_save_that_fails_says_how_to_continue(
+    small: Scenario, tmp_path: Path
+) -> None:
+    run = open_run(tmp_path / "run", small, steps=500, environments=50)
+    (tmp_path / "run").rename(tmp_path / "moved")
+    (tmp_path / "run").touch()
+    finish(run)
+    assert "make room" in run.save_error
+    assert "start it again" in run.save_error
+    assert "the training continues" not in run.save_error
+
+
 def test_a_run_that_is_stopped_is_saved_and_ends(
     small: Scenario, tmp_path: Path
 ) -> None:
