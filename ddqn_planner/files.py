@@ -68,6 +68,20 @@ def kind_of(path: str | Path) -> str:
     return _kind(mode)
 
 
+def is_missing(path: str | Path) -> bool:
+    """Return whether there is no file; False if the rights of a folder hide that.
+
+    What opens the file then says that it may not be read.
+    """
+    try:
+        os.stat(path)
+    except PermissionError:
+        return False
+    except (OSError, ValueError):
+        return True
+    return False
+
+
 def _kind(mode: int) -> str:
     """Return the kind of file that a mode of `os.stat` means, "" if it is regular."""
     return "" if stat.S_ISREG(mode) else KINDS.get(stat.S_IFMT(mode), "no file")

@@ -203,3 +203,24 @@ def test_each_option_that_names_a_file_knows_the_home_folder(
         assert ended.value.code == 2
     for wrong in ("certify ~nobody_there/m", "plan ~nobody_there/m.yaml"):
         assert "no home folder of a user 'nobody_there'" in console(wrong, status=2).err
+
+
+def test_a_file_in_a_folder_that_may_not_be_read_is_not_called_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(real: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a function of the system that may not look below `tmp_path`."""
+
+        def call(path: Any, *arguments: Any, **options: Any) -> Any:
+            if isinstance(path, int) or not str(path).startswith(str(tmp_path)):
+                return real(path, *arguments, **options)
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+
+        return call
+
+    monkeypatch.setattr(os, "stat", refused(os.stat))
+    monkeypatch.setattr(os, "open", refused(os.open))
+    for read in (load_map, Planner.load):
+        for name in ("any.yaml", "any.safetensors"):
+            with pytest.raises(ValueError, match=r"Permission denied.*rights|ends in"):
+                read(tmp_path / name)

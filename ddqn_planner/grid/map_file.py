@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ddqn_planner.files import as_path, kind_of, read_file
+from ddqn_planner.files import as_path, is_missing, kind_of, read_file
 from ddqn_planner.grid.arguments import (
     OCCUPIED,
     UNKNOWN,
@@ -197,7 +197,7 @@ def read_map_file(path: str | Path, only_below: bool = False) -> MapFile:
     kind = kind_of(path)
     if kind:
         raise MapNotFoundError(f"{str(path)!r} is {kind}; give the path of a map file")
-    if not os.path.isfile(path):
+    if is_missing(path):
         raise MapNotFoundError(f"{str(path)!r}: no such file; give the path of a map")
     if path.suffix.lower() not in (".yaml", ".yml", ".map"):
         raise MapMetadataError(

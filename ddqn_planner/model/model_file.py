@@ -13,7 +13,7 @@ import safetensors.numpy
 from numpy.typing import NDArray
 from safetensors import SafetensorError
 
-from ddqn_planner.files import as_path, kind_of, read_file, write_atomically
+from ddqn_planner.files import as_path, is_missing, kind_of, read_file, write_atomically
 from ddqn_planner.grid import MoveRule
 from ddqn_planner.model.networks import (
     AnyMapQNetwork,
@@ -77,9 +77,11 @@ def find_model(name: str | Path) -> Path:
             raise ModelFileError(
                 f"the model {str(path)!r} is {kind}; give a model file"
             )
-        if os.path.exists(path):
-            return path
-        raise ModelFileError(f"there is no model file {str(path)!r}; check the path")
+        if is_missing(path):
+            raise ModelFileError(
+                f"there is no model file {str(path)!r}; check the path"
+            )
+        return path
     try:
         return find_resource("models", f"{name}{MODEL_SUFFIX}")
     except FileNotFoundError as error:
