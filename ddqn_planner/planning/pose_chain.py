@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 
 from ddqn_planner.compiled import in_place
 from ddqn_planner.planning.pose_curves import (
+    SLIDE_BEFORE_TURN,
     TURN_OF_PIECE,
     Course,
     Int64,
     cost_of_curve,
+    direction_of_curve,
     half_turn,
     is_curve_free,
     is_in_reverse,
@@ -60,6 +62,7 @@ KEPT: Final = -1  # no word: a stretch of the path
 PLANNED, FROM_START, TO_GOAL = 0, 1, 2
 NO_NODE: Final = -1
 FORWARD, REVERSE = 0, 1  # the directions in which a robot drives
+SIDEWAYS: Final = 2  # of a curve after which the direction is that before it
 RIGHT, LEFT = 0, 1  # the sides to which it turns
 NO_SIDE: Final = -1  # that of a line
 NO_TURN: Final = 0.01  # radians: a curve that turns less is a line
@@ -100,7 +103,7 @@ class Leg(NamedTuple):
 
     node: int  # to which it leads
     word: int  # or KEPT
-    direction: int  # FORWARD or REVERSE
+    direction: int  # FORWARD, REVERSE or SIDEWAYS
     first_side: int  # of its first turn, or NO_SIDE
     last_side: int  # of its last turn, or NO_SIDE
     weight: float
@@ -149,6 +152,7 @@ class Candidates(NamedTuple):
 
     node: Int64  # (M,): to which each leads
     word: Int64  # (M,)
+    direction: Int64  # (M,): see `Leg`
     first_side: Int64  # (M,): see `Leg`
     last_side: Int64  # (M,)
     weight: Float64  # (M,)
@@ -189,10 +193,10 @@ def choose(nodes: Any, jumps: Int64, limits: Any, candidates: Any, course: Any) 
 
 
 @in_place
-def _weight_by_way(nodes: Any, leg: Any, side: int) -> float:
+def _weight_by_way(nodes: Any, leg: Any, arrival: int, side: int) -> float:
     """Return the weight of the chain to the goal that begins with a leg.
 
-    The robot turned last to a side.
+    The robot arrives in a direction, FORWARD or REVERSE, and turned last to a side.
     """
     weight: float = leg.weight
     last_side = side
@@ -200,7 +204,8 @@ def _weight_by_way(nodes: Any, leg: Any, side: int) -> float:
         last_side = leg.last_side
         if leg.first_side != side:
             weight += FLIP_WEIGHT
-    value: float = nodes.value[leg.node, leg.direction, last_side]
+    direction = arrival if leg.direction == SIDEWAYS else leg.direction
+    value: float = nodes.value[leg.node, direction, last_side]
     return weight + value
 
 
@@ -208,9 +213,11 @@ def _weight_by_way(nodes: Any, leg: Any, side: int) -> float:
 def _gain(nodes: Any, node: int, leg: Any) -> float:
     """Return by how much a leg makes the chain from a node lighter, at most."""
     gain = -np.inf
-    for side in range(2):
-        weight = _weight_by_way(nodes, leg, side)
-        gain = max(gain, nodes.value[node, leg.direction, side] - weight)
+    for arrival in range(2):
+        if leg.direction == SIDEWAYS or arrival == leg.direction:
+            for side in range(2):
+                weight = _weight_by_way(nodes, leg, arrival, side)
+                gain = max(gain, nodes.value[node, arrival, side] - weight)
     return gain
 
 
@@ -219,10 +226,11 @@ def _take(nodes: Any, node: int, leg: Any, course: Any) -> None:
     """Take a leg from a node where this weighs less than what was taken."""
     cusp_weight = max(CUSP_WEIGHT, course.rates.cusp)
     for side in range(2):
-        weight = _weight_by_way(nodes, leg, side)
         last_side = side if leg.last_side == NO_SIDE else leg.last_side
         for arrival in range(2):
-            cusps = cusp_weight if arrival != leg.direction else 0.0
+            weight = _weight_by_way(nodes, leg, arrival, side)
+            has_cusp = leg.direction not in (arrival, SIDEWAYS)
+            cusps = cusp_weight if has_cusp else 0.0
             if weight + cusps < nodes.value[node, arrival, side]:
                 nodes.value[node, arrival, side] = weight + cusps
                 nodes.chosen_node[node, arrival, side] = leg.node
@@ -242,7 +250,7 @@ def _take_free(nodes: Any, node: int, candidates: Any, course: Any) -> None:
         curve = Leg(
             candidates.node[number],
             word,
-            REVERSE if is_in_reverse(word) else FORWARD,
+            candidates.direction[number],
             candidates.first_side[number],
             candidates.last_side[number],
             candidates.weight[number],
@@ -253,7 +261,7 @@ def _take_free(nodes: Any, node: int, candidates: Any, course: Any) -> None:
         write_pieces(begin, nodes.pose[curve.node], word, course.radius, course.pieces)
         is_free = True
         for stride in STRIDES:
-            is_free = is_free and is_curve_free(begin, word, stride, course)
+            is_free = is_free and is_curve_free(begin, stride, course)
         if is_free:
             _take(nodes, node, curve, course)
 
@@ -288,11 +296,15 @@ def _list_curves(
             number = candidates.queue.size[0]
             candidates.node[number] = next_node
             candidates.word[number] = word
+            candidates.direction[number] = curve.direction
             candidates.first_side[number] = curve.first_side
             candidates.last_side[number] = curve.last_side
             candidates.weight[number] = curve.weight
-            weight = _weight_by_way(nodes, curve, RIGHT)
-            weight = min(weight, _weight_by_way(nodes, curve, LEFT))
+            weight = np.inf
+            for arrival in range(2):
+                for side in range(2):
+                    by_way = _weight_by_way(nodes, curve, arrival, side)
+                    weight = min(weight, by_way)
             push_to_heap(weight, number, candidates.queue)
 
 
@@ -307,12 +319,14 @@ def _curve_to(
     """
     begin = nodes.pose[node]
     end = nodes.pose[next_node]
-    direction = REVERSE if is_in_reverse(word) else FORWARD
-    nothing = Leg(next_node, word, direction, NO_SIDE, NO_SIDE, np.inf)
+    nothing = Leg(next_node, word, SIDEWAYS, NO_SIDE, NO_SIDE, np.inf)
     # The quickest look: no curve costs less than a line, or turns less than the yaw.
     dx = end[0] - begin[0]
     dy = end[1] - begin[1]
     weight = CURVE_WEIGHT + TURN_WEIGHT * abs(half_turn(end[2] - begin[2]))
+    direction = SIDEWAYS
+    if word < SLIDE_BEFORE_TURN:
+        direction = REVERSE if is_in_reverse(word) else FORWARD
     line = Leg(next_node, word, direction, NO_SIDE, NO_SIDE, weight)
     limit = min(greatest_cost, _gain(nodes, node, line))
     if limit < 0 or LEAST_RATE**2 * (dx * dx + dy * dy) > limit * limit:
@@ -321,21 +335,30 @@ def _curve_to(
         return nothing
     curve = _curve_without_cost(next_node, word, course.pieces)
     limit = min(greatest_cost, _gain(nodes, node, curve))
-    if least_cost_of_curve(word, course) > limit:
+    if least_cost_of_curve(course) > limit:
         return nothing
-    if not is_curve_free(begin, word, FIRST_STRIDE, course):
+    if not is_curve_free(begin, FIRST_STRIDE, course):
         return nothing
-    cost = cost_of_curve(begin, word, course)
+    cost = cost_of_curve(begin, course)
     if cost > limit:
         return nothing
     return Leg(
         next_node,
         word,
-        direction,
+        curve.direction,
         curve.first_side,
         curve.last_side,
         curve.weight + cost,
     )
+
+
+@in_place
+def _direction(word: int, pieces: Float64) -> int:
+    """Return the direction of a curve: FORWARD, REVERSE or SIDEWAYS."""
+    direction = direction_of_curve(word, pieces)
+    if direction == 0:
+        return SIDEWAYS
+    return FORWARD if direction > 0 else REVERSE
 
 
 @in_place
@@ -355,7 +378,7 @@ def _curve_without_cost(node: int, word: int, pieces: Float64) -> Any:
         elif last_side != side:
             weight += FLIP_WEIGHT
         last_side = side
-    direction = REVERSE if is_in_reverse(word) else FORWARD
+    direction = _direction(word, pieces)
     return Leg(node, word, direction, first_side, last_side, weight)
 
 
@@ -389,6 +412,7 @@ def best_chain(
     candidates = Candidates(
         node=np.empty(most_curves, np.int64),
         word=np.empty(most_curves, np.int64),
+        direction=np.empty(most_curves, np.int64),
         first_side=np.empty(most_curves, np.int64),
         last_side=np.empty(most_curves, np.int64),
         weight=np.empty(most_curves),
@@ -607,7 +631,9 @@ def _follow(
             direction = int(nodes.next_direction[node])
         else:
             part = _curve(nodes.pose[node], nodes.pose[next_node], word, course)
-            direction = REVERSE if is_in_reverse(word) else FORWARD
+            direction_of_part = _direction(word, course.pieces)
+            if direction_of_part != SIDEWAYS:
+                direction = direction_of_part
         poses.append(part.poses)
         costs.append(cost + part.costs)
         replaced_costs.append(
@@ -640,7 +666,7 @@ def _stretch(track: Track, begin: int, end: int) -> _Part:
 def _curve(begin: Float64, end: Float64, word: int, course: Course) -> _Part:
     """Return the curve of a word from a pose (3,) to another."""
     write_pieces(begin, end, word, course.radius, course.pieces)
-    cost = cost_of_curve(begin, word, course)
-    poses = poses_of_curve(begin, word, course)
+    cost = cost_of_curve(begin, course)
+    poses = poses_of_curve(begin, course)
     poses[-1] = end
     return _Part(poses, evenly(0.0, cost, len(poses)))

@@ -1,8 +1,8 @@
 """Curves of a body: Dubins curves, lines between turns, the room and the cost of each.
 
 Dubins curves (Dubins 1957; the words of Shkel and Lumelsky 2001 without three arcs) are
-driven ahead or in reverse; a robot that can turn on the spot drives a line between two
-turns, too.
+driven ahead or in reverse. A robot that can turn on the spot drives a line between two
+turns, too, and one that can move sideways a line in any direction in a held heading.
 """
 
 import math
@@ -14,7 +14,11 @@ from numpy.typing import NDArray
 from ddqn_planner.compiled import in_place
 from ddqn_planner.grid.layers import forbids, has_costs, multiplier_at
 from ddqn_planner.grid.moves import ACTION_OF_STEP
-from ddqn_planner.planning.pose_paths import Float64, least_cost_of_step
+from ddqn_planner.planning.pose_paths import (
+    Float64,
+    least_cost_of_step,
+    rate_of_slide,
+)
 from ddqn_planner.planning.pose_world import (
     BORDER,
     LAST_BIT,
@@ -24,7 +28,7 @@ from ddqn_planner.planning.pose_world import (
     is_far,
     is_inside,
 )
-from ddqn_planner.robot.directions import AHEAD
+from ddqn_planner.robot.directions import AHEAD, ON_THE_SPOT
 from ddqn_planner.robot.driving_costs import Rates
 from ddqn_planner.robot.motions import ANGLE, SPACING
 
@@ -39,14 +43,21 @@ MARGIN: Final = STEP / 2 + 0.01
 YAWS: Final = 128
 PLACES: Final = 4
 SAME_END: Final = 1e-9  # cells and radians
-# The columns of `Course.pieces`: by how many radians a piece turns to the left, and how
-# many cells it is long.
+# The columns of `Course.pieces`: the radians that a piece turns to the left, the cells
+# that it is long, and the direction of travel from the robot's heading, in radians.
 TURN_OF_PIECE: Final = 0
 LENGTH_OF_PIECE: Final = 1
+BEARING_OF_PIECE: Final = 2
 # Dubins curves ahead are the words 0 to 3, those in reverse 4 to 7.
 DUBINS_WORDS: Final = 4
 SPIN_AHEAD: Final = 8
 SPIN_BEHIND: Final = 9
+# A line in a held heading, and a turn on the spot after or before it.
+SLIDE_BEFORE_TURN: Final = 10
+SLIDE_AFTER_TURN: Final = 11
+# Bearings: directions of travel from the robot's heading, in radians.
+AHEAD_BEARING: Final = 0.0
+BEHIND_BEARING: Final = math.pi
 FINE: Final = 0.02  # cells between points of a curve that tell the cells that it passes
 COARSE: Final = 0.5  # likewise, where no cell forbids a move
 
@@ -65,7 +76,7 @@ class Course(NamedTuple):
     steps_when_far: int  # that lead from a tile far from obstacles to free poses alone
     world: World
     placed: Float64  # (K, 2): a buffer for the corners at a pose
-    pieces: Float64  # (3, 2): a buffer for a curve, see `write_pieces`
+    pieces: Float64  # (3, 3): a buffer for a curve, see `write_pieces`
 
 
 # The body, exactly
@@ -217,12 +228,14 @@ def _write_line_between_turns(
     dx = end[0] - begin[0]
     dy = end[1] - begin[1]
     yaw = math.atan2(dy, dx)
+    bearing = AHEAD_BEARING
     if word == SPIN_BEHIND:
+        bearing = BEHIND_BEARING
         yaw += math.pi
     distance = math.sqrt(dx * dx + dy * dy)
-    pieces[0] = (half_turn(yaw - begin[2]), 0.0)
-    pieces[1] = (0.0, distance)
-    pieces[2] = (half_turn(end[2] - yaw), 0.0)
+    pieces[0] = (half_turn(yaw - begin[2]), 0.0, bearing)
+    pieces[1] = (0.0, distance, bearing)
+    pieces[2] = (half_turn(end[2] - yaw), 0.0, bearing)
     return distance
 
 
@@ -247,9 +260,9 @@ def _write_line_between_arcs(
     an arc of one and an arc of the other.
     """
     # In reverse, the robot drives where its back points.
-    back = math.pi if word >= DUBINS_WORDS else 0.0
-    begin_yaw = begin[2] + back
-    end_yaw = end[2] + back
+    bearing = BEHIND_BEARING if word >= DUBINS_WORDS else AHEAD_BEARING
+    begin_yaw = begin[2] + bearing
+    end_yaw = end[2] + bearing
     first_side = 1 if word & 1 else -1  # 1: the arc turns left
     last_side = 1 if word & 2 else -1
     # From the centre of the first circle to that of the last one.
@@ -267,21 +280,44 @@ def _write_line_between_arcs(
     line_yaw = math.atan2(dy, dx) + math.atan2(across, line)
     first_turn = _whole_turn(first_side * (line_yaw - begin_yaw))
     last_turn = _whole_turn(last_side * (end_yaw - line_yaw))
-    pieces[0] = (first_side * first_turn, radius * first_turn)
-    pieces[1] = (0.0, line)
-    pieces[2] = (last_side * last_turn, radius * last_turn)
+    pieces[0] = (first_side * first_turn, radius * first_turn, bearing)
+    pieces[1] = (0.0, line, bearing)
+    pieces[2] = (last_side * last_turn, radius * last_turn, bearing)
     return line + radius * (first_turn + last_turn)
+
+
+@in_place
+def _write_slide(begin: Float64, end: Float64, word: int, pieces: Float64) -> float:
+    """Write the pieces of a line in a held heading and of a turn; return its length.
+
+    Without a turn, only `SLIDE_BEFORE_TURN` is such a curve.
+    """
+    dx = end[0] - begin[0]
+    dy = end[1] - begin[1]
+    distance = math.sqrt(dx * dx + dy * dy)
+    direction = math.atan2(dy, dx)
+    turn = half_turn(end[2] - begin[2])
+    pieces[2] = (0.0, 0.0, AHEAD_BEARING)
+    if word == SLIDE_BEFORE_TURN:
+        pieces[0] = (0.0, distance, half_turn(direction - begin[2]))
+        pieces[1] = (turn, 0.0, AHEAD_BEARING)
+        return distance
+    pieces[0] = (turn, 0.0, AHEAD_BEARING)
+    pieces[1] = (0.0, distance, half_turn(direction - end[2]))
+    return distance if abs(turn) >= SAME_END else np.inf
 
 
 @in_place
 def write_pieces(
     begin: Float64, end: Float64, word: int, radius: float, pieces: Float64
 ) -> float:
-    """Write the turn and the length of each piece of a curve; return its length.
+    """Write the turn, length and bearing of each piece of a curve; return its length.
 
     The curve leads from one pose (3,) to another. The length is infinite if there is no
     such curve.
     """
+    if word >= SLIDE_BEFORE_TURN:
+        return _write_slide(begin, end, word, pieces)
     if word >= SPIN_AHEAD:
         return _write_line_between_turns(begin, end, word, pieces)
     return _write_line_between_arcs(begin, end, word, radius, pieces)
@@ -294,6 +330,21 @@ def is_in_reverse(word: int) -> bool:
 
 
 @in_place
+def direction_of_curve(word: int, pieces: Float64) -> int:
+    """Return in which direction a curve is driven, see `directions_of_travel`.
+
+    It is 1 ahead, -1 in reverse, and 0 sideways.
+    """
+    if word < SLIDE_BEFORE_TURN:
+        return -1 if is_in_reverse(word) else 1
+    line = 0 if word == SLIDE_BEFORE_TURN else 1
+    ahead = math.cos(pieces[line, BEARING_OF_PIECE])
+    if pieces[line, LENGTH_OF_PIECE] <= ON_THE_SPOT or abs(ahead) <= AHEAD:
+        return 0
+    return 1 if ahead > 0 else -1
+
+
+@in_place
 def _is_empty(turn: float, length: float) -> bool:
     """Return whether a piece of a curve has neither a turn nor a length."""
     return abs(turn) < SAME_END and length < SAME_END
@@ -301,13 +352,13 @@ def _is_empty(turn: float, length: float) -> bool:
 
 @in_place
 def _pose_on(
-    pose: tuple[float, float, float], turn: float, length: float, is_behind: bool
+    pose: tuple[float, float, float], turn: float, length: float, bearing: float
 ) -> tuple[float, float, float]:
-    """Return the pose that a turn and a length lead to from a pose."""
+    """Return the pose to which a piece of a curve leads from a pose."""
     x, y, yaw = pose
     half = turn / 2
     chord = length * (math.sin(half) / half if abs(half) > SAME_END else 1.0)
-    direction = yaw + half + (math.pi if is_behind else 0.0)
+    direction = yaw + half + bearing
     return x + chord * math.cos(direction), y + chord * math.sin(direction), yaw + turn
 
 
@@ -316,7 +367,7 @@ def _is_piece_free(
     begin: tuple[float, float, float],
     turn: float,
     length: float,
-    is_behind: bool,
+    bearing: float,
     stride: int,
     course: Any,
 ) -> bool:
@@ -325,7 +376,7 @@ def _is_piece_free(
     number = min(stride, count)
     while True:
         share = number / count
-        x, y, yaw = _pose_on(begin, share * turn, share * length, is_behind)
+        x, y, yaw = _pose_on(begin, share * turn, share * length, bearing)
         steps = free_steps(x, y, yaw, course)
         if steps == 0:
             return False
@@ -335,18 +386,21 @@ def _is_piece_free(
 
 
 @in_place
-def is_curve_free(begin: Float64, word: int, stride: int, course: Any) -> bool:
-    """Return whether the body has room along a curve from a free pose (3,) on."""
-    is_behind = is_in_reverse(word)
+def is_curve_free(begin: Float64, stride: int, course: Any) -> bool:
+    """Return whether the body has room along the curve of `course.pieces`.
+
+    It leads from a free pose (3,) on, and is looked at at every `stride`-th pose.
+    """
     pose = (begin[0], begin[1], begin[2])
     for piece in range(3):
         turn = course.pieces[piece, TURN_OF_PIECE]
         length = course.pieces[piece, LENGTH_OF_PIECE]
+        bearing = course.pieces[piece, BEARING_OF_PIECE]
         if _is_empty(turn, length):
             continue
-        if not _is_piece_free(pose, turn, length, is_behind, stride, course):
+        if not _is_piece_free(pose, turn, length, bearing, stride, course):
             return False
-        pose = _pose_on(pose, turn, length, is_behind)
+        pose = _pose_on(pose, turn, length, bearing)
     return True
 
 
@@ -355,7 +409,7 @@ def _mean_multiplier(
     begin: tuple[float, float, float],
     turn: float,
     length: float,
-    is_behind: bool,
+    bearing: float,
     world: Any,
 ) -> float:
     """Return the mean multiplier of the cells of a piece.
@@ -371,8 +425,8 @@ def _mean_multiplier(
     # each chord is the one before it turned by the same angle.
     part_turn = turn / count
     part_length = length / count
-    middle = _pose_on(begin, part_turn / 2, part_length / 2, is_behind)
-    next_x, next_y, _ = _pose_on(middle, part_turn, part_length, is_behind)
+    middle = _pose_on(begin, part_turn / 2, part_length / 2, bearing)
+    next_x, next_y, _ = _pose_on(middle, part_turn, part_length, bearing)
     x, y, _ = middle
     chord_x = next_x - x
     chord_y = next_y - y
@@ -403,57 +457,62 @@ def _mean_multiplier(
 
 @in_place
 def _least_cost_of_piece(
-    turn: float, length: float, is_behind: bool, rates: Any
+    turn: float, length: float, bearing: float, rates: Any
 ) -> float:
     """Return what a piece costs where each cell costs 1."""
     if length == 0:
         cost: float = abs(turn) * rates.spin
-    elif turn == 0:
-        cost = length * (rates.behind if is_behind else rates.ahead)
+    elif bearing == AHEAD_BEARING:
+        cost = length * (rates.ahead if turn == 0 else rates.bend_ahead)
+    elif bearing == BEHIND_BEARING:
+        cost = length * (rates.behind if turn == 0 else rates.bend_behind)
     else:
-        cost = length * (rates.bend_behind if is_behind else rates.bend_ahead)
+        cost = length * rate_of_slide(bearing, rates.slide)
     return cost
 
 
 @in_place
-def least_cost_of_curve(word: int, course: Any) -> float:
+def least_cost_of_curve(course: Any) -> float:
     """Return what the curve of `course.pieces` costs where each cell costs 1."""
-    is_behind = is_in_reverse(word)
     cost = 0.0
     for piece in range(3):
         turn = course.pieces[piece, TURN_OF_PIECE]
         length = course.pieces[piece, LENGTH_OF_PIECE]
+        bearing = course.pieces[piece, BEARING_OF_PIECE]
         if not _is_empty(turn, length):
-            cost += _least_cost_of_piece(turn, length, is_behind, course.rates)
+            cost += _least_cost_of_piece(turn, length, bearing, course.rates)
     return cost
 
 
 @in_place
-def cost_of_curve(begin: Float64, word: int, course: Any) -> float:
-    """Return what a curve costs; infinite if a cell forbids it."""
-    is_behind = is_in_reverse(word)
+def cost_of_curve(begin: Float64, course: Any) -> float:
+    """Return what the curve of `course.pieces` costs from a pose (3,) on.
+
+    It is infinite if a cell forbids the curve.
+    """
     pose = (begin[0], begin[1], begin[2])
     cost = 0.0
     for piece in range(3):
         turn = course.pieces[piece, TURN_OF_PIECE]
         length = course.pieces[piece, LENGTH_OF_PIECE]
+        bearing = course.pieces[piece, BEARING_OF_PIECE]
         if _is_empty(turn, length):
             continue
-        least = _least_cost_of_piece(turn, length, is_behind, course.rates)
-        cost += least * _mean_multiplier(pose, turn, length, is_behind, course.world)
-        pose = _pose_on(pose, turn, length, is_behind)
+        least = _least_cost_of_piece(turn, length, bearing, course.rates)
+        cost += least * _mean_multiplier(pose, turn, length, bearing, course.world)
+        pose = _pose_on(pose, turn, length, bearing)
     return cost
 
 
 @in_place
-def write_curve(begin: Float64, word: int, pieces: Float64, poses: Float64) -> int:
+def write_curve(begin: Float64, pieces: Float64, poses: Float64) -> int:
     """Write the poses of a curve except the first; return how many, or would be."""
-    is_behind = is_in_reverse(word)
     pose = (begin[0], begin[1], begin[2])
     count = 0
     for piece in range(3):
         turn = pieces[piece, TURN_OF_PIECE]
         length = pieces[piece, LENGTH_OF_PIECE]
+        bearing = pieces[piece, BEARING_OF_PIECE]
         if _is_empty(turn, length):
             continue
         steps_of_length = math.ceil(length / SPACING - 1e-9)
@@ -461,18 +520,18 @@ def write_curve(begin: Float64, word: int, pieces: Float64, poses: Float64) -> i
         for number in range(1, steps + 1):
             share = number / steps
             if count < len(poses):
-                x, y, yaw = _pose_on(pose, share * turn, share * length, is_behind)
+                x, y, yaw = _pose_on(pose, share * turn, share * length, bearing)
                 poses[count] = (x, y, yaw)
             count += 1
-        pose = _pose_on(pose, turn, length, is_behind)
+        pose = _pose_on(pose, turn, length, bearing)
     return count
 
 
-def poses_of_curve(begin: Float64, word: int, course: Course) -> Float64:
+def poses_of_curve(begin: Float64, course: Course) -> Float64:
     """Return the poses (N, 3) of the curve of `course.pieces`, except the first."""
-    count = write_curve(begin, word, course.pieces, np.empty((0, 3)))
+    count = write_curve(begin, course.pieces, np.empty((0, 3)))
     poses = np.empty((count, 3))
-    write_curve(begin, word, course.pieces, poses)
+    write_curve(begin, course.pieces, poses)
     return poses
 
 
@@ -538,8 +597,10 @@ def write_costs(path: Float64, count: int, course: Any, costs: Float64) -> None:
         turn = path[number, 2] - yaw
         length = math.sqrt(dx * dx + dy * dy)
         direction = _direction_of_step(dx, dy, length, yaw, turn)
-        least = least_cost_of_step(length, turn, direction, course.rates)
+        yaw_of_line = math.atan2(dy, dx)
+        bearing = yaw_of_line - yaw
+        least = least_cost_of_step(length, turn, direction, bearing, course.rates)
         # The cells that the step passes, as those of a line.
-        line = (x, y, math.atan2(dy, dx))
-        multiplier = _mean_multiplier(line, 0.0, length, False, course.world)
+        line = (x, y, yaw_of_line)
+        multiplier = _mean_multiplier(line, 0.0, length, AHEAD_BEARING, course.world)
         costs[number] = costs[number - 1] + least * multiplier

@@ -2,7 +2,8 @@
 
 A path of primitives begins and ends in the centres of cells, in one of 16 headings, and
 bends more often than it must. Between poses of such a path, the finish tries the curves
-of `pose_curves`. Curves with cusps between them are those of Reeds and Shepp (1990).
+of `pose_curves`. Curves with cusps between them are those of Reeds and Shepp (1990); an
+omnidirectional robot also drives lines in a held heading.
 The best chain of free curves and of stretches of the path is that of `pose_chain`.
 """
 
@@ -31,6 +32,8 @@ from ddqn_planner.planning.pose_curves import (
     MARGIN,
     PLACES,
     SAME_END,
+    SLIDE_AFTER_TURN,
+    SLIDE_BEFORE_TURN,
     SPIN_AHEAD,
     SPIN_BEHIND,
     STEP,
@@ -110,7 +113,7 @@ class Finish:
             steps_when_far=max(int(cells_free / STEP), 0),
             world=world,
             placed=np.empty((corners, 2)),
-            pieces=np.empty((3, 2)),
+            pieces=np.empty((3, 3)),
         )
 
     def _masks(self) -> NDArray[np.uint64]:
@@ -334,7 +337,7 @@ def _cost_of_cell_ahead(pose: Float64, course: Course) -> float:
     """Return what a line of one cell costs from a pose (3,) on."""
     course.pieces[:] = 0
     course.pieces[0, LENGTH_OF_PIECE] = 1
-    cost: float = cost_of_curve(pose, 0, course)
+    cost: float = cost_of_curve(pose, course)
     return cost
 
 
@@ -349,6 +352,8 @@ def words_of(rates: Rates) -> Int64:
         words.append(SPIN_AHEAD)
     if math.isfinite(rates.behind + rates.spin):
         words.append(SPIN_BEHIND)
+    if len(rates.slide):
+        words += [SLIDE_BEFORE_TURN, SLIDE_AFTER_TURN]
     return np.array(words if math.isfinite(rates.ahead) else [], np.int64)
 
 

@@ -7,6 +7,7 @@ curve of `pose_curves` between that and the path: so a car turns a little or mov
 
 import math
 from collections.abc import Iterator, Sequence
+from itertools import product
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -24,13 +25,15 @@ from ddqn_planner.planning.pose_chain import (
     lengths_of,
 )
 from ddqn_planner.planning.pose_curves import (
+    AHEAD_BEARING,
+    BEHIND_BEARING,
     DUBINS_WORDS,
     SPIN_AHEAD,
     Course,
     Int64,
     cost_of_curve,
+    direction_of_curve,
     is_curve_free,
-    is_in_reverse,
     least_cost_of_curve,
     poses_of_curve,
     write_costs,
@@ -40,7 +43,7 @@ from ddqn_planner.planning.pose_paths import Float64
 from ddqn_planner.robot.directions import cusps_before, directions_of_travel
 
 # Radii of the sharpest bend, or of the body where there are no bends, that the robot
-# drives first: to each side and straight on, ahead and in reverse.
+# drives first: to each side and straight on, ahead and in reverse, or sideways.
 STRETCHES: Final = (0.125, 0.25, 0.5, 1.0, 1.5)
 FARTHEST: Final = 4.0  # radii along the path to where a curve leads
 SPACING_OF_JOINTS: Final = 2.0  # cells between the poses to which curves lead
@@ -99,22 +102,24 @@ def best_joint(stretches: Any, rest: Any, most_cost: float, course: Any) -> Any:
                 )
                 if length == np.inf:
                     continue
-                direction = -1 if is_in_reverse(word) else 1
-                cusps = int(first_direction * direction < 0) + int(
-                    direction * rest.direction[number] < 0
-                )
+                direction = direction_of_curve(word, course.pieces)
+                next_direction = rest.direction[number]
+                cusps = int(direction * next_direction < 0)
+                # A line sideways keeps the direction.
+                turned = direction if direction != 0 else next_direction
+                cusps += int(first_direction * turned < 0)
                 cost = stretches.cost[stretch] + rest.cost[number]
                 cost += cusps * course.rates.cusp
-                if cost + least_cost_of_curve(word, course) >= least_cost:
+                if cost + least_cost_of_curve(course) >= least_cost:
                     continue
-                if not is_curve_free(begin, word, FIRST_STRIDE, course):
+                if not is_curve_free(begin, FIRST_STRIDE, course):
                     continue
-                cost += cost_of_curve(begin, word, course)
+                cost += cost_of_curve(begin, course)
                 if cost >= least_cost:
                     continue
                 is_free = True
                 for stride in STRIDES:
-                    is_free = is_free and is_curve_free(begin, word, stride, course)
+                    is_free = is_free and is_curve_free(begin, stride, course)
                 if is_free:
                     least_cost = cost
                     best = (stretch, number, word)
@@ -180,6 +185,7 @@ def _backwards_course(course: Course) -> Course:
             behind=rates.ahead,
             bend_ahead=rates.bend_behind,
             bend_behind=rates.bend_ahead,
+            slide=np.roll(rates.slide, len(rates.slide) // 2),
         ),
         words=np.where(words < SPIN_AHEAD, words ^ DUBINS_WORDS, words ^ 1),
     )
@@ -233,12 +239,12 @@ def _with_joint(
     begin_of_curve = stretch.poses[-1]
     end_of_curve = chain.poses[number]
     write_pieces(begin_of_curve, end_of_curve, word, course.radius, course.pieces)
-    curve = poses_of_curve(begin_of_curve, word, course)
+    curve = poses_of_curve(begin_of_curve, course)
     if len(curve):
         curve[-1] = end_of_curve
     poses = np.concatenate([stretch.poses, curve, chain.poses[number + 1 :]])
     # The costs up to each pose.
-    cost_of_joint = stretch.cost + cost_of_curve(begin_of_curve, word, course)
+    cost_of_joint = stretch.cost + cost_of_curve(begin_of_curve, course)
     costs_on_stretch = np.linspace(0, stretch.cost, len(stretch.poses))
     costs_on_curve = evenly(stretch.cost, cost_of_joint, len(curve))
     old_costs = _without_cusps(chain, course)
@@ -263,18 +269,20 @@ def _stretches_from(start: Float64, course: Course) -> Iterator[Stretch]:
     """Yield the stretches from a pose (3,) on; the first one has no length."""
     yield Stretch(start[None], 0, 0.0)
     unit = _unit_of(course)
-    for direction, word in ((1, 0), (-1, DUBINS_WORDS)):
-        for side in SIDES if math.isfinite(course.radius) else SIDES[:1]:
-            for length in STRETCHES:
-                course.pieces[:] = 0
-                course.pieces[0] = (side * length, length * unit)
-                cost = cost_of_curve(start, word, course)
-                if not math.isfinite(cost) or not is_curve_free(start, word, 1, course):
-                    break
-                poses = np.concatenate(
-                    [start[None], poses_of_curve(start, word, course)]
-                )
-                yield Stretch(poses, direction, cost)
+    sides = SIDES if math.isfinite(course.radius) else SIDES[:1]
+    drives = [*product((AHEAD_BEARING, BEHIND_BEARING), sides)]
+    if len(course.rates.slide):
+        drives += [(math.pi / 2, 0), (-math.pi / 2, 0)]
+    for bearing, side in drives:
+        direction = round(math.cos(bearing))
+        for length in STRETCHES:
+            course.pieces[:] = 0
+            course.pieces[0] = (side * length, length * unit, bearing)
+            cost = cost_of_curve(start, course)
+            if not math.isfinite(cost) or not is_curve_free(start, 1, course):
+                break
+            poses = np.concatenate([start[None], poses_of_curve(start, course)])
+            yield Stretch(poses, direction, cost)
 
 
 def _unit_of(course: Course) -> float:

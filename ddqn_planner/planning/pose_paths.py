@@ -34,6 +34,7 @@ REACH: Final = 5.0, math.pi / 4
 OUTLINE_SPACING: Final = 0.25  # cells between two points of a body's outline
 # And inside: so each cell there, turned as it may be, has a point.
 FILL_SPACING: Final = 0.7
+LEAST_PART: Final = 1e-6  # of a line: a smaller one is rounding
 SAME: Final = 1 + 1e-6  # what is rounded in sums of float32 is less
 ESCAPE_IN_WORDS: Final = (
     "the start is occupied: cells that the robot's body covers there do not count until"
@@ -279,7 +280,31 @@ def cells_of(path: Float64) -> NDArray[np.int32]:
 
 
 @in_place
-def least_cost_of_step(length: float, turn: float, direction: int, rates: Any) -> float:
+def rate_of_slide(bearing: float, slide_rates: Float64) -> float:
+    """Return what a cell of a line in a held heading costs where each cell costs 1.
+
+    `bearing` is the direction of travel from the heading, in radians, and `slide_rates`
+    are those of `slide_rates_of`. The line costs as much as two lines to the same place
+    with the bearings in this table beside its own.
+    """
+    part = 2 * math.pi / len(slide_rates)
+    number = math.floor(bearing / part)
+    excess = bearing - number * part
+    first = math.sin(part - excess) / math.sin(part)
+    last = math.sin(excess) / math.sin(part)
+    rate = 0.0
+    # An infinite rate counts only where the line has a part of its bearing.
+    if first > LEAST_PART:
+        rate += first * slide_rates[number % len(slide_rates)]
+    if last > LEAST_PART:
+        rate += last * slide_rates[(number + 1) % len(slide_rates)]
+    return rate
+
+
+@in_place
+def least_cost_of_step(
+    length: float, turn: float, direction: int, bearing: float, rates: Any
+) -> float:
     """Return what a step from pose to pose costs where each cell costs 1, in cells.
 
     Parameters
@@ -290,12 +315,16 @@ def least_cost_of_step(length: float, turn: float, direction: int, rates: Any) -
         In radians.
     direction : int
         Of travel, see `directions_of_travel`.
+    bearing : float
+        From the heading to the end of the step, in radians.
     rates : Rates
         Infinite where the robot cannot drive so; then so is the cost.
     """
     is_bend = abs(turn) > ON_THE_SPOT
     if length < ON_THE_SPOT:
         return abs(turn) * rates.spin if is_bend else 0.0
+    if not is_bend and len(rates.slide) > 0:
+        return length * rate_of_slide(bearing, rates.slide)
     if direction > 0:
         rate: float = rates.bend_ahead if is_bend else rates.ahead
     elif direction < 0:
@@ -310,6 +339,7 @@ def _write_least_costs(
     lengths: Float64,
     turns: Float64,
     directions: NDArray[np.int64],
+    bearings: Float64,
     rates: Any,
     costs: Float64,
 ) -> None:
@@ -319,8 +349,16 @@ def _write_least_costs(
     """
     for step in range(len(costs)):
         costs[step] = least_cost_of_step(
-            lengths[step], turns[step], directions[step], rates
+            lengths[step], turns[step], directions[step], bearings[step], rates
         )
+
+
+def _with_usual_rates(rates: Rates, usual_rates: Rates) -> Rates:
+    """Return rates with those of another robot where a robot cannot drive."""
+    numbers = rates[:-1]  # all except the array of slides
+    finite = np.where(np.isfinite(numbers), numbers, usual_rates[:-1])
+    slide = np.where(np.isfinite(rates.slide), rates.slide, usual_rates.aside)
+    return Rates(*finite.tolist())._replace(slide=slide)
 
 
 def cost_of_poses(poses: Float64, grid: GridMap, rates: Rates) -> float:
@@ -335,11 +373,13 @@ def cost_of_poses(poses: Float64, grid: GridMap, rates: Rates) -> float:
     path[:, 2] = np.unwrap(path[:, 2])
     usual_spin = TURN / grid.resolution
     usual_rates = Rates(1.0, 1.0, BEHIND, BEHIND, BEHIND, usual_spin)
-    finite_rates = Rates(*np.where(np.isfinite(rates), rates, usual_rates).tolist())
+    finite_rates = _with_usual_rates(rates, usual_rates)
     dx, dy, turns = np.diff(path, axis=0).T  # (N - 1,) each
+    lengths = np.hypot(dx, dy)
+    bearings = np.arctan2(dy, dx) - path[:-1, 2]
     directions = directions_of_travel(path)  # (N - 1,)
     costs = np.empty(len(directions))  # of the steps
-    _write_least_costs(np.hypot(dx, dy), turns.copy(), directions, finite_rates, costs)
+    _write_least_costs(lengths, turns.copy(), directions, bearings, finite_rates, costs)
     cells = cells_of(path[:-1])  # (N - 1, 2)
     x = cells[:, 0]
     y = cells[:, 1]

@@ -4,6 +4,7 @@ All costs are those of so many cells driven straight ahead.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -11,7 +12,15 @@ import numpy as np
 
 from ddqn_planner.grid.arguments import as_number
 from ddqn_planner.robot.directions import AHEAD, ON_THE_SPOT
-from ddqn_planner.robot.motions import BEHIND, MIN_COST, TURN, Motions, Poses
+from ddqn_planner.robot.motions import (
+    BEHIND,
+    MIN_COST,
+    TURN,
+    Float64,
+    Motions,
+    Poses,
+    turn_between,
+)
 
 # Metres driven straight ahead that cost as much as a metre in a bend: without it, paths
 # of least cost slalom.
@@ -24,6 +33,11 @@ CUSP_METRES: Final = 2.0
 MAX_FACTOR: Final = 100.0
 MAX_CUSP: Final = 1000.0  # metres
 MAX_SPIN: Final = TURN * MAX_FACTOR  # metres for a radian
+# Bearings of lines in a held heading: one for each degree from the heading on.
+BEARINGS: Final = 360
+PARALLEL: Final = 1e-3  # radians between two lines
+ROUNDING: Final = 1e-9
+DIGITS: Final = 6  # of a bearing
 
 
 class DrivingCosts(NamedTuple):
@@ -50,12 +64,19 @@ class Rates(NamedTuple):
     aside: float
     spin: float  # a radian on the spot
     cusp: float = 0.0
+    # (BEARINGS,): a cell of a line in a held heading, see `slide_rates_of`; empty for a
+    # robot that cannot move sideways.
+    slide: Float64 = np.empty(0)
+
+
+# The fields of `Rates` that a primitive may belong to.
+KINDS: Final = "ahead", "bend_ahead", "behind", "bend_behind", "aside", "spin"
 
 
 class PrimitiveRate(NamedTuple):
     """What one primitive costs, and how sharply it bends."""
 
-    kind: str  # the field of `Rates` that it belongs to
+    kind: str  # one of `KINDS`
     rate: float  # per cell of length, or per radian on the spot
     radius: float  # of its sharpest bend in cells; infinite without one
 
@@ -98,13 +119,64 @@ def with_costs(motions: Motions, costs: DrivingCosts, is_lattice: bool) -> Motio
 
 def rates_of(motions: Motions) -> Rates:
     """Return what a robot's motions cost: of a kind, the dearest primitive counts."""
-    rates = dict.fromkeys(Rates._fields, 0.0)
+    rates = dict.fromkeys(KINDS, 0.0)
     for primitive in _rates_of_primitives(motions):
         rates[primitive.kind] = max(rates[primitive.kind], primitive.rate)
     # A kind without a primitive cannot be driven.
     drivable_rates = {kind: rate or math.inf for kind, rate in rates.items()}
-    drivable_rates["cusp"] = motions.cusp
-    return Rates(**drivable_rates)
+    slide = np.empty(0)
+    if math.isfinite(drivable_rates["aside"]):
+        slide = slide_rates_of(motions)
+    return Rates(**drivable_rates, cusp=motions.cusp, slide=slide)
+
+
+def slide_rates_of(motions: Motions) -> Float64:
+    """Return what a cell of a line in a held heading costs, by bearing: (BEARINGS,).
+
+    A bearing is the direction of travel, from the heading. A line costs as much as
+    the cheapest of the robot's lines to the same place, one after another, and in the
+    heading in which these cost most: so no line is cheaper than the robot's motions.
+    Without lines to both sides in all headings, there are no rates.
+    """
+    bearing = np.linspace(0, 2 * math.pi, BEARINGS, endpoint=False)
+    direction = np.array([np.cos(bearing), np.sin(bearing)])  # (2, BEARINGS)
+    greatest_rate = np.zeros(BEARINGS)
+    for lines in _lines_of_headings(motions):
+        angle, rate = np.array(list(lines.items())).T  # (L,) each
+        line = np.array([np.cos(angle), np.sin(angle)])  # (2, L)
+        first, last = np.triu_indices(len(rate), 1)  # (M,): pairs of lines
+        is_pair = np.abs(np.sin(angle[first] - angle[last])) > PARALLEL
+        first = first[is_pair]
+        last = last[is_pair]
+        pairs = np.stack([line[:, first], line[:, last]], axis=-1)  # (2, M, 2)
+        # How far each line of a pair leads on the way of one cell in each direction.
+        cells = np.linalg.inv(pairs.swapaxes(0, 1)) @ direction  # (M, 2, BEARINGS)
+        cost = rate[first, None] * cells[:, 0] + rate[last, None] * cells[:, 1]
+        leads_there = (cells > -ROUNDING).all(axis=1)  # (M, BEARINGS)
+        least_rate = np.where(leads_there, cost, np.inf).min(axis=0, initial=np.inf)
+        greatest_rate = np.maximum(greatest_rate, least_rate)
+    can_slide = np.isfinite(greatest_rate[[0, BEARINGS // 4, -BEARINGS // 4]]).all()
+    return greatest_rate if can_slide else np.empty(0)
+
+
+def _lines_of_headings(motions: Motions) -> Iterator[dict[float, float]]:
+    """Yield, for each heading, the rate of each line in it by the line's bearing.
+
+    Of several lines with one bearing, the dearest counts.
+    """
+    rate_of_primitive = [primitive.rate for primitive in _rates_of_primitives(motions)]
+    for heading in range(motions.headings):
+        lines: dict[float, float] = {}
+        for number in np.flatnonzero(motions.start == heading).tolist():
+            poses = motions.poses[number]
+            dx, dy, _ = poses[-1] - poses[0]
+            turned = float(np.abs(np.diff(poses[:, 2])).sum())
+            if turned > ON_THE_SPOT or math.hypot(dx, dy) < ON_THE_SPOT:
+                continue
+            bearing = float(turn_between(poses[0, 2], math.atan2(dy, dx)))
+            bearing = round(bearing, DIGITS)
+            lines[bearing] = max(lines.get(bearing, 0.0), rate_of_primitive[number])
+        yield lines
 
 
 def least_radius_of(motions: Motions) -> float:

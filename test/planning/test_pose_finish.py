@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import bodies
 import numpy as np
 import pytest
 from bodies import Oracle, occupied_cells, shape_of
@@ -13,10 +14,16 @@ from planning.test_poses import BODIES, CELL, planner, robot
 from ddqn_planner import GridMap, Planner
 from ddqn_planner.planning.path_finder import last_step
 from ddqn_planner.planning.plan import Pose, PosePlan, PoseRequest, are_joined
-from ddqn_planner.planning.pose_curves import write_pieces
+from ddqn_planner.planning.pose_curves import (
+    SLIDE_BEFORE_TURN,
+    cost_of_curve,
+    write_costs,
+    write_pieces,
+)
 from ddqn_planner.planning.pose_finish import END_COST
 from ddqn_planner.planning.pose_paths import cost_of_poses
 from ddqn_planner.planning.pose_planner import PosePlanner
+from ddqn_planner.planning.pose_world import world_of
 from ddqn_planner.robot.driving_costs import least_radius_of, rates_of
 from ddqn_planner.robot.motions import turn_between
 
@@ -139,6 +146,57 @@ def test_ends_are_exact_where_nothing_is_near(motion: str) -> None:
     assert exact >= 9
 
 
+@pytest.mark.parametrize("bearing", [0.4, 1.2, math.pi / 2, -2.5])
+def test_an_omnidirectional_robot_moves_a_little_aside_on_one_line(
+    bearing: float,
+) -> None:
+    grid = GridMap(np.zeros((SIDE, SIDE), np.bool_), CELL)
+    body = planner("omnidirectional")
+    start = (3.03, 2.98, 0.3)
+    x, y, yaw = start
+    goal = (x + 0.6 * math.cos(yaw + bearing), y + 0.6 * math.sin(yaw + bearing), yaw)
+    found = plan(body, grid, start, goal, finished=True)
+    assert ends_off(found, start, goal) == (0.0, 0.0)
+    assert found.poses[:, 2] == pytest.approx(yaw)
+    assert found.driven * CELL == pytest.approx(0.6)
+    assert found.cost == pytest.approx(
+        cost_of_poses(found.poses, grid, rates_of(body.motions)), rel=1e-3
+    )
+
+
+def test_an_omnidirectional_robot_s_ends_are_exact_near_its_start_too() -> None:
+    """So within a metre, where turns and bends to both ends would cost too much."""
+    random = np.random.default_rng(8)
+    grid = GridMap(np.zeros((120, 120), np.bool_), 0.05)
+    triangle = bodies.robot(bodies.FOOTPRINTS["triangle"], "omnidirectional")
+    body = triangle.pose_planner
+    assert body is not None
+    for _ in range(80):
+        x, y, yaw = random.uniform((2.7, 2.7, -3), (3.3, 3.3, 3)).tolist()
+        goal_x, goal_y = random.uniform(2.3, 3.7, 2).tolist()
+        start, goal = (x, y, yaw), (goal_x, goal_y, yaw + random.uniform(-0.8, 0.8))
+        path = plan(body, grid, start, goal, finished=True)
+        assert ends_off(path, start, goal) == pytest.approx((0, 0), abs=1e-9)
+
+
+@pytest.mark.parametrize("has_costs", [False, True])
+def test_a_slide_costs_the_same_as_a_curve_and_pose_by_pose(has_costs: bool) -> None:
+    """So a stretch of a path that is moved to an exact end costs what it did."""
+    random = np.random.default_rng(3)
+    cost = np.full((SIDE, SIDE), 40) if has_costs else None
+    grid = GridMap(np.zeros((SIDE, SIDE), np.bool_), CELL, cost=cost)
+    body = planner("omnidirectional")
+    course = body._finish.course(world_of(grid, body.body))
+    for _ in range(20):
+        begin, end = random.uniform((20, 20, -3), (40, 40, 3), (2, 3))
+        end[2] = begin[2]
+        write_pieces(begin, end, SLIDE_BEFORE_TURN, course.radius, course.pieces)
+        poses = np.linspace(begin, end, 30)
+        costs = np.empty(len(poses))
+        write_costs(poses, len(poses), course, costs)
+        assert costs[-1] == pytest.approx(cost_of_curve(begin, course))
+
+
 def test_the_rest_of_a_finished_path_costs_what_its_poses_do() -> None:
     """So with the cusps of the curves that lead a robot back to its path."""
     random = np.random.default_rng(4)
@@ -189,18 +247,17 @@ def test_a_curve_costs_no_less_than_any_primitive_of_its_kind(seed: int) -> None
 def test_the_pieces_of_each_word_lead_to_the_end(seed: int) -> None:
     random = np.random.default_rng(seed)
     begin, end = random.uniform(-20, 20, (2, 3))
-    pieces = np.empty((3, 2))
-    for word in range(10):
+    pieces = np.empty((3, 3))
+    for word in range(12):
         length = write_pieces(begin, end, word, 4.0, pieces)
         if length == math.inf:
             continue
-        way = -1 if 4 <= word < 8 or word == 9 else 1
         x, y, yaw = begin
-        for turn, piece_length in pieces.tolist():
+        for turn, piece_length, bearing in pieces.tolist():
             half = turn / 2
-            chord = way * piece_length * np.sinc(half / math.pi)
-            x += chord * math.cos(yaw + half)
-            y += chord * math.sin(yaw + half)
+            chord = piece_length * np.sinc(half / math.pi)
+            x += chord * math.cos(yaw + half + bearing)
+            y += chord * math.sin(yaw + half + bearing)
             yaw += turn
         assert (x, y) == pytest.approx(tuple(end[:2]), abs=1e-5)
         assert abs(turn_between(yaw, end[2])) < 1e-5

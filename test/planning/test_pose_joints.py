@@ -254,7 +254,7 @@ def costs_with_joints(chain: Chain, start: Float64, course: Course) -> list[floa
                 length = write_pieces(
                     begin, chain.poses[number], word, course.radius, course.pieces
                 )
-                if math.isinf(length) or not is_curve_free(begin, word, 1, course):
+                if math.isinf(length) or not is_curve_free(begin, 1, course):
                     continue
                 costs.append(_with_joint(chain, number, stretch, word, course).cost)
     return costs

@@ -4,7 +4,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import linprog
 
+from ddqn_planner.planning.pose_paths import rate_of_slide
 from ddqn_planner.robot.directions import (
     CUSP,
     cusps_before,
@@ -33,6 +35,38 @@ def test_each_kind_of_drive_costs_what_is_given(motion: str) -> None:
     assert rates.spin == pytest.approx(1.2 * plain.spin)  # 0.6 and 0.5 m a radian
     assert rates.cusp == pytest.approx(7)  # cells of 0.1 m
     assert rates.aside == pytest.approx(3 if motion == "omnidirectional" else np.inf)
+
+
+@pytest.mark.parametrize("reverse", [1, 2])
+def test_a_line_in_a_held_heading_costs_what_the_motions_to_its_end_do(
+    reverse: float,
+) -> None:
+    """In the heading in which these cost most: never less, and little more."""
+    motions = motions_of("omnidirectional", reverse=reverse)
+    slide = rates_of(motions).slide
+    for bearing in np.linspace(-np.pi, np.pi, 50):
+        least = [
+            least_cost_of_lines(motions, heading, bearing)
+            for heading in range(motions.headings)
+        ]
+        rate = rate_of_slide(bearing, slide)
+        assert max(least) * (1 - 1e-6) <= rate <= max(least) * 1.005
+
+
+def least_cost_of_lines(motions: Motions, heading: int, bearing: float) -> float:
+    """The least cost of a way of one cell in a direction, by linear programming."""
+    is_line = (motions.start == heading) & (motions.end == heading)
+    offset = motions.offset[is_line]  # (L, 2)
+    is_line[is_line] = offset.any(axis=1)
+    direction = motions.angles[heading] + bearing
+    way = [np.cos(direction), np.sin(direction)]
+    result = linprog(motions.cost[is_line], A_eq=motions.offset[is_line].T, b_eq=way)
+    return float(result.fun)
+
+
+@pytest.mark.parametrize("motion", ["ackermann", "differential"])
+def test_a_robot_that_cannot_move_sideways_has_no_such_lines(motion: str) -> None:
+    assert not len(rates_of(motions_of(motion)).slide)
 
 
 def test_by_default_bends_and_cusps_cost_something_and_bends_of_lattices_do_not() -> (
