@@ -31,7 +31,7 @@ from ddqn_planner.planning.pose_chain import (
     Track,
 )
 from ddqn_planner.planning.pose_curves import TURN_OF_PIECE, Course
-from ddqn_planner.planning.pose_paths import PosePath, cost_of_poses
+from ddqn_planner.planning.pose_paths import Float64, PosePath, cost_of_poses
 from ddqn_planner.planning.pose_planner import PosePlanner
 from ddqn_planner.robot.directions import directions_of_travel
 from ddqn_planner.robot.driving_costs import rates_of
@@ -43,6 +43,7 @@ class Choice(NamedTuple):
     first: int
     nodes: Nodes
     tracks: list[Track]
+    planned_costs: Float64
     limits: Limits
     course: Course
     chain: Chain
@@ -52,6 +53,7 @@ class Leg(NamedTuple):
     """A leg of a chain, from its poses."""
 
     node: int
+    arrival: tuple[int, int]  # the direction in which, and the side of the last turn
     next_node: int
     is_curve: bool
     direction: int  # 1 ahead, -1 in reverse
@@ -61,10 +63,10 @@ class Leg(NamedTuple):
 
 
 def requests(body: PosePlanner) -> Iterator[tuple[GridMap, PosePath]]:
-    """Finished paths of a car between poses that are near each other, or farther."""
+    """Finished paths of a car between poses near each other, or among obstacles."""
     random = np.random.default_rng(11)
-    for low, high in 12 * ((2, 4),) + 6 * ((1, 5),):
-        occupancy = random.random((SIDE, SIDE)) < 0.004
+    for low, high, density in 12 * ((2, 4, 0.004),) + 12 * ((1, 5, 0.02),):
+        occupancy = random.random((SIDE, SIDE)) < density
         grid = GridMap(occupancy, CELL)
         start = (*random.uniform(low, high, 2), random.uniform(-3, 3))
         goal = (*random.uniform(low, high, 2), random.uniform(-3, 3))
@@ -90,7 +92,8 @@ def choices(monkeypatch: pytest.MonkeyPatch) -> list[Choice]:
         first: int, nodes: Nodes, tracks: list[Track], costs: Any, course: Course
     ) -> Chain:
         chain = follow(first, nodes, tracks, costs, course)
-        collected.append(Choice(first, nodes, tracks, last_limits[0], course, chain))
+        limits = last_limits[0]
+        collected.append(Choice(first, nodes, tracks, costs, limits, course, chain))
         return chain
 
     monkeypatch.setattr(pose_chain, "choose", choose_and_keep_limits)
@@ -124,6 +127,7 @@ def legs_of(choice: Choice) -> Iterator[Leg]:
         sides = np.sign(turns[np.abs(turns) > least_turn]).astype(int).tolist()
         yield Leg(
             node,
+            (direction, side),
             next_node,
             word != KEPT,
             -1 if travel.min() < 0 else 1,
@@ -163,6 +167,34 @@ def test_a_chain_weighs_what_its_legs_do(choices: list[Choice]) -> None:
         flips += flips_here
     assert cusps > 3
     assert flips > 3
+
+
+def test_a_chain_follows_what_was_chosen_for_the_way_it_arrives(
+    choices: list[Choice],
+) -> None:
+    """For another direction and another last turn, something else may be chosen."""
+    list(requests(planner("ackermann")))
+    chains_of_both_sides = 0
+    for choice in list(choices):
+        nodes = choice.nodes
+        sides = {leg.arrival[1] for leg in legs_of(choice)}
+        chains_of_both_sides += len(sides) > 1
+        is_followed = np.zeros(nodes.value.shape, np.bool_)
+        for leg in legs_of(choice):
+            direction, side = leg.arrival
+            is_followed[leg.node, direction, side] = True
+        chosen_alone = nodes._replace(
+            chosen_node=np.where(is_followed, nodes.chosen_node, NO_NODE)
+        )
+        again = pose_chain._follow(
+            choice.first,
+            chosen_alone,
+            choice.tracks,
+            choice.planned_costs,
+            choice.course,
+        )
+        assert np.array_equal(again.poses, choice.chain.poses)
+    assert chains_of_both_sides >= 2
 
 
 def test_a_curve_costs_little_more_than_what_it_replaces(choices: list[Choice]) -> None:

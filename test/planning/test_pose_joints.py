@@ -35,7 +35,11 @@ from ddqn_planner.planning.pose_joints import (
 from ddqn_planner.planning.pose_paths import cost_of_poses, in_cells
 from ddqn_planner.planning.pose_planner import PosePlanner
 from ddqn_planner.planning.pose_world import world_of
-from ddqn_planner.robot.directions import cusps_before, directions_of_travel
+from ddqn_planner.robot.directions import (
+    cusps_before,
+    directions_of_travel,
+    first_direction,
+)
 from ddqn_planner.robot.driving_costs import rates_of
 
 SIDE = 60  # cells
@@ -258,6 +262,22 @@ def costs_with_joints(chain: Chain, start: Float64, course: Course) -> list[floa
                     continue
                 costs.append(_with_joint(chain, number, stretch, word, course).cost)
     return costs
+
+
+def test_the_rest_of_a_chain_costs_what_its_poses_do() -> None:
+    """Also with cusps; one at its first pose depends on how the robot gets there."""
+    body = planner("ackermann")
+    course = course_on(HALL, body)
+    for length in (1.0, 2.5, 4.0, 6.5):
+        chain = chain_with_cusp(length, course)
+        rest = _rest_of(chain, course)
+        assert set(rest.direction.tolist()) == {-1, 0, 1}
+        for place, number in enumerate(rest.number.tolist()):
+            poses = chain.poses[number:]
+            assert rest.pose[place].tolist() == poses[0].tolist()
+            assert rest.direction[place] == first_direction(poses)
+            later = chain._replace(poses=poses)
+            assert rest.cost[place] == pytest.approx(cost_on(later, course), abs=1e-9)
 
 
 @pytest.mark.parametrize("motion", ["ackermann", "differential"])
