@@ -14,6 +14,7 @@ from ddqn_planner.grid.layers import has_costs
 from ddqn_planner.planning import departure, pose_guide, pose_space, wavefront
 from ddqn_planner.planning.departure import Departure
 from ddqn_planner.planning.field_cache import Field
+from ddqn_planner.planning.plan import Pose
 from ddqn_planner.planning.pose_guide import NO_GUIDE, Guide
 from ddqn_planner.planning.pose_paths import SAME, PosePath, cells_of
 from ddqn_planner.planning.pose_space import Aim, Search, height_at
@@ -119,6 +120,8 @@ class PoseField(Field[Search]):
         self.world = world
         self.path: PosePath | None = None
         """The last path that was made from the field."""
+        self.finished_from: Pose | None = None
+        """The start (x, y, yaw) of a request for which a path was finished last."""
         self.visits = 0
         """States that were visited for the start that is aimed at."""
         self._lower_bound = math.inf
@@ -546,6 +549,12 @@ class PoseField(Field[Search]):
             escape=escape,
         )
         return self.path
+
+    def path_finished_from(self, start: Pose) -> PosePath | None:
+        """Return the last path if it was finished for a start (x, y, yaw)."""
+        path = self.path
+        is_finished = path is not None and path.is_finished
+        return path if is_finished and self.finished_from == start else None
 
     def take_over(
         self, older: PoseField, changed: NDArray[np.int64] | None, start: State | None

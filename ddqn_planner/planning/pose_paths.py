@@ -70,6 +70,16 @@ class PosePath(NamedTuple):
             self.least_costs[part],
         )
 
+    def or_cheaper(self, other: "PosePath") -> "PosePath":
+        """Return another path from the same start if it costs less, else this one.
+
+        What is proved of the cost of any path holds beside the other path, too.
+        """
+        if other.costs[-1] >= self.costs[-1]:
+            return self
+        gain = max(self.least_costs[0] - other.least_costs[0], 0.0)
+        return other._replace(least_costs=other.least_costs + gain)
+
     def cusps_to(self, rest: "PosePath") -> int:
         """Return whether a cusp lies between a path and the next one: 1, else 0."""
         together = np.concatenate([self.poses, rest.poses[1:]])

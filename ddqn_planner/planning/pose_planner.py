@@ -178,6 +178,9 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
     ) -> PausingGenerator[PosePlan]:
         """Return the plan of the cheapest path from a start to one of some states.
 
+        Bounds compare paths of primitives. So the finished path of a proved one may
+        cost more than that of the request before, the first one: then this one stays.
+
         Parameters
         ----------
         request : PoseRequest
@@ -202,14 +205,19 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         clock.end_field()
         if bound == math.inf:
             return PosePlan(PlanStatus.NO_PATH, field_ms=clock.field_ms)
+        last_path = field.path_finished_from(request.start)
         path = field.rollout(start.state, request.bound, is_proved)
         remark = ""
         if request.finished:
             goal = self._end_of(path, request)
             path = self._finished(path, goal, request, start.world)
+            if last_path is not None:
+                path = path.or_cheaper(last_path)
+                goal = self._end_of(path, request)
             remark = paths.ends_in_words(path, request.start, goal)
             if len(path.poses) > 1:
                 field.path = path
+                field.finished_from = request.start
         plan = path.plan(grid, remark)
         return replace(plan, field_ms=clock.field_ms, rollout_ms=clock.rollout_ms)
 

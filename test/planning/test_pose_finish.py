@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import islice
 
 import bodies
 import numpy as np
@@ -10,8 +11,10 @@ from bodies import Oracle, occupied_cells, shape_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from planning.test_poses import BODIES, CELL, planner, robot
+from random_maps import generate_map
 
 from ddqn_planner import GridMap, Planner
+from ddqn_planner.grid.inflation import inflate
 from ddqn_planner.planning.path_finder import last_step
 from ddqn_planner.planning.plan import Pose, PosePlan, PoseRequest, are_joined
 from ddqn_planner.planning.pose_curves import (
@@ -102,6 +105,30 @@ def test_a_finished_path_is_free_and_no_worse(
         if motion == "ackermann":
             assert not ((turn > 1e-6) & (length <= 1e-6)).any()
         assert length.max() <= 0.51
+
+
+def test_a_path_that_is_proved_costs_no_more_than_the_first_one() -> None:
+    """Bounds compare motions: the finished path of cheaper ones may cost more."""
+    random = np.random.default_rng(2)
+    blocks = generate_map("corridors", (9, 9), random)
+    hall = GridMap(np.kron(blocks, np.ones((20, 20), np.bool_)), 0.05)
+    grid = inflate(hall, 0.0, 1.0)
+    car = Planner.load("car")
+    paths_that_changed = 0
+    for start, goal in islice(bodies.requests(hall, 0.35, random), 16):
+        body = Planner(car.network, car.metadata).pose_planner
+        assert body is not None
+        request = PoseRequest(grid, start, (goal,), is_bound_proved=False)
+        first = last_step(body.steps(request))
+        proved = last_step(body.steps(replace(request, is_bound_proved=True)))
+        if len(first.poses) > 1:
+            assert proved.cost <= first.cost * (1 + 1e-6)
+            has_changed = not np.array_equal(proved.poses, first.poses)
+            paths_that_changed += has_changed
+            # What the proof found out holds for a first path that stays, too.
+            if first.bound > 1.3 and not has_changed:
+                assert proved.bound < first.bound
+    assert paths_that_changed > 0
 
 
 def test_a_car_s_path_through_an_empty_hall_bends_in_one_s_at_most() -> None:
