@@ -50,6 +50,9 @@ FORMS = {
     "beside its origin": "[[-0.2, 0.4], [0.2, 0.4], [0.2, 0.7], [-0.2, 0.7]]",
 }
 SQUARE = (0, 0), (0, 2), (2, 2), (2, 0)
+# What costs among cells of any costs may differ by: Dijkstra here and the planner cut
+# the way of a primitive into parts, and each rounds these in its own way.
+ROUNDED = 5e-3
 BODIES = {
     "differential": "[[0.25, 0.15], [-0.25, 0.15], [-0.25, -0.15], [0.25, -0.15]]",
     "ackermann": "[[0.35, 0.15], [-0.1, 0.15], [-0.1, -0.15], [0.35, -0.15]]",
@@ -170,9 +173,7 @@ def test_plans_cost_the_least_within_their_bound_also_after_repairs(
                     and max(x_off.max(), y_off.max(), turned.max()) < 1e-6
                 ):
                     assert 1 <= found.bound <= bound + 1e-5
-                    same = (
-                        1.003 if layers else 1.0001
-                    )  # the parts of the way are rounded
+                    same = 1 + ROUNDED if layers else 1.0001
                     assert least / same <= found.cost <= least * found.bound * same
                 elif not found.poses.size:
                     assert found.status is PlanStatus.NO_PATH
@@ -447,7 +448,7 @@ def test_a_concave_body_or_one_beside_its_origin_takes_the_cheapest_free_path(
         least = best[own[1], own[0], own[2]]
         assert (found.status is PlanStatus.SUCCEEDED) == (least < math.inf)
         if found.poses.size:
-            assert found.cost == pytest.approx(least, rel=2e-3, abs=1e-6)
+            assert found.cost == pytest.approx(least, rel=ROUNDED, abs=1e-6)
             assert all(map(grid.contains, found.cells))
             assert not any(
                 len(cells.query(placed(shape, pose), "intersects"))
