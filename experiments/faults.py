@@ -38,6 +38,7 @@ TRY_TIME = 1.0
 """Seconds until a question is asked again: it may have gone to a killed node."""
 START_TIME = 20.0  # the same for ~/start, which a second question would find started
 LAST_WAIT = 0.5  # seconds that a client waits after a kill until it gives up
+SAVE_TIME = 10.0  # seconds within which a save has ended
 COUNTS = (
     "kills",
     "in a save",
@@ -249,7 +250,7 @@ class Faults(Client):
         self.diagnostics.clear()
         self.trigger("save")
         wait_for("model", lambda: self.diagnostics.find(_has_model_of_trainer))
-        tally["temporaries"] = len(self._temporaries())
+        tally["temporaries"] = len(self._left_temporaries())
         tally["restarts"] += f"from step {steps} " in message
 
     def _send_saves(self) -> list[Call]:
@@ -268,6 +269,18 @@ class Faults(Client):
     def _temporaries(self) -> list[Path]:
         """Return the files that a save writes first, and a killed one leaves."""
         return [*self.training_folder.glob(".*")]
+
+    def _left_temporaries(self) -> list[Path]:
+        """Return the temporary files that stay: those of a save under way do not.
+
+        Their names are random, so another save has others.
+        """
+        left = self._temporaries()
+        deadline = time.monotonic() + SAVE_TIME
+        while left and time.monotonic() < deadline:
+            time.sleep(0.05)
+            left = [path for path in left if path.exists()]
+        return left
 
     def _saved_steps(self) -> int:
         """Load what the trainer saved; return the steps of its checkpoint."""
