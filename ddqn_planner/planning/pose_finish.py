@@ -61,7 +61,7 @@ from ddqn_planner.planning.pose_paths import (
 )
 from ddqn_planner.planning.pose_world import BORDER, World
 from ddqn_planner.robot.directions import cusps_before, directions_of_travel
-from ddqn_planner.robot.driving_costs import Rates, least_radius_of, rates_of
+from ddqn_planner.robot.driving_costs import Rates, least_radius_of
 from ddqn_planner.robot.motions import Motions, turn_between
 
 # What a curve may cost, as a share of what it replaces, if the whole path costs no more
@@ -80,6 +80,8 @@ class Finish:
     Parameters
     ----------
     motions : Motions
+    rates : Rates
+        What these motions cost, see `rates_of`.
     footprint : (K, 2)
         The corners of the body, in metres.
     points : BodyPoints
@@ -87,12 +89,12 @@ class Finish:
     """
 
     def __init__(
-        self, motions: Motions, footprint: Float64, points: BodyPoints
+        self, motions: Motions, rates: Rates, footprint: Float64, points: BodyPoints
     ) -> None:
         self._points = points
         self._corners = np.ascontiguousarray(footprint / motions.resolution)
         self._far = float(np.hypot(*self._corners.T).max())
-        self._rates = rates_of(motions)
+        self._rates = rates
         self._radius = least_radius_of(motions)
         self._words = words_of(self._rates)
         self._mask = np.empty((0, 0, 0), np.uint64)

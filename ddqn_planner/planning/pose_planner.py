@@ -85,7 +85,7 @@ class PosePlanner(PathFinder[PoseRequest, PosePlan]):
         # A start so near to a pose of a path, in cells and radians, lies on that path.
         self._on_path = 0.5, math.pi / self.motions.headings
         self._rates = rates_of(self.motions)
-        self._finish = Finish(self.motions, self.footprint, self.points)
+        self._finish = Finish(self.motions, self._rates, self.footprint, self.points)
         # A request compares the same two maps for its path, its world and its field.
         self._differences = lru_cache(maxsize=1)(differences)
         self.fields = FieldCache[PoseField](0, self._differences)

@@ -138,25 +138,50 @@ def slide_rates_of(motions: Motions) -> Float64:
     heading in which these cost most: so no line is cheaper than the robot's motions.
     Without lines to both sides in all headings, there are no rates.
     """
-    bearing = np.linspace(0, 2 * math.pi, BEARINGS, endpoint=False)
-    direction = np.array([np.cos(bearing), np.sin(bearing)])  # (2, BEARINGS)
-    greatest_rate = np.zeros(BEARINGS)
-    for lines in _lines_of_headings(motions):
-        angle, rate = np.array(list(lines.items())).T  # (L,) each
-        line = np.array([np.cos(angle), np.sin(angle)])  # (2, L)
-        first, last = np.triu_indices(len(rate), 1)  # (M,): pairs of lines
-        is_pair = np.abs(np.sin(angle[first] - angle[last])) > PARALLEL
-        first = first[is_pair]
-        last = last[is_pair]
-        pairs = np.stack([line[:, first], line[:, last]], axis=-1)  # (2, M, 2)
-        # How far each line of a pair leads on the way of one cell in each direction.
-        cells = np.linalg.inv(pairs.swapaxes(0, 1)) @ direction  # (M, 2, BEARINGS)
-        cost = rate[first, None] * cells[:, 0] + rate[last, None] * cells[:, 1]
-        leads_there = (cells > -ROUNDING).all(axis=1)  # (M, BEARINGS)
-        least_rate = np.where(leads_there, cost, np.inf).min(axis=0, initial=np.inf)
-        greatest_rate = np.maximum(greatest_rate, least_rate)
-    can_slide = np.isfinite(greatest_rate[[0, BEARINGS // 4, -BEARINGS // 4]]).all()
-    return greatest_rate if can_slide else np.empty(0)
+    bearings = np.linspace(0, 2 * math.pi, BEARINGS, endpoint=False)
+    greatest_rates = np.zeros(BEARINGS)
+    for rate_of_bearing in _lines_of_headings(motions):
+        least_rates = _least_rates(rate_of_bearing, bearings)
+        greatest_rates = np.maximum(greatest_rates, least_rates)
+    to_both_sides = [0, BEARINGS // 4, -BEARINGS // 4]
+    can_slide = np.isfinite(greatest_rates[to_both_sides]).all()
+    return greatest_rates if can_slide else np.empty(0)
+
+
+def _least_rates(rate_of_bearing: dict[float, float], bearings: Float64) -> Float64:
+    """Return the least costs of a cell in each direction, by lines one after another.
+
+    Two lines lead to each place at the least cost: more cost no less.
+
+    Parameters
+    ----------
+    rate_of_bearing : dict
+        What a cell of each line costs, by the bearing of the line in radians.
+    bearings : (B,)
+        The directions, in radians.
+
+    Returns
+    -------
+    (B,)
+        Infinite where no two of the lines lead.
+    """
+    directions = np.array([np.cos(bearings), np.sin(bearings)])  # (2, B)
+    angles = np.array(list(rate_of_bearing))  # (L,)
+    rates = np.array(list(rate_of_bearing.values()))  # (L,)
+    lines = np.array([np.cos(angles), np.sin(angles)])  # (2, L)
+    first, last = np.triu_indices(len(angles), 1)  # (M,): pairs of lines
+    is_pair = np.abs(np.sin(angles[first] - angles[last])) > PARALLEL
+    first = first[is_pair]
+    last = last[is_pair]
+    pairs = np.stack([lines[:, first], lines[:, last]], axis=-1)  # (2, M, 2)
+    # How far each line of a pair leads on the way of one cell in each direction.
+    cells = np.linalg.inv(pairs.swapaxes(0, 1)) @ directions  # (M, 2, B)
+    cost_of_first = rates[first, None] * cells[:, 0]  # (M, B)
+    cost_of_last = rates[last, None] * cells[:, 1]
+    leads_there = (cells > -ROUNDING).all(axis=1)  # (M, B)
+    costs = np.where(leads_there, cost_of_first + cost_of_last, np.inf)
+    least_rates: Float64 = costs.min(axis=0, initial=np.inf)
+    return least_rates
 
 
 def _lines_of_headings(motions: Motions) -> Iterator[dict[float, float]]:
