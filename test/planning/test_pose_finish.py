@@ -24,7 +24,7 @@ from ddqn_planner.planning.pose_curves import (
     write_pieces,
 )
 from ddqn_planner.planning.pose_finish import END_COST
-from ddqn_planner.planning.pose_paths import cost_of_poses
+from ddqn_planner.planning.pose_paths import PosePath, cost_of_poses
 from ddqn_planner.planning.pose_planner import PosePlanner
 from ddqn_planner.planning.pose_world import world_of
 from ddqn_planner.robot.driving_costs import least_radius_of, rates_of
@@ -129,6 +129,27 @@ def test_a_path_that_is_proved_costs_no_more_than_the_first_one() -> None:
             if first.bound > 1.3 and not has_changed:
                 assert proved.bound < first.bound
     assert paths_that_changed > 0
+
+
+def path_ahead(cost: float, least_cost: float) -> PosePath:
+    """A path of one cell, and what any path costs at least."""
+    poses = np.array([(0.05, 0.05, 0), (0.15, 0.05, 0)], np.float64)
+    cells = np.array([(0, 0), (1, 0)], np.int32)
+    costs, least_costs = np.array([0, cost]), np.array([least_cost, 0])
+    return PosePath(poses, cells, costs, least_costs)
+
+
+@pytest.mark.parametrize("least_costs", [(8.0, 2.0), (2.0, 8.0), (8.0, 8.0)])
+def test_the_cheaper_of_two_paths_has_the_better_of_their_bounds(
+    least_costs: tuple[float, float],
+) -> None:
+    grid = GridMap(np.zeros((1, 2), np.bool_), 0.1)
+    of_this, of_other = least_costs
+    cheaper = path_ahead(9.0, of_this).or_cheaper(path_ahead(8.5, of_other)).plan(grid)
+    assert cheaper.cost == 8.5
+    assert cheaper.bound == pytest.approx(8.5 / max(least_costs))
+    this = path_ahead(9.0, of_this)
+    assert this.or_cheaper(path_ahead(9.0, of_other)) is this
 
 
 def test_a_car_s_path_through_an_empty_hall_bends_in_one_s_at_most() -> None:
